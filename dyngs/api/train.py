@@ -37,6 +37,7 @@ from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
 from dyngs.prune.stage import PruneStage
+from dyngs.runs.capture_record import changed_files, named, write_record
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     Checkpoint,
@@ -161,7 +162,11 @@ def train(
             )
             return folder
         asked = asked_for(folder) if resume_from is not None else config
+        if resumed is not None:
+            resumed.require_settings(config)
         config, choices, capture = _chosen(config, begins=resumed is None)
+        if resumed is not None:
+            _warn_of_changed_files(folder, config, capture)
         run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, threads=threads)
         write_choices(run.folder, choices)
         lines = run.run(listeners)
@@ -236,6 +241,7 @@ class _Run:
         if resumed is None:
             begin(self.folder, self.config)
             note_asked(self.folder, asked)
+            write_record(self.folder, config.data, capture)
 
     @property
     def config(self) -> Config:
@@ -373,6 +379,14 @@ class _Run:
             yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
         if _SPEED in self.limits:
             yield self.limits[_SPEED].reached()
+
+
+def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None) -> None:
+    """Print which files of the capture have changed since the run began. Raises DyngsError: it is another capture."""
+    changed = changed_files(folder, config.data, capture)
+    if changed:
+        line = f"{len(changed)} of the training views have changed since the run began: {named(changed)}"
+        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
 
 
 def _tell_memory(trainer: Trainer[Any], processes: int) -> None:

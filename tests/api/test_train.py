@@ -22,6 +22,7 @@ from torch import Tensor
 
 from dyngs.api import train as train_module
 from dyngs.api.train import train, with_capture
+from dyngs.cli import main
 from dyngs.config import (
     Config,
     DataConfig,
@@ -215,6 +216,67 @@ def test_a_closed_terminal_saves_too(capture: Path, tmp_path: Path) -> None:
         assert process.wait(60) == 130, printed
     done = load_run(tmp_path / "run").step
     assert done == _log(tmp_path / "run")[-1]["step"] > 0
+
+
+@pytest.fixture
+def interrupted(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that was stopped; its capture is a copy."""
+    shutil.copytree(capture, tmp_path / "capture")
+    with monkeypatch.context() as patch:
+        _interrupt_after(3, patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(_config(tmp_path / "capture", tmp_path / "run", steps=6))
+    return tmp_path / "run"
+
+
+def test_a_resumed_run_names_images_that_were_replaced(
+    interrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = tmp_path / "capture" / "train"
+    shutil.copyfile(images / "r_002.png", images / "r_001.png")
+    assert main(["train", "--resume", str(interrupted)]) == 0
+    warning = "1 of the training views have changed since the run began: train/r_001"
+    assert f"dyngs: warning: {warning}\n" in capsys.readouterr().err
+
+
+def test_a_resumed_run_refuses_another_capture(
+    interrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where it is said to be the same one at another place; that of a copy goes on to the same bytes."""
+    other, copied = tmp_path / "other", tmp_path / "copied"
+    write_still_capture(other, StillOptions(size=24, num_train=4, num_test=1, samples=1))
+    before = (interrupted / RESOLVED_NAME).read_text()
+    assert main(["train", "--resume", str(interrupted), f"data.root={other}"]) == 2
+    assert "other sizes of train/r_000" in capsys.readouterr().err
+    assert (interrupted / RESOLVED_NAME).read_text() == before
+    (tmp_path / "capture").rename(copied)
+    assert main(["train", "--resume", str(interrupted), f"data.root={copied}"]) == 0
+    assert "warning" not in capsys.readouterr().err
+    assert _final_bytes(interrupted) == _final_bytes(train(_config(copied, tmp_path / "whole", steps=6)))
+    shutil.copytree(other, copied, dirs_exist_ok=True)
+    assert main(["train", "--resume", str(interrupted), "train.steps=8"]) == 2
+    assert "not the capture that the run was trained on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("  kind: static\n", "  kind: dynamic\n", "model.kind=static, but config.yaml has model.kind=dynamic"),
+        ("  sh_degree: 2\n", "  sh_degree: 1\n", "model.sh_degree=2, but config.yaml has model.sh_degree=1"),
+        ("  refine: never\n", "  refine: always\n", "camera.refine=never, but config.yaml has camera.refine=always"),
+        ("  exposure: never\n", "  exposure: always\n", "train.exposure=never, but config.yaml"),
+    ],
+)
+def test_an_edited_configuration_that_contradicts_the_checkpoint_is_refused(
+    before: str, after: str, said: str, interrupted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = interrupted / RESOLVED_NAME
+    text = file.read_text()
+    assert text.count(before) == 1
+    file.write_text(text.replace(before, after))
+    for words in (["train", "--resume", str(interrupted)], ["eval", str(interrupted)]):
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_time_adds_up_over_resumes(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
