@@ -22,7 +22,7 @@ from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
-from dyngs.budget.time import Deadline, first_fit, refitted
+from dyngs.budget.time import Deadline, fit_to_time
 from dyngs.capture.unposed import is_unposed, with_poses
 from dyngs.config import Config, HumanModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
@@ -31,6 +31,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture, require_folder
 from dyngs.errors import DyngsError, as_word, counted
 from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians.start import FirstGaussians
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.kinds import build
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
@@ -236,7 +237,7 @@ class _Run:
             _tell_memory(self._gaussians.trainer, processes.local_size)
         self._meter: CostMeter | None = None
         if self.limited is not None:
-            self._set_limits(self.limited, resumed)
+            self._set_limits(self.limited, resumed, first)
         self._follow(held.folder() or folder)
         if resumed is None:
             begin(self.folder, self.config)
@@ -279,7 +280,7 @@ class _Run:
                 )
         return list(self._reached())
 
-    def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
+    def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None, first: FirstGaussians | None) -> None:
         budget, speed = run.config.budget, None
         if budget.min_fps is not None:
             speed = SpeedLimit(run, budget.min_fps)
@@ -289,17 +290,16 @@ class _Run:
         minutes = run.config.train.minutes
         if minutes is not None:
             run.given = 60 * minutes
-            wanted, begun = run.config.train.steps, run.used
+            wanted = run.config.train.steps
+            refit_seconds = 0.0
             if resumed is None:
-                run.config = first_fit(run.config, run.trainer, run.used + run.reserve)
-                begun = run.used
-                run.exchange(refitted(run.trainer, run.config))
+                refit_seconds = fit_to_time(run, first, lambda line: print(line, flush=True))
                 self.loop.total = run.config.total_steps
             self.limits[_TIME] = Deadline(
                 run,
                 wanted,
                 fits=resumed is None,
-                refit_seconds=run.used - begun,
+                refit_seconds=refit_seconds,
                 save=self._save,
                 on_refit=(lambda: None) if speed is None else speed.hold,
             )
