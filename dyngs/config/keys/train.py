@@ -17,7 +17,8 @@ class TrainConfig(Section):
         default=None,
         gt=0,
         description="longest time of training on this machine, min; fewer than train.steps are done if need be, with "
-        "schedules to match, and a line at the end says what all would cost; 1 is a preview; null: no limit",
+        "schedules to match, in smaller images where too few fit, and a line at the end says what all would cost; 1 is "
+        "a preview; null: no limit",
     )
     batch_size: int = Field(
         default=1,
