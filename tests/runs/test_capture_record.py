@@ -105,12 +105,12 @@ def add_times(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (resize, r"other sizes of train/r_000, train/r_001, train/r_002 and 1 more: \[16, 16\] before, \[8, 8\] now"),
+        (resize, r"other sizes of train/r_000, train/r_001, train/r_002 and 1 more\)"),
         (swap_poses, r"other cameras of train/r_000, train/r_001\)"),
         (scale_world, r"other cameras of train/r_000, .* and 1 more"),
         (change_angle, r"other cameras of train/r_000, .* and 1 more"),
-        (add_times, r"other times of train/r_000, .*: None before, 0.0 now"),
-        (lambda root: edit_frames(root, lambda frames: frames.pop()), r"training views removed: train/r_003\)"),
+        (add_times, r"other times of train/r_000, .* and 1 more"),
+        (lambda root: edit_frames(root, lambda frames: frames.pop()), r"\(without the training views train/r_003\)"),
     ],
     ids=["resized", "swapped poses", "scaled", "other focal length", "times", "a view fewer"],
 )
@@ -137,7 +137,7 @@ def test_the_people_of_a_network_are_known(tmp_path: Path) -> None:
     (tmp_path / "people" / "p1" / "more.txt").write_text("more")
     assert changed_files(tmp_path, data, None) == ["p1"]
     shutil.rmtree(tmp_path / "people" / "p2")
-    with pytest.raises(DyngsError, match=r"training views removed: p2\)"):
+    with pytest.raises(DyngsError, match=r"\(without the training views p2\)"):
         changed_files(tmp_path, data, None)
 
 
