@@ -179,23 +179,41 @@ def first_fit(config: Config, trainer: Trainer[Any], used: float) -> Config:
 
     ``used``: seconds that are not there for steps, up to now and at the end.
     """
-    seconds, steps = 60 * (config.train.minutes or math.inf), config.train.steps
+    seconds = 60 * (config.train.minutes or math.inf)
     begin = time.perf_counter()
+    images = trainer.images
+    cached = images.cached_bytes
+    forecast, slow = _pilot(config, trainer, seconds)
+    loading = 0.0
+    if images.keeps_all and images.cached_bytes > cached and slow < PILOT_FRACTION * seconds:
+        # The same steps once more: what took longer the first time was decoding, which happens once per image.
+        forecast, fast = _pilot(config, trainer, seconds)
+        loading = max(slow - fast, 0.0) * len(images)
+    used += time.perf_counter() - begin + loading
+    found = fitting_steps(forecast, config, 0, AIM * seconds - used, config.train.steps)
+    return with_steps(config, max(found, 1))
+
+
+def _pilot(config: Config, trainer: Trainer[Any], seconds: float) -> tuple[Forecast, float]:
+    """Return a forecast by a few steps of a copy of ``trainer``, and the mean seconds of a step.
+
+    ``seconds``: that the run has.
+    """
     pilot = refitted(trainer, config)
-    prepared = time.perf_counter()
-    forecast = Forecast(pilot.done, prepared, pilot.num_gaussians)
-    while pilot.done < min(PILOT_WARM_UP + PILOT_STEPS, steps):
+    begin = since = now = time.perf_counter()
+    first = pilot.done
+    forecast = Forecast(first, begin, pilot.num_gaussians)
+    while pilot.done < min(PILOT_WARM_UP + PILOT_STEPS, config.train.steps):
         height, width = pilot.step().truth.shape[:2]
         now = time.perf_counter()
         forecast.observe(config, pilot.done, now, pilot.num_gaussians, height * width)
         most = PILOT_FRACTION if pilot.done > PILOT_WARM_UP else SLOW_PILOT_FRACTION
-        if now - prepared > most * seconds:
+        if now - begin > most * seconds:
             break
-        if pilot.done == PILOT_WARM_UP < steps:
-            forecast.restart(pilot.done, now, pilot.num_gaussians)
-    used += (prepared - begin) + (time.perf_counter() - begin)
-    found = fitting_steps(forecast, config, 0, AIM * seconds - used, steps)
-    return with_steps(config, max(found, 1))
+        if pilot.done == PILOT_WARM_UP < config.train.steps:
+            first, since = pilot.done, now
+            forecast.restart(first, since, pilot.num_gaussians)
+    return forecast, (now - since) / (pilot.done - first)
 
 
 def refitted(trainer: Trainer[Any], config: Config) -> Trainer[Any]:

@@ -37,6 +37,9 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
+from dyngs.data.capture import View
+from dyngs.data.decoding import Decoded
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.deform.schedule import motion_begins_after
 from dyngs.kinds import assemble, prepared
@@ -233,6 +236,21 @@ def _slowed_by_pixels(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     monkeypatch.setattr("dyngs.budget.time.SMALLEST_SIDE", 5)
 
 
+def test_decoding_counts_once_for_each_image(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of a second on 16 images that take ten seconds each: with them in every step 50 would fit."""
+    clock, real = _slowed(monkeypatch, 1.0), ImageLoader._decode
+
+    def decoded(loader: ImageLoader, view: View) -> Decoded:
+        clock[0] += 10.0
+        return real(loader, view)
+
+    monkeypatch.setattr(ImageLoader, "_decode", decoded)
+    folder = train(_still(moving, tmp_path / "run"))
+    assert load_resolved(folder).data.longest_side is None
+    assert 360 <= load_run(folder).step <= 430
+    assert load_run(folder).seconds_train <= 600
+
+
 def _still(capture: Path, folder: Path) -> Config:
     return Config(
         data=DataConfig(root=capture),
@@ -247,9 +265,9 @@ def _still(capture: Path, folder: Path) -> Config:
 @pytest.mark.parametrize(
     ("seconds", "side", "fewest", "most"),
     [
-        (0.004, None, 235, 258),  # 2.3 s a step: enough fit
-        (0.01, 12, 370, 390),  # 5.8 s a step: 100 fit; a quarter of that at 12 px
-        (0.05, 6, 260, 275),  # 29 s a step: at 12 px still too few fit
+        (0.004, None, 230, 258),  # 2.3 s a step: enough fit
+        (0.01, 12, 355, 370),  # 5.8 s a step: 100 fit; a quarter of that at 12 px
+        (0.05, 6, 255, 270),  # 29 s a step: at 12 px still too few fit
         (0.5, 6, 10, 16),  # 288 s a step; at 6 px, the smallest here, 18 s
     ],
 )
