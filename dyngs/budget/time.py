@@ -143,24 +143,23 @@ def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[st
     Where fewer than ``FEWEST_STEPS`` fit, the images are halved until they do, or are small.
     """
     fewest = min(FEWEST_STEPS, run.config.train.steps)
-    fitted = first_fit(run.config, run.trainer, run.used + run.reserve)
-    steps, side = fitted.train.steps, _longest_side(run.trainer)
-    whole = f"{counted(steps, 'step')} would fit at {side} px"
+    fitted, most = first_fit(run.config, run.trainer, run.used + run.reserve)
+    side = _longest_side(run.trainer)
+    whole = f"at most {counted(most, 'step')} would fit at {side} px"
     is_shrunk = False
-    while fitted.train.steps < fewest and side >= 2 * SMALLEST_SIDE:
-        most = fitted.train.steps
+    while most < fewest and side >= 2 * SMALLEST_SIDE:
         while most < fewest and side >= 2 * SMALLEST_SIDE:
             side //= 2
-            most *= 4  # steps of a fourth of the pixels take a fourth of the time at best
+            most = 4 * max(most, 1)  # a fourth of the pixels takes a fourth of the time at best
         data = run.config.data.model_copy(update={"longest_side": side})
         run.config = run.config.model_copy(update={"data": data})
         run.trainer.images.rest()
         run.exchange(assemble(run.config, run.trainer.capture, first=first))
-        fitted = first_fit(run.config, run.trainer, run.used + run.reserve)
+        fitted, most = first_fit(run.config, run.trainer, run.used + run.reserve)
         is_shrunk = True
     if is_shrunk:
-        minutes, found = fitted.train.minutes, counted(fitted.train.steps, "step")
-        say(f"train.minutes={minutes:g}: {whole}, so images are shrunk to {side} px (data.longest_side): {found} fit")
+        minutes = fitted.train.minutes
+        say(f"train.minutes={minutes:g}: {whole}, so images are shrunk to {side} px (data.longest_side)")
     begin = run.used
     run.config = fitted
     run.exchange(refitted(run.trainer, fitted))
@@ -174,10 +173,11 @@ def _longest_side(trainer: Trainer[Any]) -> int:
     return max(map(max, sizes))
 
 
-def first_fit(config: Config, trainer: Trainer[Any], used: float) -> Config:
-    """Return ``config`` with as many steps as fit, at most its own, by the measured rate of a copy of ``trainer``.
+def first_fit(config: Config, trainer: Trainer[Any], used: float) -> tuple[Config, int]:
+    """Return ``config`` with as many steps as fit, and how many may fit at best, by a copy of ``trainer``.
 
-    ``used``: seconds that are not there for steps, up to now and at the end.
+    Both are at most its own steps. The number of steps is adapted later, so the first is cautious; images are shrunk
+    for good, so what decides that is not. ``used``: seconds that are not there for steps, up to now and at the end.
     """
     seconds = 60 * (config.train.minutes or math.inf)
     begin = time.perf_counter()
@@ -190,8 +190,12 @@ def first_fit(config: Config, trainer: Trainer[Any], used: float) -> Config:
         forecast, fast = _pilot(config, trainer, seconds)
         loading = max(slow - fast, 0.0) * len(images)
     used += time.perf_counter() - begin + loading
-    found = fitting_steps(forecast, config, 0, AIM * seconds - used, config.train.steps)
-    return with_steps(config, max(found, 1))
+    left = AIM * seconds - used
+    steps = config.train.steps
+    fewest = min(FEWEST_STEPS, steps)
+    found = fitting_steps(forecast, config, 0, left, steps)
+    most = fewest * left / max(forecast.least_seconds(config, fewest), 1e-9)
+    return with_steps(config, max(found, 1)), max(found, min(int(max(most, 0)), steps))
 
 
 def _pilot(config: Config, trainer: Trainer[Any], seconds: float) -> tuple[Forecast, float]:

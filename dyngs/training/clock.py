@@ -140,6 +140,15 @@ class Forecast:
         cost = cost_between(config, done, total, self._pixels, lambda step: self._expected(config, step, since))
         return cost * (now.seconds - since.seconds) / max(now.cost - since.cost, 1e-9)
 
+    def least_seconds(self, config: Config, steps: int) -> float:
+        """Return the seconds of a run of ``steps`` whose steps become dearer by larger images alone."""
+        first, now = self._marks[0], self._marks[-1]
+        pace = (now.seconds - first.seconds) / max(now.cost - first.cost, 1e-9)
+        train = with_steps(config, steps).train
+        sampled = [math.ceil(steps * (i + 0.5) / SAMPLES) for i in range(SAMPLES)]
+        pixels = [self._pixels / image_divisor(train, step) ** 2 for step in sampled]
+        return steps * pace * fmean(step_cost(None, 0, x, now.num_gaussians) for x in pixels)
+
     def _expected(self, config: Config | None, step: int, since: _Mark) -> float:
         """Return how many Gaussians are expected at ``step``.
 

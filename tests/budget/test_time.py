@@ -214,11 +214,11 @@ def test_a_first_fit_keeps_or_lowers_the_steps(moving: Path, tmp_path: Path, mon
     wanted = config.train.steps
     _slowed(monkeypatch, 1.0)
     assert wanted < FEWEST_STEPS
-    assert first_fit(timed(config, 1000.0), assemble(config), 0.0).train.steps == wanted
-    assert first_fit(timed(config, 0.1), assemble(config), 0.0).train.steps in (1, 2)
-    assert first_fit(timed(config, 0.001), assemble(config), 0.0).train.steps == 1
+    assert first_fit(timed(config, 1000.0), assemble(config), 0.0)[0].train.steps == wanted
+    assert first_fit(timed(config, 0.1), assemble(config), 0.0)[0].train.steps in (1, 2)
+    assert first_fit(timed(config, 0.001), assemble(config), 0.0)[0].train.steps == 1
     long = with_steps(config, 1000)
-    fitted = first_fit(timed(long, 20.0), assemble(long), 0.0).train.steps
+    fitted = first_fit(timed(long, 20.0), assemble(long), 0.0)[0].train.steps
     assert FEWEST_STEPS <= fitted < 1000
     assert fitted <= AIM * 1200
 

@@ -119,3 +119,15 @@ def test_slow_checkpoints_are_written_less_often() -> None:
 
 def test_no_checkpoint_is_due_without_an_interval() -> None:
     assert not SaveTimer(0.0, 0.0).is_due(1e9)
+
+
+def test_the_least_that_a_run_takes() -> None:
+    """Steps of images that are whole from the start take as long as so far; with small ones first, longer."""
+    forecast = Forecast(0, 0.0, 1000)
+    plain = load_config("blender", ["data.root=nowhere", "train.steps=200"])
+    forecast.observe(plain, 10, 5.0, 1000, 10_000)
+    assert forecast.least_seconds(plain, 200) == pytest.approx(100.0)
+    moving = dynamic(200)
+    forecast = Forecast(0, 0.0, 1000)
+    forecast.observe(moving, 10, 5.0, 1000, 10_000)
+    assert 100.0 < forecast.least_seconds(moving, 200) < forecast.seconds(moving, 200, 0)
