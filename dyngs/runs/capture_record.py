@@ -91,7 +91,7 @@ def _is_close(one: np.ndarray, other: np.ndarray, part: slice, extent: float) ->
 
 def _record(data: DataConfig, capture: Capture | None) -> dict[str, Any]:
     if capture is None:
-        people = {str(one.root.relative_to(data.root)): one.root for one in captures_in(data)}
+        people = {one.root.relative_to(data.root).as_posix(): one.root for one in captures_in(data)}
         files = {name: _listing(root) for name, root in people.items()}
         return {"views": {name: [] for name in people}, "files": files}
     digest = cache(_digest)
