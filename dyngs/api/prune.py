@@ -100,7 +100,8 @@ def prune_within(
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
-        save_checkpoint(started, replace(chosen.checkpoint, settings=settings_of(chosen.config)), seconds)
+        smaller = replace(chosen.checkpoint, settings=settings_of(chosen.config))
+        save_checkpoint(started, smaller, seconds)
         write_config(chosen.config, started)
         write_scene(started / EXPORT_FOLDER / SCENE_FILE, file.data)
         write_config(chosen.config, started / EXPORT_FOLDER)

@@ -385,7 +385,8 @@ def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None
     """Print which files of the capture have changed since the run began. Raises DyngsError: it is another capture."""
     changed = changed_files(folder, config.data, capture)
     if changed:
-        line = f"{len(changed)} of the training views have changed since the run began: {named(changed)}"
+        views = counted(len(changed), "training view")
+        line = f"files of {views} have changed since the run began: {named(changed)}"
         print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
 
 

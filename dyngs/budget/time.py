@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
 from dyngs.config import Config
-from dyngs.data.images.images import target_size
 from dyngs.deform.schedule import motion_begins_after
 from dyngs.errors import counted
 from dyngs.gaussians.start import FirstGaussians
@@ -138,13 +137,13 @@ class Deadline:
 
 
 def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[str], None]) -> float:
-    """Give a run that begins as many steps as fit into its time; return the seconds that preparing it took last.
+    """Give a run that begins as many steps as fit into its time; return how long preparing it took.
 
     Where fewer than ``FEWEST_STEPS`` fit, the images are halved until they do, or are small.
     """
     fewest = min(FEWEST_STEPS, run.config.train.steps)
     fitted, most = first_fit(run.config, run.trainer, run.used + run.reserve)
-    side = _longest_side(run.trainer)
+    side = max(map(max, run.trainer.images.sizes))
     whole = f"at most {counted(most, 'step')} would fit at {side} px"
     is_shrunk = False
     while most < fewest and side >= 2 * SMALLEST_SIDE:
@@ -166,18 +165,11 @@ def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[st
     return run.used - begin
 
 
-def _longest_side(trainer: Trainer[Any]) -> int:
-    """Return the longest side of the training images, px."""
-    data = trainer.config.data
-    sizes = [target_size(view.width, view.height, data.downscale, data.longest_side) for view in trainer.images.views]
-    return max(map(max, sizes))
-
-
 def first_fit(config: Config, trainer: Trainer[Any], used: float) -> tuple[Config, int]:
     """Return ``config`` with as many steps as fit, and how many may fit at best, by a copy of ``trainer``.
 
-    Both are at most its own steps. The number of steps is adapted later, so the first is cautious; images are shrunk
-    for good, so what decides that is not. ``used``: seconds that are not there for steps, up to now and at the end.
+    Both are at most its own steps. The number of steps is adapted later, so the first is cautious. Images
+    are shrunk for good, so the second is not. ``used``: seconds that are not there for steps.
     """
     seconds = 60 * (config.train.minutes or math.inf)
     begin = time.perf_counter()
@@ -186,7 +178,7 @@ def first_fit(config: Config, trainer: Trainer[Any], used: float) -> tuple[Confi
     forecast, slow = _pilot(config, trainer, seconds)
     loading = 0.0
     if images.keeps_all and images.cached_bytes > cached and slow < PILOT_FRACTION * seconds:
-        # The same steps once more: what took longer the first time was decoding, which happens once per image.
+        # The same steps once more: the difference is the decoding, which happens once per image.
         forecast, fast = _pilot(config, trainer, seconds)
         loading = max(slow - fast, 0.0) * len(images)
     used += time.perf_counter() - begin + loading

@@ -107,8 +107,8 @@ class Measured:
         side = load_resolved(folder).data.longest_side
         if side != entry.config.data.longest_side:
             raise DyngsError(
-                f"too few steps fit into {limit}, so its images were shrunk to {side} px, unlike those of the others; "
-                f"give more minutes, or data.longest_side={side} for all"
+                f"too few steps fit into {limit}, so its images were shrunk to {side} px, unlike those of "
+                f"the others; give more minutes, or data.longest_side={side} for all"
             )
 
     def _result(self, entry: Entry) -> Result:

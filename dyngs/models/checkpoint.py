@@ -61,8 +61,8 @@ class Checkpoint:
             before = self.settings.get(name, now)
             if before != now:
                 raise DyngsError(
-                    f"{self.name}: was trained with {name}={before}, but config.yaml has {name}={now}; change it back, "
-                    "or train anew"
+                    f"{self.name}: was trained with {name}={before}, but config.yaml has {name}={now}; "
+                    "change it back, or train anew"
                 )
 
     def part(self, prefix: str) -> dict[str, Tensor]:

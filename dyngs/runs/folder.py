@@ -121,7 +121,7 @@ def note_asked(folder: Path, asked: Config) -> None:
 
 
 def note_root(folder: Path, data: DataConfig) -> None:
-    """Write into the configuration of a run where its capture lies by now, if that differs and is the same capture."""
+    """Write into the configuration of a run where its capture lies by now; it must be the same capture."""
     for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:

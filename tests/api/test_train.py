@@ -235,7 +235,7 @@ def test_a_resumed_run_names_images_that_were_replaced(
     images = tmp_path / "capture" / "train"
     shutil.copyfile(images / "r_002.png", images / "r_001.png")
     assert main(["train", "--resume", str(interrupted)]) == 0
-    warning = "1 of the training views have changed since the run began: train/r_001"
+    warning = "files of 1 training view have changed since the run began: train/r_001"
     assert f"dyngs: warning: {warning}\n" in capsys.readouterr().err
 
 
