@@ -43,7 +43,7 @@ import torch
 from dyngs.cli import main as dyngs
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.runs.checkpoint import checkpoint_paths, has_only_scene_file, load_run
-from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
 
 OPERATIONS = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fcntl.flock", "shutil.rmtree")
 WRITES = os.O_WRONLY | os.O_RDWR
@@ -291,7 +291,7 @@ def told(file: Path) -> object:
         return [{key: value for key, value in line.items() if key != "seconds"} for line in lines]
     if file.name == "timing.json":
         return list(json.loads(file.read_text())["seconds_train"])
-    if file.name == RESOLVED_NAME:
+    if file.name in (RESOLVED_NAME, ASKED_NAME):
         return [line for line in file.read_text().splitlines() if not line.strip().startswith("dir:")]
     return file.read_bytes()
 

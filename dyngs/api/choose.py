@@ -192,7 +192,7 @@ def as_static(config: Config) -> Config:
     names = ("model", "init", "strategy", "optim")
     changed = {name: _requested(getattr(config, name), getattr(usual, name)) for name in names}
     train = _requested(config.train, usual.train)
-    lengths = ("steps", "log_every", "save_every", "eval_every", "tensorboard")
+    lengths = ("steps", "log_every", "save_minutes", "save_every", "eval_every", "tensorboard")
     kept = {name: getattr(config.train, name) for name in lengths}
     return config.model_copy(update=changed | {"train": train.model_copy(update=kept)})
 

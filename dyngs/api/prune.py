@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -19,10 +20,15 @@ from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.files.outputs import new_folder
 from dyngs.kinds import assemble
+<<<<<<< HEAD
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
+=======
+from dyngs.models.checkpoint import Checkpoint, settings_of
+>>>>>>> w-saving
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Promise, Search
+from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, require_empty
@@ -53,7 +59,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     require_folder(config.data.root)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
-        save_checkpoint(started, start, 0.0)
+        save_checkpoint(started, replace(start, settings=settings_of(config)), 0.0)
         write_config(config, started)
     train(config, resume_from=out)
     write_scene_file(out, file_of(out))
@@ -98,7 +104,8 @@ def prune_within(
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
-        save_checkpoint(started, chosen.checkpoint, seconds)
+        smaller = replace(chosen.checkpoint, settings=settings_of(chosen.config))
+        save_checkpoint(started, smaller, seconds)
         write_config(chosen.config, started)
         write_scene(started / EXPORT_FOLDER / SCENE_FILE, file.data)
         write_config(chosen.config, started / EXPORT_FOLDER)
@@ -128,6 +135,6 @@ def unseen_images(config: Config, device: torch.device) -> list[Image]:
 
 
 def _copy_start(run_dir: Path, folder: Path) -> None:
-    for name in (TIMING_NAME, LOG_NAME, FRAME_NAME):
+    for name in (TIMING_NAME, LOG_NAME, FRAME_NAME, RECORD_NAME):
         if (run_dir / name).is_file():
             shutil.copyfile(run_dir / name, folder / name)

@@ -22,7 +22,7 @@ from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
-from dyngs.budget.time import Deadline, first_fit, refitted
+from dyngs.budget.time import Deadline, fit_to_time
 from dyngs.capture.unposed import is_unposed, with_poses
 from dyngs.config import Config, HumanModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
@@ -31,6 +31,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture, require_folder
 from dyngs.errors import DyngsError, as_word, counted
 from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians.start import FirstGaussians
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.kinds import build
 from dyngs.models.checkpoint import read_capture_of
@@ -38,6 +39,7 @@ from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
 from dyngs.prune.stage import PruneStage
+from dyngs.runs.capture_record import changed_files, named, write_record
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     Checkpoint,
@@ -67,7 +69,7 @@ from dyngs.runs.inputs import inputs_of
 from dyngs.runs.lock import Held, writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
-from dyngs.training.clock import Stopwatch
+from dyngs.training.clock import SaveTimer, Stopwatch
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.extend import told, with_length
 from dyngs.training.limits import require_possible, shared
@@ -162,12 +164,22 @@ def train(
             )
             return folder
         asked = asked_for(folder) if resume_from is not None else config
+<<<<<<< HEAD
         config, choices, capture = _chosen(config, resumed)
+=======
+        if resumed is not None:
+            resumed.require_settings(config)
+        config, choices, capture = _chosen(config, begins=resumed is None)
+        if resumed is not None:
+            _warn_of_changed_files(folder, config, capture)
+>>>>>>> w-saving
         run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, threads=threads)
         write_choices(run.folder, choices)
-        run.run(listeners)
+        lines = run.run(listeners)
         folder = run.folder
         note_asked(folder, asked)
+        for line in lines:
+            print(line, flush=True)
     return folder
 
 
@@ -225,24 +237,26 @@ class _Run:
             watch.pause(-seconds_at(folder, resumed.info.step))
         self.limited = LimitedRun(folder, config, self.loop, trainer) if isinstance(trainer, Trainer) else None
         self._config, self._saved = config, self.loop.trainer.done
+        self._save_timer = SaveTimer(config.train.save_minutes, watch.seconds)
         self._gaussians = self.limited if config.model.made_of_gaussians else None
         if self._gaussians is not None:
             _tell_memory(self._gaussians.trainer, processes.local_size)
         self._meter: CostMeter | None = None
         if self.limited is not None:
-            self._set_limits(self.limited, resumed)
+            self._set_limits(self.limited, resumed, first)
         self._follow(held.folder() or folder)
         if resumed is None:
             begin(self.folder, self.config)
             note_asked(self.folder, asked)
+            write_record(self.folder, config.data, capture)
 
     @property
     def config(self) -> Config:
         """The configuration as saved; limits may change the number of steps."""
         return self._config if self.limited is None else self.limited.config
 
-    def run(self, listeners: Sequence[Listener]) -> None:
-        """Step until the end, or until interrupted, and keep the limits."""
+    def run(self, listeners: Sequence[Listener]) -> list[str]:
+        """Step until the end, or until interrupted, and keep the limits; return a line for each limit."""
         options, loop, done = self.config.train, self.loop, self.loop.trainer.done
         with (
             RunLog(self.folder, done, every=options.log_every, tensorboard=options.tensorboard) as log,
@@ -270,10 +284,9 @@ class _Run:
                 raise KeyboardInterrupt(
                     f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {as_word(self.folder)}"
                 )
-        for line in self._reached():
-            print(line, flush=True)
+        return list(self._reached())
 
-    def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
+    def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None, first: FirstGaussians | None) -> None:
         budget, speed = run.config.budget, None
         if budget.min_fps is not None:
             speed = SpeedLimit(run, budget.min_fps)
@@ -283,17 +296,16 @@ class _Run:
         minutes = run.config.train.minutes
         if minutes is not None:
             run.given = 60 * minutes
-            wanted, begun = run.config.train.steps, run.used
+            wanted = run.config.train.steps
+            refit_seconds = 0.0
             if resumed is None:
-                run.config = first_fit(run.config, run.trainer, run.used + run.reserve)
-                begun = run.used
-                run.exchange(refitted(run.trainer, run.config))
+                refit_seconds = fit_to_time(run, first, lambda line: print(line, flush=True))
                 self.loop.total = run.config.total_steps
             self.limits[_TIME] = Deadline(
                 run,
                 wanted,
                 fits=resumed is None,
-                refit_seconds=run.used - begun,
+                refit_seconds=refit_seconds,
                 save=self._save,
                 on_refit=(lambda: None) if speed is None else speed.hold,
             )
@@ -312,12 +324,14 @@ class _Run:
                 options, step = self.config.train, event.step
                 evaluates = options.eval_every > 0 and step % options.eval_every == 0
                 is_last = step == options.steps or event.is_last
-                if evaluates or is_last or (options.save_every > 0 and step % options.save_every == 0):
+                is_due = options.save_every > 0 and step % options.save_every == 0
+                if evaluates or is_last or is_due or self._save_timer.is_due(event.seconds):
                     self._save()
                 if evaluates and event.loop.trainer.has_test_views:
                     self._evaluate(step)
 
     def _save(self) -> None:
+        begin = self.loop.watch.seconds
         checkpoint = self.loop.trainer.checkpoint()
         for part, limit in self.limits.items():
             kept = {f"{part}.{name}": x for name, x in limit.state().items()}
@@ -334,6 +348,7 @@ class _Run:
                 f"{self.folder}; go on with `{again}`"
             )
         self._saved = self.loop.trainer.done
+        self._save_timer.saved(begin, self.loop.watch.seconds)
         self.loop.tell(Saved(self._saved, path))
 
     def _follow(self, folder: Path) -> None:
@@ -370,6 +385,15 @@ class _Run:
             yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
         if _SPEED in self.limits:
             yield self.limits[_SPEED].reached()
+
+
+def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None) -> None:
+    """Print which files of the capture have changed since the run began. Raises DyngsError: it is another capture."""
+    changed = changed_files(folder, config.data, capture)
+    if changed:
+        views = counted(len(changed), "training view")
+        line = f"files of {views} have changed since the run began: {named(changed)}"
+        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
 
 
 def _tell_memory(trainer: Trainer[Any], processes: int) -> None:

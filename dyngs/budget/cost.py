@@ -100,7 +100,9 @@ class CostMeter:
         peak, each = peak_memory() + self.run.trainer.images.bytes_to_come, gaussian_bytes(config)
         least, expected, most = (peak + each * max(n - now, 0) for n in (counts.low, counts.middle, counts.high))
         paths = checkpoint_paths(self.run.folder)
-        stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if config.train.save_every else 1)
+        options = config.train
+        saves_often = options.save_every > 0 or 0 < 60 * options.save_minutes < middle
+        stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if saves_often else 1)
         return ExpectedCost(
             self.steps,
             Range(fast / spread, middle, slow * spread),

@@ -13,10 +13,11 @@ from typing import Any
 
 from torch import Tensor
 
-from dyngs.budget.run import LimitedRun, two_digits
+from dyngs.budget.run import LimitedRun
 from dyngs.config import Config
 from dyngs.deform.schedule import motion_begins_after
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import counted
+from dyngs.gaussians.start import FirstGaussians
 from dyngs.kinds import assemble
 from dyngs.runs.config_file import write_config
 from dyngs.training.clock import Forecast, with_steps
@@ -24,11 +25,15 @@ from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200
-"""Fewest steps that must fit; otherwise the run is refused."""
+"""Fewest steps that must fit; otherwise the images are shrunk."""
+SMALLEST_SIDE = 64
+"""Longest side, px, below which images are not shrunk: the run has the steps that fit then."""
 AIM = 0.97
 """Fraction of the time that a run is planned to use."""
 PILOT_STEPS, PILOT_WARM_UP, PILOT_FRACTION = 20, 2, 0.02
 """Steps that are measured before training, fewer where they would take a larger fraction of the time."""
+SLOW_PILOT_FRACTION = 0.1
+"""Fraction of the time after which even the warm-up ends."""
 FITS = 20
 """Number of times over a run that the number of steps is adapted."""
 SMALLEST_CHANGE = 0.04
@@ -131,38 +136,80 @@ class Deadline:
         run.loop.expect(run.config.total_steps)
 
 
-def first_fit(config: Config, trainer: Trainer[Any], used: float) -> Config:
-    """Return ``config`` with as many steps as fit, at most its own, by the measured rate of a copy of ``trainer``.
+def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[str], None]) -> float:
+    """Give a run that begins as many steps as fit into its time; return how long preparing it took.
 
-    ``used``: seconds that are not there for steps, up to now and at the end.
-
-    Raises:
-        DyngsError: too few fit; says how many minutes would do.
+    Where fewer than ``FEWEST_STEPS`` fit, the images are halved until they do, or are small.
     """
-    minutes, steps = config.train.minutes or math.inf, config.train.steps
+    fewest = min(FEWEST_STEPS, run.config.train.steps)
+    fitted, most = first_fit(run.config, run.trainer, run.used + run.reserve)
+    side = max(map(max, run.trainer.images.sizes))
+    whole = f"at most {counted(most, 'step')} would fit at {side} px"
+    is_shrunk = False
+    while most < fewest and side >= 2 * SMALLEST_SIDE:
+        while most < fewest and side >= 2 * SMALLEST_SIDE:
+            side //= 2
+            most = 4 * max(most, 1)  # a fourth of the pixels takes a fourth of the time at best
+        data = run.config.data.model_copy(update={"longest_side": side})
+        run.config = run.config.model_copy(update={"data": data})
+        run.trainer.images.rest()
+        run.exchange(assemble(run.config, run.trainer.capture, first=first))
+        fitted, most = first_fit(run.config, run.trainer, run.used + run.reserve)
+        is_shrunk = True
+    if is_shrunk:
+        minutes = fitted.train.minutes
+        say(f"train.minutes={minutes:g}: {whole}, so images are shrunk to {side} px (data.longest_side)")
+    begin = run.used
+    run.config = fitted
+    run.exchange(refitted(run.trainer, fitted))
+    return run.used - begin
+
+
+def first_fit(config: Config, trainer: Trainer[Any], used: float) -> tuple[Config, int]:
+    """Return ``config`` with as many steps as fit, and how many may fit at best, by a copy of ``trainer``.
+
+    Both are at most its own steps. The number of steps is adapted later, so the first is cautious. Images
+    are shrunk for good, so the second is not. ``used``: seconds that are not there for steps.
+    """
+    seconds = 60 * (config.train.minutes or math.inf)
     begin = time.perf_counter()
+    images = trainer.images
+    cached = images.cached_bytes
+    forecast, slow = _pilot(config, trainer, seconds)
+    loading = 0.0
+    if images.keeps_all and images.cached_bytes > cached and slow < PILOT_FRACTION * seconds:
+        # The same steps once more: the difference is the decoding, which happens once per image.
+        forecast, fast = _pilot(config, trainer, seconds)
+        loading = max(slow - fast, 0.0) * len(images)
+    used += time.perf_counter() - begin + loading
+    left = AIM * seconds - used
+    steps = config.train.steps
+    fewest = min(FEWEST_STEPS, steps)
+    found = fitting_steps(forecast, config, 0, left, steps)
+    most = fewest * left / max(forecast.least_seconds(config, fewest), 1e-9)
+    return with_steps(config, max(found, 1)), max(found, min(int(max(most, 0)), steps))
+
+
+def _pilot(config: Config, trainer: Trainer[Any], seconds: float) -> tuple[Forecast, float]:
+    """Return a forecast by a few steps of a copy of ``trainer``, and the mean seconds of a step.
+
+    ``seconds``: that the run has.
+    """
     pilot = refitted(trainer, config)
-    prepared = time.perf_counter()
-    for _ in range(min(PILOT_WARM_UP, steps - 1)):
-        pilot.step()
-    done = pilot.done
-    forecast = Forecast(done, time.perf_counter(), pilot.num_gaussians)
-    while pilot.done < min(done + PILOT_STEPS, steps):
+    begin = since = now = time.perf_counter()
+    first = pilot.done
+    forecast = Forecast(first, begin, pilot.num_gaussians)
+    while pilot.done < min(PILOT_WARM_UP + PILOT_STEPS, config.train.steps):
         height, width = pilot.step().truth.shape[:2]
         now = time.perf_counter()
         forecast.observe(config, pilot.done, now, pilot.num_gaussians, height * width)
-        if now - prepared > PILOT_FRACTION * 60 * minutes:
+        most = PILOT_FRACTION if pilot.done > PILOT_WARM_UP else SLOW_PILOT_FRACTION
+        if now - begin > most * seconds:
             break
-    used += (prepared - begin) + (time.perf_counter() - begin)
-    found = fitting_steps(forecast, config, 0, AIM * 60 * minutes - used, steps)
-    fewest = min(FEWEST_STEPS, steps)
-    if found < fewest:
-        needed = (used + forecast.seconds(with_steps(config, fewest), fewest, 0)) / AIM / 60
-        raise DyngsError(
-            f"train.minutes={minutes:g}: about {counted(found, 'step')} would fit, and fewer than {fewest} are of no "
-            f"use; {two_digits(needed, math.ceil):g} would do, or smaller images (data.longest_side)"
-        )
-    return with_steps(config, found)
+        if pilot.done == PILOT_WARM_UP < config.train.steps:
+            first, since = pilot.done, now
+            forecast.restart(first, since, pilot.num_gaussians)
+    return forecast, (now - since) / (pilot.done - first)
 
 
 def refitted(trainer: Trainer[Any], config: Config) -> Trainer[Any]:

@@ -181,7 +181,6 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
         float(found.compute_mean_track_length()), model.mapper, stages, tuple(notes),
     )  # fmt: skip
     result.write(capture)
-    capture.chmod(0o755)
     return result
 
 

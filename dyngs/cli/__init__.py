@@ -110,7 +110,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exception(error)
         return _fail(str(error) if isinstance(error, DyngsError) else full)
     except KeyboardInterrupt as interrupt:
-        print(f"\ndyngs: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
+        with suppress(OSError):  # the terminal may be closed
+            print(f"\ndyngs: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
+        _abandon_if_broken(sys.stdout)
+        _abandon_if_broken(sys.stderr)
         return EXIT_INTERRUPTED
     except OSError as error:
         _abandon_if_broken(sys.stdout)

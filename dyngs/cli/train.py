@@ -34,7 +34,7 @@ CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap,
 human, human_predictor.
 All keys are listed in docs/cli.md.
 """
-_LOGGING = tuple(f"train.{name}" for name in ("save_every", "eval_every", "log_every", "tensorboard"))
+_LOGGING = tuple(f"train.{name}" for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard"))
 _FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
 """Keys that change nothing that a run ends with."""
 WITH_RESUME = ("train.steps", "data.root", *_FOR_THIS_CALL)

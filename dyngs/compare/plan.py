@@ -24,7 +24,6 @@ from dyngs.training.limits import require_possible
 
 MOST_STEPS = 1_000_000
 """Steps that are asked for within a time: as many as fit are done, on schedules of that length."""
-SAVE_EVERY = 1000
 _OURS = ("data.root", "run.", "train.minutes", "budget.")
 _LOOKED_AT, _LEAST_CONTRAST = 8, 2 / 255
 
@@ -130,8 +129,7 @@ def planned(bench: Bench, models: Sequence[str]) -> Plan:
 
 def _words(bench: Bench, name: str) -> list[str]:
     where = [f"run.dir={bench.run_dir(name)}", f"run.threads={bench.threads}", f"run.device={bench.device}"]
-    saved = [f"train.save_every={SAVE_EVERY}"]
-    return [f"data.root={bench.capture}", *saved, *bench.overrides, *bench.limit.overrides, *where]
+    return [f"data.root={bench.capture}", *bench.overrides, *bench.limit.overrides, *where]
 
 
 def _require_ours(bench: Bench) -> None:

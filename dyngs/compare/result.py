@@ -13,8 +13,10 @@ from dyngs.api.train import num_cores
 from dyngs.budget.size import has_file
 from dyngs.compare.curve import CurvePoint, QualityCurve, read_curve
 from dyngs.compare.plan import Bench, Entry
+from dyngs.config.io import load_resolved
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
+from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run, images_of_split
 from dyngs.evaluate.view_scores import Drawing
 from dyngs.files.write import write_image
@@ -102,6 +104,12 @@ class Measured:
         print(f"training {entry.name}: {limit}", flush=True)
         with said_path.open("a", encoding="utf-8") as said, redirect_stdout(said):
             finished(entry.config, folder, [curve])
+        side = load_resolved(folder).data.longest_side
+        if side != entry.config.data.longest_side:
+            raise DyngsError(
+                f"too few steps fit into {limit}, so its images were shrunk to {side} px, unlike those of "
+                f"the others; give more minutes, or data.longest_side={side} for all"
+            )
 
     def _result(self, entry: Entry) -> Result:
         bench, folder = self.bench, self.bench.run_dir(entry.name)

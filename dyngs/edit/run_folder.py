@@ -17,6 +17,7 @@ from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.native import kernel_threads
+from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     has_only_scene_file,
@@ -67,8 +68,9 @@ def write_edited_run(
         else:
             checkpoint = latest_checkpoint(run_dir)
             save_checkpoint(folder, checkpoint, seconds_at(run_dir, checkpoint.info.step))
-        if (run_dir / LOG_NAME).is_file():
-            shutil.copyfile(run_dir / LOG_NAME, folder / LOG_NAME)
+        for name in (LOG_NAME, RECORD_NAME):
+            if (run_dir / name).is_file():
+                shutil.copyfile(run_dir / name, folder / name)
         write_config(config, folder)
         if frame is not None:
             write_frame(folder, frame)

@@ -44,6 +44,8 @@ def write_tensors(
         try:
             # One key only: the library writes several in random order.
             save_file(dict(tensors), folder / path.name, metadata={kind.key: json.dumps(full, sort_keys=True)})
+            # It makes files that only their owner can read; the folder has what the umask allows.
+            os.chmod(folder / path.name, folder.stat().st_mode & 0o666)
             os.replace(folder / path.name, temporary)
         except SafetensorError as error:
             raise DyngsError(f"cannot write {path}: {error}; free some space{advice}") from None

@@ -4,17 +4,38 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
+<<<<<<< HEAD
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import expressed
+=======
+from dyngs.config import Config
+from dyngs.errors import DyngsError
+>>>>>>> w-saving
 from dyngs.state import part_of
 
 OTHER_CONFIG = "was its config changed? Otherwise train anew"
 """Advice where a checkpoint and its run do not fit together."""
+
+_SETTINGS = ("model.kind", "model.sh_degree", "model.deform.kind", "colour.kind", "strategy.kind")
+_SETTINGS += ("camera.refine", "train.robust", "train.exposure")
+"""Keys of the configuration that decide what a checkpoint holds; the first that differs is told."""
+
+
+def settings_of(config: Config) -> dict[str, Any]:
+    """Return the settings that decide what a checkpoint holds, by dotted key; None where a section has no such key."""
+    found = {}
+    for name in _SETTINGS:
+        value: Any = config
+        for key in name.split("."):
+            value = getattr(value, key, None)
+        found[name] = value
+    return found
 
 
 @dataclass(frozen=True)
@@ -44,10 +65,21 @@ class Checkpoint:
     info: CheckpointInfo
     tensors: dict[str, Tensor]
     path: Path | None = field(default=None, compare=False)  # of the file that it was read from; None: of none
+    settings: dict[str, Any] = field(default_factory=dict)  # ``settings_of`` its trainer; empty: not known
 
     @property
     def name(self) -> str:
         return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
+
+    def require_settings(self, config: Config) -> None:
+        """Raise where ``config`` has another value of a setting that decided what the checkpoint holds."""
+        for name, now in settings_of(config).items():
+            before = self.settings.get(name, now)
+            if before != now:
+                raise DyngsError(
+                    f"{self.name}: was trained with {name}={before}, but config.yaml has {name}={now}; "
+                    "change it back, or train anew"
+                )
 
     def part(self, prefix: str) -> dict[str, Tensor]:
         """Return the tensors whose names start with ``prefix.``, without it."""

@@ -13,6 +13,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, as_word
 from dyngs.files.outputs import new_folder
 from dyngs.files.temporary import remove_leftovers
+from dyngs.runs.capture_record import RECORD_NAME, changed_files
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
 from dyngs.runs.lock import LOCK_NAME, writing
@@ -24,7 +25,7 @@ CHOICES_NAME = "choices.json"
 """In a run folder: what small runs before it said."""
 ASKED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
-_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, CHOICES_NAME, BODY_FOLDER)
+_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, CHOICES_NAME, RECORD_NAME, BODY_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
 
 
@@ -120,11 +121,12 @@ def note_asked(folder: Path, asked: Config) -> None:
 
 
 def note_root(folder: Path, data: DataConfig) -> None:
-    """Write into the configuration of a run where its capture lies by now, if that differs and there is a capture."""
+    """Write into the configuration of a run where its capture lies by now; it must be the same capture."""
     for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:
-            read_capture(data)
+            capture = None if stored.model.is_network else read_capture(data)
+            changed_files(folder, data, capture)
             save_config(stored.model_copy(update={"data": stored.data.model_copy(update={"root": data.root})}), path)
 
 

@@ -14,6 +14,7 @@ from dyngs.data.capture import Capture, all_views
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import Inputs
+from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, LoadedRun, checkpoint_paths, has_only_scene_file
 from dyngs.runs.config_file import BODY_FOLDER
 from dyngs.runs.folder import ASKED_NAME
@@ -67,7 +68,7 @@ def _config_of(run_dir: Path) -> Config | None:
 
 
 def _files_of_run(run_dir: Path) -> Iterator[Path]:
-    yield from (run_dir / name for name in (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME))
+    yield from (run_dir / name for name in (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME))
     yield from checkpoint_paths(run_dir)
     yield from (run_dir / BODY_FOLDER).glob("*")
     if has_only_scene_file(run_dir):

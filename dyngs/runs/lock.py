@@ -122,7 +122,7 @@ def _locked(folder: Path) -> tuple[int, bool]:
 def _opened(path: Path) -> int:
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
-        file = os.open(path, flags, 0o644)
+        file = os.open(path, flags, 0o666)
     except OSError as error:
         link = "; it is a link, remove it" if path.is_symlink() else ""
         raise DyngsError(f"cannot write {path}: {error.strerror or error}{link}") from error

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import IO, Any
 
 from dyngs.config import Config
@@ -20,7 +21,8 @@ PLAIN_LINES = 10
 class Progress:
     """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; a context manager.
 
-    Where there is no terminal, plain lines. Tells nothing where ``total`` steps are already done.
+    Where there is no terminal, plain lines. Prints nothing where ``total`` steps are already done. Output that cannot
+    be written is dropped: a terminal that was closed must not end the run.
 
     Args:
         every: steps between updates; the last step has one, too.
@@ -78,7 +80,7 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._task, completed=record.step, text=text, left=left)
         else:
-            print(f"step {record.step}/{self._total} {text} {left} left", file=self._stream, flush=True)
+            self.say(f"step {record.step}/{self._total} {text} {left} left")
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 
     def expect(self, total: int) -> None:
@@ -88,10 +90,11 @@ class Progress:
 
     def say(self, line: str) -> None:
         """Show ``line`` above the progress bar."""
-        if self._bar is not None:
-            self._bar.console.print(line, markup=False, highlight=False)
-        else:
-            print(line, file=self._stream, flush=True)
+        with suppress(OSError):
+            if self._bar is not None:
+                self._bar.console.print(line, markup=False, highlight=False)
+            else:
+                print(line, file=self._stream, flush=True)
 
     def pause(self, seconds: float) -> None:
         """Leave ``seconds`` that were not spent training out of the rate."""
@@ -108,7 +111,8 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
-            self._bar.stop()
+            with suppress(OSError):
+                self._bar.stop()
 
 
 def _rich_bar(total: int, done: int, stream: IO[str]) -> tuple[Any, Any]:

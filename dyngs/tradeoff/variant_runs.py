@@ -15,7 +15,7 @@ from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.kinds import assemble, restored_model
-from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.stage import prune_
 from dyngs.runs.checkpoint import (
@@ -217,5 +217,6 @@ def _write(folder: Path, checkpoint: Checkpoint, config: Config, source: Path, *
     tensors = checkpoint.tensors
     if not whole:
         tensors = tensors_of(restored_model(checkpoint, config.model).state())
-    save_checkpoint(folder, replace(checkpoint, tensors=tensors), seconds_at(source, checkpoint.info.step))
+    checkpoint = replace(checkpoint, tensors=tensors, settings=settings_of(config))
+    save_checkpoint(folder, checkpoint, seconds_at(source, checkpoint.info.step))
     write_config(config, folder)

@@ -24,6 +24,8 @@ MOTION = 2.0  # Factor by which steps cost more once things may move
 DETAIL = 0.5
 """Power of the images' side with which the number of Gaussians grows: 2 to 4.7 times were seen from 1/4 to full."""
 SAMPLES = 64
+SAVE_FRACTION = 0.05
+"""Largest fraction of the time that regular checkpoints may take."""
 
 
 class Stopwatch:
@@ -39,6 +41,30 @@ class Stopwatch:
     def pause(self, seconds: float) -> None:
         """Leave ``seconds`` out (negative: count them in)."""
         self._since += seconds
+
+
+class SaveTimer:
+    """When the next regular checkpoint is due.
+
+    Args:
+        minutes: ``train.save_minutes``.
+        now: seconds of training at which the run begins or is resumed.
+    """
+
+    def __init__(self, minutes: float, now: float) -> None:
+        self._minutes = minutes
+        self._last = now
+        self._duration = 0.0
+
+    def is_due(self, now: float) -> bool:
+        """Return whether a checkpoint is due after ``now`` seconds of training."""
+        interval = max(60 * self._minutes, self._duration / SAVE_FRACTION)
+        return self._minutes > 0 and now - self._last >= interval
+
+    def saved(self, begin: float, end: float) -> None:
+        """Note that a checkpoint was written from ``begin`` to ``end``, seconds of training."""
+        self._last = end
+        self._duration = end - begin
 
 
 def with_steps(config: Config, steps: int) -> Config:
@@ -113,6 +139,15 @@ class Forecast:
         since = next((m for m in reversed(self._marks[:-1]) if m.step <= middle), first)
         cost = cost_between(config, done, total, self._pixels, lambda step: self._expected(config, step, since))
         return cost * (now.seconds - since.seconds) / max(now.cost - since.cost, 1e-9)
+
+    def least_seconds(self, config: Config, steps: int) -> float:
+        """Return the seconds of a run of ``steps`` whose steps become dearer by larger images alone."""
+        first, now = self._marks[0], self._marks[-1]
+        pace = (now.seconds - first.seconds) / max(now.cost - first.cost, 1e-9)
+        train = with_steps(config, steps).train
+        sampled = [math.ceil(steps * (i + 0.5) / SAMPLES) for i in range(SAMPLES)]
+        pixels = [self._pixels / image_divisor(train, step) ** 2 for step in sampled]
+        return steps * pace * fmean(step_cost(None, 0, x, now.num_gaussians) for x in pixels)
 
     def _expected(self, config: Config | None, step: int, since: _Mark) -> float:
         """Return how many Gaussians are expected at ``step``.

@@ -102,9 +102,10 @@ class Loop:
 
 
 class Interrupts:
-    """A context manager in which the first Ctrl-C or SIGTERM only sets ``requested``; a second Ctrl-C raises as usual.
+    """A context manager in which a signal only sets ``requested``: Ctrl-C, SIGTERM, or SIGHUP from a closed terminal.
 
-    Does nothing outside the main thread, where Python delivers no signals.
+    A second Ctrl-C raises as usual. SIGHUP stays ignored under ``nohup``. Does nothing outside the main thread, where
+    Python delivers no signals.
     """
 
     def __init__(self) -> None:
@@ -113,7 +114,10 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is threading.main_thread():
-            self._before = {s: signal.signal(s, self._request) for s in (signal.SIGINT, signal.SIGTERM)}
+            signals = [signal.SIGINT, signal.SIGTERM]
+            if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+                signals.append(signal.SIGHUP)
+            self._before = {number: signal.signal(number, self._request) for number in signals}
         return self
 
     def __exit__(

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, reading
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
 from dyngs.models.kind import kind_of
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
@@ -68,7 +68,8 @@ class NetworkTrainer:
         tensors |= {f"optimizer.{name}": x for name, x in optimizer_state(self.optimizer, network).items()}
         mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value  # fields have none
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.learner.background, mode)
-        return Checkpoint(info, {name: x.detach().cpu() for name, x in tensors.items()})
+        stored = {name: x.detach().cpu() for name, x in tensors.items()}
+        return Checkpoint(info, stored, settings=settings_of(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self.learner.load(checkpoint)

@@ -17,7 +17,7 @@ from dyngs.config import Config
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.errors import DyngsError, reading
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
 from dyngs.models.model import Look, Loss, Model
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
@@ -185,7 +185,8 @@ class Trainer(Generic[M]):
         for name, part in self._parts().items():
             state |= prefixed(name, with_role(part.state(), Role.TRAINING))
         state |= with_role({"rng": self.generator.get_state()}, Role.TRAINING)
-        return Checkpoint(self.info, {name: x.cpu() for name, x in tensors_of(state).items()})
+        tensors = {name: x.cpu() for name, x in tensors_of(state).items()}
+        return Checkpoint(self.info, tensors, settings=settings_of(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go back to where ``checkpoint`` was taken."""

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import select
 import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +20,9 @@ from tiny_fields import ALL_KINDS, busy_config, write_tiny_capture
 from tiny_people import NET, people
 from torch import Tensor
 
+from dyngs.api import train as train_module
 from dyngs.api.train import train, with_capture
+from dyngs.cli import main
 from dyngs.config import (
     Config,
     DataConfig,
@@ -28,21 +34,31 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, packaged_presets, save_config
 from dyngs.data import read
 from dyngs.data.capture import Capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.kinds import assemble
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
 from dyngs.training import losses
+from dyngs.training.clock import SaveTimer
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import StepReport, Trainer
 
 # Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.
 BUSY = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150)
 BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90, min_opacity=0.45)
+
+IN_TERMINAL = """
+import fcntl, sys, termios
+from dyngs.__main__ import main
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)  # signals of the terminal reach this process
+sys.argv = ["dyngs", "train", sys.argv[1], f"run.dir={sys.argv[2]}"]
+sys.exit(main())
+"""
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +192,93 @@ def test_sigterm_saves_too(capture: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert load_run(tmp_path / "run").step == 3
 
 
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals")
+def test_a_closed_terminal_saves_too(capture: Path, tmp_path: Path) -> None:
+    """A real process whose terminal goes away while it prints there."""
+    config = _config(capture, tmp_path / "run", steps=100_000)
+    save_config(config, tmp_path / "config.yaml")
+    controlling, terminal = os.openpty()
+    files = {"stdin": terminal, "stdout": terminal, "stderr": terminal}
+    environment = os.environ | {"TERM": "xterm"}
+    with subprocess.Popen(
+        [sys.executable, "-c", IN_TERMINAL, str(tmp_path / "config.yaml"), str(tmp_path / "run")],
+        start_new_session=True,
+        env=environment,
+        **files,
+    ) as process:
+        os.close(terminal)
+        log = tmp_path / "run" / "log.jsonl"
+        printed = b""
+        while process.poll() is None and not (log.is_file() and log.stat().st_size):
+            if select.select([controlling], [], [], 0.05)[0]:
+                printed += os.read(controlling, 65536)
+        os.close(controlling)
+        assert process.wait(60) == 130, printed
+    done = load_run(tmp_path / "run").step
+    assert done == _log(tmp_path / "run")[-1]["step"] > 0
+
+
+@pytest.fixture
+def interrupted(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that was stopped; its capture is a copy."""
+    shutil.copytree(capture, tmp_path / "capture")
+    with monkeypatch.context() as patch:
+        _interrupt_after(3, patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(_config(tmp_path / "capture", tmp_path / "run", steps=6))
+    return tmp_path / "run"
+
+
+def test_a_resumed_run_names_images_that_were_replaced(
+    interrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = tmp_path / "capture" / "train"
+    shutil.copyfile(images / "r_002.png", images / "r_001.png")
+    assert main(["train", "--resume", str(interrupted)]) == 0
+    warning = "files of 1 training view have changed since the run began: train/r_001"
+    assert f"dyngs: warning: {warning}\n" in capsys.readouterr().err
+
+
+def test_a_resumed_run_refuses_another_capture(
+    interrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where it is said to be the same one at another place; that of a copy goes on to the same bytes."""
+    other, copied = tmp_path / "other", tmp_path / "copied"
+    write_still_capture(other, StillOptions(size=24, num_train=4, num_test=1, samples=1))
+    before = (interrupted / RESOLVED_NAME).read_text()
+    assert main(["train", "--resume", str(interrupted), f"data.root={other}"]) == 2
+    assert "other sizes of train/r_000" in capsys.readouterr().err
+    assert (interrupted / RESOLVED_NAME).read_text() == before
+    (tmp_path / "capture").rename(copied)
+    assert main(["train", "--resume", str(interrupted), f"data.root={copied}"]) == 0
+    assert "warning" not in capsys.readouterr().err
+    assert _final_bytes(interrupted) == _final_bytes(train(_config(copied, tmp_path / "whole", steps=6)))
+    shutil.copytree(other, copied, dirs_exist_ok=True)
+    assert main(["train", "--resume", str(interrupted), "train.steps=8"]) == 2
+    assert "not the capture that the run was trained on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("  kind: static\n", "  kind: dynamic\n", "model.kind=static, but config.yaml has model.kind=dynamic"),
+        ("  sh_degree: 2\n", "  sh_degree: 1\n", "model.sh_degree=2, but config.yaml has model.sh_degree=1"),
+        ("  refine: never\n", "  refine: always\n", "camera.refine=never, but config.yaml has camera.refine=always"),
+        ("  exposure: never\n", "  exposure: always\n", "train.exposure=never, but config.yaml"),
+    ],
+)
+def test_an_edited_configuration_that_contradicts_the_checkpoint_is_refused(
+    before: str, after: str, said: str, interrupted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = interrupted / RESOLVED_NAME
+    text = file.read_text()
+    assert text.count(before) == 1
+    file.write_text(text.replace(before, after))
+    for words in (["train", "--resume", str(interrupted)], ["eval", str(interrupted)]):
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_time_adds_up_over_resumes(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_dir = tmp_path / "run"
     with monkeypatch.context() as patch:
@@ -296,6 +399,52 @@ def test_checkpoints_and_scores_come_when_asked(capture: Path, tmp_path: Path) -
     assert json.loads((folder / "metrics.json").read_text())["num_views"] == 1
 
 
+@pytest.fixture
+def saves_each_step(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The time between checkpoints is over after each step; returns the steps of all that are written."""
+    saved, real = list[int](), train_module.save_checkpoint
+
+    def noted(folder: Path, checkpoint: Checkpoint, seconds: float) -> Path:
+        saved.append(checkpoint.info.step)
+        return real(folder, checkpoint, seconds)
+
+    monkeypatch.setattr(train_module, "save_checkpoint", noted)
+    monkeypatch.setattr(SaveTimer, "is_due", lambda timer, now: timer._minutes > 0)
+    return saved
+
+
+def _saved_often(config: Config, minutes: float = 5.0) -> Config:
+    return config.model_copy(update={"train": config.train.model_copy(update={"save_minutes": minutes})})
+
+
+def test_checkpoints_come_by_time_in_every_preset() -> None:
+    for name in packaged_presets():
+        assert load_config(packaged_preset(name), ["data.root=nowhere"]).train.save_minutes == 5
+
+
+@pytest.mark.parametrize("strategy", [BUSY, BUSY_MCMC], ids=["default", "mcmc"])
+def test_saving_changes_no_byte(
+    capture: Path, tmp_path: Path, strategy: DefaultStrategy | McmcStrategy, saves_each_step: list[int]
+) -> None:
+    plain = train(_saved_often(_config(capture, tmp_path / "plain", strategy=strategy), 0))
+    assert saves_each_step == [14]
+    often = train(_config(capture, tmp_path / "often", strategy=strategy))
+    assert saves_each_step[1:] == list(range(1, 15))
+    assert [path.stem for path in checkpoint_paths(often)] == ["step_0000013", "step_0000014"]
+    assert _final_bytes(plain) == _final_bytes(often)
+
+
+def test_saving_changes_no_byte_of_a_network(tmp_path: Path, saves_each_step: list[int]) -> None:
+    root = people(tmp_path / "people", (1, 2))
+    ends = []
+    for minutes in (0.0, 5.0):
+        run = RunConfig(dir=tmp_path / f"run{minutes:g}", threads=1)
+        config = Config(data=DataConfig(root=root), model=NET, train=TrainConfig(steps=3), run=run)
+        ends.append(_final_bytes(train(_saved_often(config, minutes))))
+    assert saves_each_step == [3, 1, 2, 3]
+    assert ends[0] == ends[1]
+
+
 def test_the_capture_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Deciding, training and evaluating hand it on."""
     root, reads, real = write_tiny_capture(tmp_path / "capture"), list[Path](), read._finished
@@ -359,6 +508,14 @@ def test_a_resumed_moving_run_equals_an_uninterrupted_one(
     assert _final_bytes(resumed) == _final_bytes(whole_run)
     same = ("step", "loss", "psnr", "num_gaussians", "num_moving")
     assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole_run)]
+
+
+def test_saving_changes_no_byte_of_a_moving_run(
+    whole_run: Path, moving_capture: Path, tmp_path: Path, saves_each_step: list[int]
+) -> None:
+    often = train(busy_config(moving_capture, tmp_path / "often", _kind_of(whole_run)))
+    assert saves_each_step == list(range(1, 25))
+    assert _final_bytes(often) == _final_bytes(whole_run)
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)

@@ -25,11 +25,23 @@ from dyngs.budget.time import (
     refitted,
     same_phase,
 )
-from dyngs.config import AutoColour, Config, DataConfig, DynamicModel, TrainConfig
+from dyngs.config import (
+    AutoColour,
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.config.io import load_resolved
+from dyngs.data.capture import View
+from dyngs.data.decoding import Decoded
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.deform.schedule import motion_begins_after
-from dyngs.errors import DyngsError
 from dyngs.kinds import assemble, prepared
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
@@ -197,22 +209,86 @@ def _slowed(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[float]:
     return clock
 
 
-def test_a_first_fit_keeps_or_lowers_the_steps_or_refuses(
-    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_first_fit_keeps_or_lowers_the_steps(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = busy_config(moving, tmp_path, "control_nodes")
     wanted = config.train.steps
     _slowed(monkeypatch, 1.0)
     assert wanted < FEWEST_STEPS
-    assert first_fit(timed(config, 1000.0), assemble(config), 0.0).train.steps == wanted
-    with pytest.raises(DyngsError, match=r"train.minutes=0.1: about \d+ steps? would fit.* would do") as refused:
-        first_fit(timed(config, 0.1), assemble(config), 0.0)
-    would_do = float(str(refused.value).split(";")[1].split()[0])
-    assert first_fit(timed(config, would_do), assemble(config), 0.0).train.steps == wanted
+    assert first_fit(timed(config, 1000.0), assemble(config), 0.0)[0].train.steps == wanted
+    assert first_fit(timed(config, 0.1), assemble(config), 0.0)[0].train.steps in (1, 2)
+    assert first_fit(timed(config, 0.001), assemble(config), 0.0)[0].train.steps == 1
     long = with_steps(config, 1000)
-    fitted = first_fit(timed(long, 20.0), assemble(long), 0.0).train.steps
+    fitted = first_fit(timed(long, 20.0), assemble(long), 0.0)[0].train.steps
     assert FEWEST_STEPS <= fitted < 1000
     assert fitted <= AIM * 1200
+
+
+def _slowed_by_pixels(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """A clock that only steps advance, by ``seconds`` for each pixel of their image."""
+    clock, real = _slowed(monkeypatch, 0.0), Trainer.step
+
+    def stepping(trainer: Trainer) -> StepReport:
+        report = real(trainer)
+        clock[0] += seconds * report.truth[..., 0].numel()
+        return report
+
+    monkeypatch.setattr(Trainer, "step", stepping)
+    monkeypatch.setattr("dyngs.budget.time.SMALLEST_SIDE", 5)
+
+
+def test_decoding_counts_once_for_each_image(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of a second on 16 images that take ten seconds each: with them in every step 50 would fit."""
+    clock, real = _slowed(monkeypatch, 1.0), ImageLoader._decode
+
+    def decoded(loader: ImageLoader, view: View) -> Decoded:
+        clock[0] += 10.0
+        return real(loader, view)
+
+    monkeypatch.setattr(ImageLoader, "_decode", decoded)
+    folder = train(_still(moving, tmp_path / "run"))
+    assert load_resolved(folder).data.longest_side is None
+    assert 360 <= load_run(folder).step <= 430
+    assert load_run(folder).seconds_train <= 600
+
+
+def _still(capture: Path, folder: Path) -> Config:
+    return Config(
+        data=DataConfig(root=capture),
+        model=StaticModel(sh_degree=0),
+        init=RandomInit(num_random=20),
+        strategy=DefaultStrategy(grow=False),
+        train=TrainConfig(steps=1000, minutes=10.0),
+        run=RunConfig(dir=folder, threads=1),
+    )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "side", "fewest", "most"),
+    [
+        (0.004, None, 230, 258),  # 2.3 s a step: enough fit
+        (0.01, 12, 355, 370),  # 5.8 s a step: 100 fit; a quarter of that at 12 px
+        (0.05, 6, 255, 270),  # 29 s a step: at 12 px still too few fit
+        (0.5, 6, 10, 16),  # 288 s a step; at 6 px, the smallest here, 18 s
+    ],
+)
+def test_images_are_halved_until_enough_steps_fit(
+    seconds: float, side: int | None, fewest: int, most: int, moving: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Of images of 24 px in ten minutes."""
+    _slowed_by_pixels(monkeypatch, seconds)
+    folder = train(_still(moving, tmp_path / "run"))
+    printed = capsys.readouterr().out
+    resolved = load_resolved(folder)
+    assert resolved.data.longest_side == side
+    assert load_resolved(folder / "asked.yaml").data.longest_side is None
+    assert ("images are shrunk" in printed) == (side is not None)
+    assert f"shrunk to {side} px (data.longest_side)" in printed or side is None
+    run = load_run(folder)
+    assert fewest <= run.step <= most
+    assert run.seconds_train <= 600
+    train(resolved, resume_from=folder)
+    assert load_run(folder).step == run.step
 
 
 def test_a_run_that_gets_slow_ends_in_time_and_stays_ended(

@@ -184,13 +184,23 @@ def test_what_is_not_made_of_gaussians_takes_part(
     assert len(stored["curve"]) == 2
 
 
+def test_a_model_whose_images_were_shrunk_is_left_out(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("dyngs.budget.time.SMALLEST_SIDE", 8)
+    words = ["compare", str(capture), "--models", "static", "--minutes", "0.01", "--threads", "1"]
+    assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
+    said = "static: too few steps fit into 0.01 minutes of training, so its images were shrunk to 8 px"
+    assert said in capsys.readouterr().err
+
+
 def test_a_comparison_that_comes_to_nothing_leaves_nothing(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert main(["compare", str(capture), "--models", "static", "--minutes", "0.0001", "--out", str(out)]) == 2
+    assert main(["compare", str(capture), "--models", "static", "--max-mb", "0.0001", "--out", str(out)]) == 2
     said = capsys.readouterr()
-    assert "no model could be trained; static: train.minutes=0.0001: about" in said.err
+    assert "no model could be trained; static: budget.max_mb=0.0001: has no room" in said.err
     assert "static (1 of 1): left out" in said.out
     assert not out.exists()
 

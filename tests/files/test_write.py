@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from dyngs.cli import main
 from dyngs.data.images.images import read_image
 from dyngs.errors import DyngsError
 from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
@@ -69,3 +72,51 @@ def test_whole_numbers_of_16_bits_stay_as_they_are(tmp_path: Path) -> None:
     values = np.array([[0, 1, 255], [256, 40000, 65535]], dtype=np.uint16)
     write_image(tmp_path / "a.png", values)
     assert np.array_equal(oiio.ImageBuf(str(tmp_path / "a.png")).get_pixels(oiio.UINT16)[..., 0], values)
+
+
+WRITERS = (
+    "train static data.root=STILL run.dir=run run.threads=1 train.steps=3 init.kind=random init.num_random=60",
+    "eval run",
+    "render run --out images --depth",
+    "render run --path orbit --frames 2 --out orbit --video orbit/orbit.mp4",
+    "export run --format ply --out files/a.ply",
+    "export run --format compressed-ply --out files/b.compressed.ply",
+    "export run --format spz --out files/a.spz",
+    "export run --format splat --out files/a.splat",
+    "export run --format sog --out files/a.sog",
+    "export run --format glb --out files/a.glb",
+    "export run --format html --out files/a.html",
+    "export run --format html --folder --out page",
+    "export run --format cameras --out cameras",
+    "export run --format dyngs --out stored",
+    "convert files/a.ply files/c.spz",
+    "edit run --out edited --up -y",
+    "data synth still made --size 16 --views 4",
+    "train human data.root=PERSON run.dir=person run.threads=1 train.steps=2 model.resolution=24 model.fit=false",
+    "export person --format avatar --out files/person.safetensors",
+)
+"""Commands that write files."""
+
+
+@pytest.mark.parametrize("umask", [0o002, 0o077], ids=["shared", "private"])
+def test_files_and_folders_have_what_the_umask_allows(
+    umask: int, still: Path, person: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    captures = {"STILL": str(still), "PERSON": str(person)}
+    before = os.umask(umask)
+    try:
+        for words in WRITERS:
+            for name, folder in captures.items():
+                words = words.replace(name, folder)
+            assert main(words.split()) == 0, words
+    finally:
+        os.umask(before)
+    found = {
+        str(path.relative_to(work)): (path.is_dir(), stat.S_IMODE(path.stat().st_mode)) for path in work.rglob("*")
+    }
+    assert len(found) > 40
+    wrong = {name: oct(mode) for name, (is_dir, mode) in found.items() if mode != (0o777 if is_dir else 0o666) & ~umask}
+    assert wrong == {}

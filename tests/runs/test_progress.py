@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 
 import pytest
@@ -65,3 +66,25 @@ def test_it_listens() -> None:
     assert [line.split(" loss")[0] for line in lines] == ["step 5/12", "something was found", "step 8/8"]
     assert "1,234 Gaussians" in lines[0]
     assert " 0.0 steps/s" in lines[-1], "a million seconds more were spent training"
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_a_closed_terminal_does_not_end_the_run(is_terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+
+    class Gone(io.StringIO):
+        is_gone = False
+
+        def isatty(self) -> bool:
+            return is_terminal
+
+        def write(self, text: str) -> int:
+            if self.is_gone:
+                raise OSError(errno.EIO, "Input/output error")
+            return super().write(text)
+
+    stream = Gone()
+    with Progress(12, 0, 5, stream) as progress:
+        stream.is_gone = True
+        progress(step_done(5, 12))
+        progress(Message("something was found"))

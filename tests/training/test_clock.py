@@ -11,7 +11,7 @@ import pytest
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.models.schedule import image_divisor
-from dyngs.training.clock import Forecast
+from dyngs.training.clock import Forecast, SaveTimer
 
 STEPS = 6000
 
@@ -98,3 +98,36 @@ def test_after_densification_nothing_is_expected_to_grow() -> None:
     run = Run(dynamic(1000), lambda x: 1000 + 9000 * min(x, 0.9), 100 * 100, 1e-3, 0.0, 1e-6)
     truth = run.seconds(960, 1000)
     assert run.predicted(960)[0] == pytest.approx(truth, rel=0.15)
+
+
+def test_checkpoints_are_due_by_time() -> None:
+    timer = SaveTimer(5.0, 100.0)
+    assert not timer.is_due(399.9)
+    assert timer.is_due(400.0)
+    timer.saved(400.0, 410.0)
+    assert not timer.is_due(709.9)
+    assert timer.is_due(710.0)
+
+
+def test_slow_checkpoints_are_written_less_often() -> None:
+    """One that takes a minute comes every twenty minutes."""
+    timer = SaveTimer(5.0, 0.0)
+    timer.saved(300.0, 360.0)
+    assert not timer.is_due(360.0 + 1199.0)
+    assert timer.is_due(360.0 + 1200.0)
+
+
+def test_no_checkpoint_is_due_without_an_interval() -> None:
+    assert not SaveTimer(0.0, 0.0).is_due(1e9)
+
+
+def test_the_least_that_a_run_takes() -> None:
+    """Steps of images that are whole from the start take as long as so far; with small ones first, longer."""
+    forecast = Forecast(0, 0.0, 1000)
+    plain = load_config("blender", ["data.root=nowhere", "train.steps=200"])
+    forecast.observe(plain, 10, 5.0, 1000, 10_000)
+    assert forecast.least_seconds(plain, 200) == pytest.approx(100.0)
+    moving = dynamic(200)
+    forecast = Forecast(0, 0.0, 1000)
+    forecast.observe(moving, 10, 5.0, 1000, 10_000)
+    assert 100.0 < forecast.least_seconds(moving, 200) < forecast.seconds(moving, 200, 0)

@@ -14,6 +14,8 @@ from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TotalChanged
 from dyngs.training.loop import Interrupts, Loop
 
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
 
 def looped(
     trainer: Counting, total: int, *listeners: Callable[[Event], None], advice: Callable[[], str] | None = None
@@ -140,7 +142,7 @@ def test_the_watch_leaves_pauses_out() -> None:
     assert 600 <= watch.seconds - before < 660
 
 
-@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("which", SIGNALS)
 def test_a_signal_is_only_noted(which: signal.Signals) -> None:
     before = signal.getsignal(which)
     with Interrupts() as interrupts:
@@ -156,6 +158,17 @@ def test_a_second_ctrl_c_insists() -> None:
         assert interrupts.requested
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no signal of a closed terminal")
+def test_nohup_is_respected() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupts() as interrupts:
+            signal.raise_signal(signal.SIGHUP)
+            assert not interrupts.requested
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_other_threads_may_train_too() -> None:

@@ -58,7 +58,6 @@ def poses_of_videos(
     try:
         with staying_within(source, options.follow_links), images_up_to(options.max_megapixels):
             lines = _made_in(work, source, options, report)
-        work.chmod(0o755)
         if out.exists():
             out.rmdir()
         os.replace(work, out)

@@ -17,7 +17,8 @@ class TrainConfig(Section):
         default=None,
         gt=0,
         description="longest time of training on this machine, min; fewer than train.steps are done if need be, with "
-        "schedules to match, and a line at the end says what all would cost; 1 is a preview; null: no limit",
+        "schedules to match, in smaller images where too few fit, and a line at the end says what all would cost; 1 is "
+        "a preview; null: no limit",
     )
     batch_size: int = Field(
         default=1,
@@ -69,6 +70,12 @@ class TrainConfig(Section):
         description="steps, of a 30,000-step run, after which one more degree of harmonics is trained each time",
     )
     log_every: int = Field(default=10, ge=1, description="steps between lines of log.jsonl")
-    save_every: int = Field(default=0, ge=0, description="steps between checkpoints; 0: only the last")
+    save_minutes: float = Field(
+        default=5.0,
+        ge=0,
+        description="minutes of training between checkpoints, longer where saving takes more than a twentieth of that; "
+        "the newest two are kept; 0: only the last",
+    )
+    save_every: int = Field(default=0, ge=0, description="steps between checkpoints, in addition; 0: none by steps")
     eval_every: int = Field(default=0, ge=0, description="steps between evaluations; 0: only by `dyngs eval`")
     tensorboard: bool = Field(default=False, description="also log to RUN/tensorboard (pip install dyngs[tensorboard])")

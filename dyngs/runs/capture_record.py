@@ -1,0 +1,148 @@
+"""Record of the capture that a run is trained on. A resumed run compares it with the capture there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from functools import cache
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture, View
+from dyngs.data.geometry import camera_center
+from dyngs.data.people_set import captures_in
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_text
+
+RECORD_NAME = "capture.json"
+"""In a run folder: the cameras and digests of the files of the training views."""
+SAMPLES = 4
+SAMPLE_BYTES = 2**14
+"""Number and size of the blocks of a file that its digest covers; smaller files are read whole."""
+TOLERANCE = 1e-6
+"""Largest change of a number that is a rounding error; of positions in extents of all positions."""
+_PARTS = {"sizes": slice(0, 2), "times": slice(2, 3), "cameras": slice(3, None)}
+_CENTRE = slice(3, 6)
+_SHOWN = 3
+
+
+def write_record(folder: Path, data: DataConfig, capture: Capture | None) -> None:
+    """Write the record of a run that begins; ``capture`` None: of a network, trained on people."""
+    write_text(folder / RECORD_NAME, json.dumps(_record(data, capture)) + "\n")
+
+
+def changed_files(folder: Path, data: DataConfig, capture: Capture | None) -> list[str]:
+    """Return the names of training views whose files have changed since the run began.
+
+    A run without a record has none. Raises DyngsError: other views, sizes, times or cameras.
+    """
+    path = folder / RECORD_NAME
+    now = _record(data, capture)
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        change = _change(stored["views"], now["views"])
+        files = [name for name, digest in now["files"].items() if stored["files"].get(name) != digest]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # of an earlier version, or damaged
+        return []
+    if change is not None:
+        raise DyngsError(
+            f"{data.root}: not the capture that the run was trained on ({change}); restore it, or "
+            f"train anew with another run.dir; to go on all the same remove {path}"
+        )
+    return files
+
+
+def named(names: Sequence[str]) -> str:
+    """Return the first of ``names``, and how many there are more."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+def _change(before: dict[str, list[float]], now: dict[str, list[float]]) -> str | None:
+    """Return what differs between the views of two records; None where nothing does."""
+    removed = [name for name in before if name not in now]
+    if removed:
+        return f"without the training views {named(removed)}"
+    added = [name for name in now if name not in before]
+    if added:
+        return f"with the new training views {named(added)}"
+    rows = {name: (np.array(before[name]), np.array(now[name])) for name in now}
+    centres = np.array([one[_CENTRE] for one, _ in rows.values()])
+    extent = np.ptp(centres, axis=0).max() if centres.size else 0.0
+    for what, part in _PARTS.items():
+        others = [name for name, (one, other) in rows.items() if not _is_close(one, other, part, extent)]
+        if others:
+            return f"other {what} of {named(others)}"
+    return None
+
+
+def _is_close(one: np.ndarray, other: np.ndarray, part: slice, extent: float) -> bool:
+    """Return whether ``part`` of two views differs by no more than rounding errors."""
+    if one.shape != other.shape:
+        return False
+    tolerance = np.full(len(one), TOLERANCE)
+    tolerance[_CENTRE] *= extent
+    return bool((np.abs(one - other) <= tolerance + 1e-9 * np.abs(one))[part].all())
+
+
+def _record(data: DataConfig, capture: Capture | None) -> dict[str, Any]:
+    if capture is None:
+        people = {one.root.relative_to(data.root).as_posix(): one.root for one in captures_in(data)}
+        files = {name: _listing(root) for name, root in people.items()}
+        return {"views": {name: [] for name in people}, "files": files}
+    digest = cache(_digest)
+    views = {}
+    files = {}
+    for view in capture.splits["train"]:
+        views[view.name] = _numbers(view, capture.world_offset)
+        files[view.name] = " ".join(map(digest, _files_of(view)))
+    body = None if capture.body is None else capture.body.get("train")
+    if body is not None:
+        numbers = body.poses.tobytes() + body.betas.tobytes()
+        files["the body's poses"] = blake2b(numbers, digest_size=8).hexdigest()
+    return {"views": views, "files": files}
+
+
+def _numbers(view: View, world_offset: np.ndarray) -> list[float]:
+    """Return size, time and camera of a view, in the coordinates of the capture's files."""
+    centre = camera_center(view.cam_from_world) + world_offset
+    rotation = view.cam_from_world[:3, :3]
+    size = (view.width, view.height, -1.0 if view.time is None else view.time)
+    lens = (*view.lens.params, view.lens.focal_ratio)
+    return np.concatenate([size, centre, rotation.ravel(), view.intrinsics[:2].ravel(), lens]).tolist()
+
+
+def _files_of(view: View) -> Iterator[Path]:
+    yield view.image_path if view.video is None else view.video.video
+    maps = (view.mask_path, view.depth_path, view.motion_mask_path, view.flow_path)
+    yield from (path for path in maps if path is not None)
+    if view.silhouette is not None:
+        yield view.silhouette.path
+
+
+def _digest(path: Path) -> str:
+    """Return a digest of the size and some blocks of a file; "" where it cannot be read."""
+    try:
+        size = path.stat().st_size
+        digest = blake2b(str(size).encode(), digest_size=8)
+        with path.open("rb") as file:
+            if size <= SAMPLES * SAMPLE_BYTES:
+                digest.update(file.read())
+                return digest.hexdigest()
+            for i in range(SAMPLES):
+                file.seek(i * (size - SAMPLE_BYTES) // (SAMPLES - 1))
+                digest.update(file.read(SAMPLE_BYTES))
+    except OSError:  # the loader names what is missing
+        return ""
+    return digest.hexdigest()
+
+
+def _listing(folder: Path) -> str:
+    """Return a digest of the names and sizes of all files below ``folder``."""
+    paths = sorted(folder.rglob("*.*"))
+    files = [(path.relative_to(folder).as_posix(), path.stat().st_size) for path in paths]
+    return blake2b(repr(files).encode(), digest_size=8).hexdigest()

@@ -1,0 +1,155 @@
+"""A capture that is the same one wherever and however it lies, and captures that are others."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_people import people
+
+from dyngs.config import DataConfig
+from dyngs.data.images.images import read_image
+from dyngs.data.read import read_capture
+from dyngs.data.scene_space import shifted
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
+from dyngs.runs.capture_record import RECORD_NAME, SAMPLE_BYTES, changed_files, named, write_record
+
+
+@pytest.fixture
+def capture(still: Path, tmp_path: Path) -> Path:
+    """A copy of a capture, whose record lies beside it."""
+    root = tmp_path / "capture"
+    shutil.copytree(still, root)
+    write_record(tmp_path, DataConfig(root=root), read_capture(root))
+    return root
+
+
+def changes(root: Path, record: Path) -> list[str]:
+    return changed_files(record, DataConfig(root=root), read_capture(root))
+
+
+def test_copied_and_touched_files_are_the_same(capture: Path, tmp_path: Path) -> None:
+    assert changes(capture, tmp_path) == []
+    shutil.copytree(capture, tmp_path / "elsewhere")
+    for path in (tmp_path / "elsewhere").rglob("*"):
+        os.utime(path, (1e9, 1e9))
+    assert changes(tmp_path / "elsewhere", tmp_path) == []
+
+
+def test_an_image_that_was_replaced_is_named(capture: Path, tmp_path: Path) -> None:
+    shutil.copyfile(capture / "train" / "r_002.png", capture / "train" / "r_001.png")
+    assert changes(capture, tmp_path) == ["train/r_001"]
+
+
+@pytest.mark.parametrize("at", [0.0, 0.4, 1.0])
+def test_an_edit_of_a_large_file_is_found(at: float, capture: Path, tmp_path: Path) -> None:
+    """Of 200 kB only some blocks are read; a compressed image differs from the edit on, so in its last block."""
+    path = capture / "train" / "r_001.png"
+    data = bytearray(path.read_bytes() + bytes(200_000))
+    path.write_bytes(data)
+    write_record(tmp_path, DataConfig(root=capture), read_capture(capture))
+    first = round(at * (len(data) - SAMPLE_BYTES))
+    data[max(first, 100) :] = bytes(1 for _ in data[max(first, 100) :])
+    path.write_bytes(data)
+    assert changes(capture, tmp_path) == ["train/r_001"]
+
+
+def resize(root: Path) -> None:
+    for path in root.rglob("*.png"):
+        pixels = np.asarray(read_image(path))
+        write_image(path, pixels[::2, ::2])
+
+
+def edit_frames(root: Path, edit: Callable[[list[dict[str, object]]], object]) -> None:
+    for path in root.glob("transforms_*.json"):
+        fields = json.loads(path.read_text())
+        edit(fields["frames"])
+        path.write_text(json.dumps(fields))
+
+
+def swap_poses(root: Path) -> None:
+    def swap(frames: list[dict[str, object]]) -> None:
+        poses = [frame["transform_matrix"] for frame in frames]
+        if len(frames) > 1:
+            frames[0]["transform_matrix"], frames[1]["transform_matrix"] = poses[1], poses[0]
+
+    edit_frames(root, swap)
+
+
+def scale_world(root: Path) -> None:
+    def scale(frames: list[dict[str, object]]) -> None:
+        for frame in frames:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] *= 2
+            frame["transform_matrix"] = matrix.tolist()
+
+    edit_frames(root, scale)
+
+
+def change_angle(root: Path) -> None:
+    path = root / "transforms_train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"camera_angle_x": 0.5}))
+
+
+def add_times(root: Path) -> None:
+    edit_frames(root, lambda frames: [frame.update(time=i / 3) for i, frame in enumerate(frames)])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (resize, r"other sizes of train/r_000, train/r_001, train/r_002 and 1 more\)"),
+        (swap_poses, r"other cameras of train/r_000, train/r_001\)"),
+        (scale_world, r"other cameras of train/r_000, .* and 1 more"),
+        (change_angle, r"other cameras of train/r_000, .* and 1 more"),
+        (add_times, r"other times of train/r_000, .* and 1 more"),
+        (lambda root: edit_frames(root, lambda frames: frames.pop()), r"\(without the training views train/r_003\)"),
+    ],
+    ids=["resized", "swapped poses", "scaled", "other focal length", "times", "a view fewer"],
+)
+def test_another_capture_is_refused(change: Callable[[Path], None], said: str, capture: Path, tmp_path: Path) -> None:
+    change(capture)
+    with pytest.raises(DyngsError, match=said) as refused:
+        changes(capture, tmp_path)
+    assert "\n" not in str(refused.value)
+    assert RECORD_NAME in str(refused.value)
+
+
+def test_where_the_reader_puts_the_origin_does_not_matter(capture: Path, tmp_path: Path) -> None:
+    moved = shifted(read_capture(capture), np.array([0.3, -7.0, 1e3]))
+    assert changed_files(tmp_path, DataConfig(root=capture), moved) == []
+    elsewhere = replace(moved, world_offset=moved.world_offset + np.array([0.0, 0.0, 0.01]))
+    with pytest.raises(DyngsError, match="other cameras"):
+        changed_files(tmp_path, DataConfig(root=capture), elsewhere)
+
+
+def test_the_people_of_a_network_are_known(tmp_path: Path) -> None:
+    data = DataConfig(root=people(tmp_path / "people", (1, 2)))
+    write_record(tmp_path, data, None)
+    assert changed_files(tmp_path, data, None) == []
+    (tmp_path / "people" / "p1" / "more.txt").write_text("more")
+    assert changed_files(tmp_path, data, None) == ["p1"]
+    shutil.rmtree(tmp_path / "people" / "p2")
+    with pytest.raises(DyngsError, match=r"\(without the training views p2\)"):
+        changed_files(tmp_path, data, None)
+
+
+@pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"views": {}}'])
+def test_a_run_without_a_record_goes_on(text: str | None, capture: Path, tmp_path: Path) -> None:
+    (tmp_path / RECORD_NAME).unlink()
+    if text is not None:
+        (tmp_path / RECORD_NAME).write_text(text)
+    resize(capture)
+    assert changes(capture, tmp_path) == []
+
+
+def test_many_names_are_counted() -> None:
+    assert named(["a", "b"]) == "a, b"
+    assert named(list("abcde")) == "a, b, c and 2 more"
