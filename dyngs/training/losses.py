@@ -26,20 +26,16 @@ class ImageLoss(Loss):
 
 
 class SilhouetteLoss(Loss):
-    """Mean error of alpha, where the images have any.
+    """Mean error of alpha, where the images have any, over the pixels that count."""
 
-    Args:
-        masked: only pixels that count in the image do so here.
-    """
-
-    def __init__(self, weight: float, *, masked: bool) -> None:
-        self.weight, self._masked = weight, masked
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
 
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
         if self.weight == 0 or look.image.alpha is None:
             return {}
         error = (look.drawn.rendering.alpha[0] - look.image.alpha).abs()
-        if self._masked and look.image.mask is not None:
+        if look.image.mask is not None:
             error = error * look.image.mask
         return {"alpha": self.weight * error.mean()}
 
