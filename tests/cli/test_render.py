@@ -51,7 +51,9 @@ def test_the_views_of_a_split_before_another_background(run_dir: Path, tmp_path:
         assert main(["render", str(run_dir), "--split", "test", "--out", str(out), *words]) == 0
         return {f.name: read_image(f).numpy() for f in out.glob("*.png")}
 
-    own, white, black = images("own"), images("white", "--background", "white"), images("black", "--background", "black")
+    own = images("own")
+    white = images("white", "--background", "white")
+    black = images("black", "--background", "black")
     first = min(own.keys() - {"sheet.png"})
     assert all((own[name] == white[name]).all() for name in own)
     assert (white[first][0, 0] == 255).all()

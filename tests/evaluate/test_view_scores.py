@@ -21,7 +21,14 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split
-from dyngs.evaluate.view_scores import Drawing, background_scores, mean_of, person_scores, right_half_scores, score_views
+from dyngs.evaluate.view_scores import (
+    Drawing,
+    background_scores,
+    mean_of,
+    person_scores,
+    right_half_scores,
+    score_views,
+)
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar import pose_fit
