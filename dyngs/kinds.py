@@ -88,12 +88,12 @@ def assemble(
     findings: list[str] = []
     if capture.has_alpha and config.train.alpha_weight == 0 and background != "random":
         findings = [
-            f"trained on {background} alone, as published (train.alpha_weight=0): {background} surfaces may be "
-            "transparent on other backgrounds"
+            f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
+            "may be transparent"
         ]
     losses = [
         model.colour_loss or ImageLoss(config.train.ssim_weight),
-        SilhouetteLoss(config.train.alpha_weight),
+        SilhouetteLoss(config.train.alpha_weight, config.train.steps),
         PenaltyLoss(),
         *([] if exposures is None else [exposures]),
         priors,

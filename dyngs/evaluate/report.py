@@ -165,8 +165,8 @@ class EvalReport:
             return ()
         worse, other = ("black", "white") if difference > 0 else ("white", "black")
         return (
-            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: errors of opacity "
-            f"(train.alpha_weight) show there; see `dyngs render RUN --out DIR --background {worse}`",
+            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: opacity is wrong in places "
+            f"(train.alpha_weight); `dyngs render RUN --out DIR --background {worse}` shows where",
         )
 
     def to_json(self) -> str:

@@ -68,7 +68,7 @@ def image(rgb: torch.Tensor, cameras: Cameras, name: str = "a", mask: torch.Tens
 
 @pytest.mark.parametrize("background", [0.0, 0.3, 1.0])
 def test_a_hole_in_a_white_object_shows_on_black_alone(background: float) -> None:
-    """Half of the image is a white object of which nothing is rendered, on whatever background."""
+    """Half of the true image is a white object, the rendering is empty."""
     cameras = camera()
     alpha = torch.zeros(14, 20)
     alpha[:, :10] = 1
