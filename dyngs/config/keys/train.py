@@ -41,7 +41,7 @@ class TrainConfig(Section):
         default=0.1,
         ge=0,
         description="weight of the mean error of opacity, where images have alpha, so that a scene is right on any "
-        "background; published: 0, images count on one background alone",
+        "background; a scene has a fifth of it until 60 % of the run; published: 0",
     )
     priors: tuple[Literal["depth", "flow", "tracks", "motion_masks"], ...] = Field(
         default=("depth", "flow", "tracks", "motion_masks"),
