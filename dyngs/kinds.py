@@ -15,7 +15,6 @@ from dyngs.data.decoding import usual_threads
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
-from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
@@ -24,14 +23,7 @@ from dyngs.gaussians.start import FirstGaussians
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
-from dyngs.models.views import (
-    IMAGES,
-    background_colour,
-    measured_alpha_weight,
-    resolved_background,
-    training_cameras,
-    training_times,
-)
+from dyngs.models.views import resolved_background, training_cameras, training_times
 from dyngs.ops.device import device_for
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import exposures_of
@@ -93,10 +85,15 @@ def assemble(
     model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator, first))
     refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
     robust, exposures = _robust(config, capture, images), exposures_of(config.train, images)
-    alpha_weight, findings = _alpha_weight(config, capture, images)
+    findings: list[str] = []
+    if capture.has_alpha and config.train.alpha_weight == 0 and background != "random":
+        findings = [
+            f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
+            "may be transparent"
+        ]
     losses = [
         model.colour_loss or ImageLoss(config.train.ssim_weight),
-        SilhouetteLoss(alpha_weight, masked=robust is not None),
+        SilhouetteLoss(config.train.alpha_weight, config.train.steps),
         PenaltyLoss(),
         *([] if exposures is None else [exposures]),
         priors,
@@ -187,15 +184,3 @@ def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefin
     refinement = CameraRefinement(images.views, size, config.train.steps)
     images.corrected = refinement.corrections.applied
     return refinement
-
-
-def _alpha_weight(config: Config, capture: Capture, images: ImageLoader) -> tuple[float, list[str]]:
-    """Return how much silhouettes count: what is requested, or what moving things before this background need."""
-    requested, background = config.train.alpha_weight, resolved_background(config, capture)
-    if requested is not None:
-        return requested, []
-    moves = config.model.may_move and len(set(training_times(capture))) > 1
-    if not moves or not capture.has_alpha or background == "random":
-        return 0.0, []
-    shown = (images[i] for i in evenly_spaced(len(images), IMAGES))
-    return measured_alpha_weight(shown, background_colour(background))

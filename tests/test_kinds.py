@@ -24,6 +24,7 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
+from dyngs.config.io import load_config, packaged_presets
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -147,26 +148,30 @@ def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     assert isinstance(assemble(_dynamic(root, model=StaticModel())).model.scene, StaticScene)
 
 
-def test_silhouettes_are_weighed_by_measurement_only_where_things_may_move(capture: Path, tmp_path: Path) -> None:
-    """A weight that is given holds for all."""
-    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
-    given = TrainConfig(steps=12, alpha_weight=0.3)
-    unset = TrainConfig(steps=12, alpha_weight=None)
+def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(capture: Path) -> None:
+    """That one prints a line when training begins, not when a run is resumed."""
+    presets = {name: load_config(name, [f"data.root={capture}"]) for name in packaged_presets()}
+    weights = {name: config.train.alpha_weight for name, config in presets.items()}
+    assert weights == {name: 0.0 if name == "blender" else 0.1 for name in presets}
 
-    def weighed(config: Config) -> tuple[float, list[str]]:
-        trainer = assemble(config)
-        return next(x.weight for x in trainer.losses if isinstance(x, SilhouetteLoss)), trainer.findings
+    few = [f"data.root={capture}", "init.kind=random", "init.num_random=30"]
 
-    (line,) = weighed(_dynamic(root, train=unset))[1]
-    assert "opaque pixels" in line
-    assert weighed(_dynamic(root, train=given)) == (0.3, [])
-    random = DataConfig(root=root, background="random")
-    for changes in ({"model": StaticModel()}, {"data": DataConfig(root=capture)}, {"data": random}):
-        assert weighed(_dynamic(root, train=unset, **changes)) == (0.0, [])
-    assert weighed(_dynamic(root)) == (0.0, []), "0 unless a preset leaves it open"
-    trainer = assemble(_dynamic(root, train=unset))
-    assert trainer.step().finding == line
-    assert trainer.step().finding is None
+    def weight_and_findings(name: str, *keys: str, restored: bool = False) -> tuple[float, list[str]]:
+        trainer = assemble(load_config(name, [*few, *keys]), restored=restored)
+        losses = [x for x in trainer.losses if isinstance(x, SilhouetteLoss)]
+        return losses[0].weight, trainer.findings
+
+    assert weight_and_findings("static") == (0.1, [])
+    weight, (line,) = weight_and_findings("blender")
+    assert weight == 0.0
+    assert "compared on white alone, as published (train.alpha_weight=0)" in line
+    assert weight_and_findings("blender", restored=True) == (0.0, [])
+    assert weight_and_findings("blender", "data.background=random") == (0.0, [])
+    assert weight_and_findings("static", "train.alpha_weight=0.3") == (0.3, [])
+
+
+def test_a_run_of_an_earlier_version_that_left_the_weight_open_can_be_read() -> None:
+    assert TrainConfig.model_validate({"alpha_weight": None}) == TrainConfig()
 
 
 @pytest.mark.parametrize("times", [None, [0.5] * 5], ids=["no times", "one time"])

@@ -16,7 +16,9 @@ import pytest
 import dyngs
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
+from dyngs.data.images.images import read_image
 from dyngs.evaluate.report import EvalReport, evaluate_run
+from dyngs.files.write import write_image
 from dyngs.human.fit import fitted_capture
 from dyngs.human.fit.capture_fit import FitEffort
 
@@ -52,6 +54,20 @@ def still_life(tmp_path_factory: pytest.TempPathFactory) -> Captured:
 
 def test_a_static_scene(still_life: Captured) -> None:
     assert still_life.report("static", "train.steps=400").psnr > 31.0  # 31.31
+
+
+def test_a_white_object_is_solid_on_black(tmp_path: Path) -> None:
+    """On white alone, nothing of it needs to be there."""
+    captured = Captured.of(tmp_path, "still", "--size", "32", "--views", "12")
+    for file in (tmp_path / "capture").rglob("*.png"):
+        pixels = read_image(file).numpy().copy()
+        pixels[..., :3] = 255
+        write_image(file, pixels)
+    report = captured.report("static", "train.steps=200")
+    assert report.psnr == report.psnr_white
+    assert report.psnr_white is not None
+    assert report.psnr_black is not None
+    assert report.psnr_black > 24.0  # 27.09; 4.92 with train.alpha_weight=0
 
 
 def test_a_static_scene_by_mcmc(still_life: Captured) -> None:

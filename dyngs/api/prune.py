@@ -20,11 +20,7 @@ from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.files.outputs import new_folder
 from dyngs.kinds import assemble
-<<<<<<< HEAD
-from dyngs.models.checkpoint import Checkpoint, read_capture_of
-=======
-from dyngs.models.checkpoint import Checkpoint, settings_of
->>>>>>> w-saving
+from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Promise, Search

@@ -164,15 +164,11 @@ def train(
             )
             return folder
         asked = asked_for(folder) if resume_from is not None else config
-<<<<<<< HEAD
-        config, choices, capture = _chosen(config, resumed)
-=======
         if resumed is not None:
             resumed.require_settings(config)
-        config, choices, capture = _chosen(config, begins=resumed is None)
+        config, choices, capture = _chosen(config, resumed)
         if resumed is not None:
             _warn_of_changed_files(folder, config, capture)
->>>>>>> w-saving
         run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, threads=threads)
         write_choices(run.folder, choices)
         lines = run.run(listeners)

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         data_root=args.data_root(arguments),
     )
     Console().print(report_table(report))
-    args.print_notes(report.notes)
+    args.print_notes(report.notes, report.warnings)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 
@@ -69,6 +69,8 @@ def report_table(report: EvalReport) -> Table:
 
     table = Table("metric", "value", title=f"{counted(report.num_views, 'view')} of the {report.split} split")
     table.add_row("PSNR", f"{report.psnr:.2f} dB")
+    if report.psnr_white is not None and report.psnr_black is not None:
+        table.add_row("PSNR on white, on black", f"{report.psnr_white:.2f} dB, {report.psnr_black:.2f} dB")
     if report.psnr_right is not None and report.psnr_right_fitted is not None:
         right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
         table.add_row("PSNR of right halves", right)

@@ -65,7 +65,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--alpha", action="store_true", help="write opacity as well")
     size = "image size for a path or fixed camera, in pixels"
     parser.add_argument("--size", type=args.image_size, metavar="WxH", help=size)
-    background = "background for a path or fixed camera (default: that of training)"
+    background = "background of all images (default: that of training)"
     parser.add_argument("--background", choices=("white", "black"), help=background)
     args.add_up(parser, " of the path")
     args.add_most_drawn(parser, "of a still scene: draw far parts coarser, and N Gaussians of each image at most")
@@ -106,9 +106,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a file")
     if arguments.up and not (is_file or arguments.path):
         raise DyngsError("--up goes with --path orbit, spiral or along")
-    for name in ("size", "background"):
-        if getattr(arguments, name) and not _is_path(arguments):
-            raise DyngsError(f"--{name} goes with --path; the views of a split keep their size and background")
+    if arguments.size and not _is_path(arguments):
+        raise DyngsError("--size goes with --path; the views of a split keep their size")
 
 
 def _is_path(arguments: argparse.Namespace) -> bool:
@@ -136,7 +135,8 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not _is_path(arguments):
         with ProgressBar() as report:
-            opened = _coarser(arguments, open_run(arguments.source, data_root=args.data_root(arguments)))
+            opened = _before(arguments, open_run(arguments.source, data_root=args.data_root(arguments)))
+            opened = _coarser(arguments, opened)
             return write_split_images(opened, arguments.split or "test", arguments.out, output, report, device)
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
@@ -158,9 +158,13 @@ def _opened(arguments: argparse.Namespace) -> Opened:
         opened = opened.at_rest()
     elif arguments.split is not None:
         opened = opened.of_split(arguments.split)
-    if arguments.background is not None:
-        opened = opened.on_background(arguments.background)
+    opened = _before(arguments, opened)
     return opened if arguments.up is None else replace(opened, stated_up=arguments.up)
+
+
+def _before(arguments: argparse.Namespace, opened: Opened) -> Opened:
+    """Return the scene before the background that is requested, if one is."""
+    return opened if arguments.background is None else opened.on_background(arguments.background)
 
 
 def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:

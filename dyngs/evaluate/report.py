@@ -34,6 +34,9 @@ from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_refinement import fitted_to_image
 
+MOST_BY_BACKGROUND = 1.0
+"""Largest difference of PSNR between white and black, dB, that is not warned of."""
+
 
 @dataclass(frozen=True)
 class PoseRefinement:
@@ -144,11 +147,27 @@ class EvalReport:
     psnr_right_fitted: float | None = None
     # ``psnr_own_poses, own_poses, silhouette_poses``: see ``PoseRefinement``; None where that was not requested
     psnr_own_poses: float | None = None
+    # ``psnr_white, psnr_black``: None where images have no alpha
+    psnr_white: float | None = None
     psnr_black: float | None = None
     ssim_black: float | None = None
     lpips_black: float | None = None
     own_poses: PoseScores | None = None
     silhouette_poses: PoseScores | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Faults of the scene that these scores show."""
+        if self.psnr_white is None or self.psnr_black is None:
+            return ()
+        difference = self.psnr_white - self.psnr_black
+        if abs(difference) <= MOST_BY_BACKGROUND:
+            return ()
+        worse, other = ("black", "white") if difference > 0 else ("white", "black")
+        return (
+            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: opacity is wrong in places "
+            f"(train.alpha_weight); `dyngs render RUN --out DIR --background {worse}` shows where",
+        )
 
     def to_json(self) -> str:
         """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
@@ -252,7 +271,7 @@ def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "psnr_per_time": psnr_per_time((score.time, score.psnr) for score in scores),
         "per_view": tuple(scores),
     }
-    means |= means_of(scores) | means_of(scores, ("flip", "psnr_right", "psnr_right_fitted"))
+    means |= means_of(scores) | means_of(scores, ("flip", "psnr_right", "psnr_right_fitted", "psnr_white"))
     for metric in REGION_METRICS:
         known = [value for value in (getattr(score, metric) for score in scores) if value is not None]
         means[metric] = fmean(known) if known else None

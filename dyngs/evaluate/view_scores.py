@@ -26,6 +26,7 @@ from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, flip, psnr, ssim
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
+from dyngs.models.views import background_colour
 from dyngs.ops.device import finish
 
 
@@ -73,8 +74,9 @@ def seconds_in_turn(drawings: Sequence[Drawing], images: Sequence[Image], rounds
 class ViewScore:
     """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
 
-    ``render_seconds`` holds ``deform_seconds``. Of people, ``psnr_person`` and ``ssim_person`` are inside the person's
-    box, ``psnr_black``, ``ssim_black`` and ``lpips_black`` of the full image on black.
+    ``render_seconds`` holds ``deform_seconds``. Of images with alpha, ``psnr_white`` and ``psnr_black`` are of the full
+    image on white and on black. Of people, ``psnr_person`` and ``ssim_person`` are inside the person's box,
+    ``ssim_black`` and ``lpips_black`` on black.
     """
 
     name: str
@@ -95,6 +97,7 @@ class ViewScore:
     psnr_things: dict[int, float] = field(default_factory=dict)
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
+    psnr_white: float | None = None
     psnr_black: float | None = None
     ssim_black: float | None = None
     lpips_black: float | None = None
@@ -141,6 +144,7 @@ def score_views(
         truth, mask = image.composite(background), image.mask
         people = {} if avatar_of(scene) is None else person_scores(image, rendering, background, lpips)
         parts = right_half_scores(image, rendering, background)
+        parts |= background_scores(image, rendering, background)
         parts |= {} if regions is None else regions.scores(image, rendered, truth)
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
         for name, metric in optional.items():
@@ -177,10 +181,21 @@ def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips:
     return {
         "psnr_person": psnr(rendered[box], truth[box], inside),
         "ssim_person": ssim(rendered[box], truth[box], inside),
-        "psnr_black": psnr(black, image.rgb_premultiplied, mask),
         "ssim_black": ssim(black, image.rgb_premultiplied, mask),
         "lpips_black": lpips(black, image.rgb_premultiplied, mask).value,
     }
+
+
+def background_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float | None]:
+    """Return ``psnr_white`` and ``psnr_black``, dB, from one rendering on ``background`` (3,); None without alpha."""
+    scores: dict[str, float | None] = {"psnr_white": None, "psnr_black": None}
+    if image.alpha is None:
+        return scores
+    for name in ("white", "black"):
+        colour = background_colour(name).to(background)
+        shown = rendering.rgb[0] + rendering.transmittance[0][..., None] * (colour - background)
+        scores[f"psnr_{name}"] = psnr(shown, image.composite(colour), image.mask)
+    return scores
 
 
 def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float | None]:

@@ -120,7 +120,7 @@ def write_split_images(
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
 
     The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that of
-    training, black if that was random. Raises DyngsError: no such split, unreadable images, or a video of several
+    ``opened``, behind truth and render. Raises DyngsError: no such split, unreadable images, or a video of several
     sizes.
     """
     inputs = inputs_of(opened)

@@ -8,15 +8,11 @@ from typing import Any
 
 from torch import Tensor
 
-<<<<<<< HEAD
-from dyngs.config import DataConfig
+from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import expressed
-=======
-from dyngs.config import Config
 from dyngs.errors import DyngsError
->>>>>>> w-saving
 from dyngs.state import part_of
 
 OTHER_CONFIG = "was its config changed? Otherwise train anew"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -12,47 +12,8 @@ from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import scaled_intrinsics
 from dyngs.data.images.images import target_size
-from dyngs.data.loader import Image
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
-OPAQUE = 0.99  # Alpha from which a pixel shows no background
-ALIKE = 0.1  # Largest difference of a channel up to which a colour counts as that of the background
-MANY_ALIKE = 0.05
-"""Fraction of the opaque pixels of the background's colour from which silhouettes are trained on: with 0.12 (orbits)
-the whole image gains 0.8 dB, with 0 (flag) nothing; in between nothing was measured."""
-WEIGHT = 0.1  # Weight of the mean error of alpha there
-IMAGES = 12  # Number of images in which colours are compared with the background
-
-
-def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> tuple[float, list[str]]:
-    """Return the weight of the mean error of alpha that suits images on ``background`` (3,), and lines about why."""
-    fraction = share_alike(images, background)
-    if fraction is None:
-        return 0.0, []
-    uses = fraction >= MANY_ALIKE
-    text = f"{fraction:.1%} of the opaque pixels have nearly the background's colour: " + (
-        f"silhouettes count, too (train.alpha_weight={WEIGHT:g})" if uses else "silhouettes are not needed"
-    )
-    return WEIGHT if uses else 0.0, [text]
-
-
-def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
-    """Return the fraction of the opaque pixels whose channels all differ from ``background`` (3,) by ``ALIKE`` or less.
-
-    None where there are no opaque pixels next to a background. Masked pixels do not count.
-    """
-    opaque, alike, shows_background = 0, 0, False
-    for image in images:
-        if image.alpha is None:
-            continue
-        shows_background |= bool((image.alpha < OPAQUE).any())
-        counts = image.alpha >= OPAQUE
-        if image.mask is not None:
-            counts &= image.mask > 0
-        colours = image.rgb_premultiplied[counts] / image.alpha[counts][:, None]
-        opaque += len(colours)
-        alike += int(((colours - background).abs() <= ALIKE).all(1).sum())
-    return alike / opaque if opaque and shows_background else None
 
 
 def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:

@@ -98,7 +98,7 @@ def _record(data: DataConfig, capture: Capture | None) -> dict[str, Any]:
     views = {}
     files = {}
     for view in capture.splits["train"]:
-        views[view.name] = _numbers(view, capture.world_offset)
+        views[view.name] = _numbers(view, capture)
         files[view.name] = " ".join(map(digest, _files_of(view)))
     body = None if capture.body is None else capture.body.get("train")
     if body is not None:
@@ -107,9 +107,9 @@ def _record(data: DataConfig, capture: Capture | None) -> dict[str, Any]:
     return {"views": views, "files": files}
 
 
-def _numbers(view: View, world_offset: np.ndarray) -> list[float]:
+def _numbers(view: View, capture: Capture) -> list[float]:
     """Return size, time and camera of a view, in the coordinates of the capture's files."""
-    centre = camera_center(view.cam_from_world) + world_offset
+    centre = capture.world_scale * camera_center(view.cam_from_world) + capture.world_offset
     rotation = view.cam_from_world[:3, :3]
     size = (view.width, view.height, -1.0 if view.time is None else view.time)
     lens = (*view.lens.params, view.lens.focal_ratio)

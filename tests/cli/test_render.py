@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from moving_scene import write_moving_run
 from refused import error_line
 
 import dyngs
 from dyngs.cli import main
+from dyngs.data.images.images import read_image
 
 Capture = pytest.CaptureFixture[str]
 
@@ -39,6 +41,24 @@ def test_render_of_a_split(run_dir: Path, tmp_path: Path, capsys: Capture) -> No
     assert any(n.endswith("_depth.exr") for n in names)
     assert "sheet.png" in capsys.readouterr().out
     assert "--size goes with --path" in error_line(capsys, "render", run_dir, "--out", tmp_path, "--size", "8x8")
+
+
+def test_the_views_of_a_split_before_another_background(run_dir: Path, tmp_path: Path) -> None:
+    """A corner that nothing covers has it in the render, in the truth of the sheet, and in the video."""
+
+    def images(name: str, *words: str) -> dict[str, np.ndarray]:
+        out = tmp_path / name
+        assert main(["render", str(run_dir), "--split", "test", "--out", str(out), *words]) == 0
+        return {f.name: read_image(f).numpy() for f in out.glob("*.png")}
+
+    own = images("own")
+    white = images("white", "--background", "white")
+    black = images("black", "--background", "black")
+    first = min(own.keys() - {"sheet.png"})
+    assert all((own[name] == white[name]).all() for name in own)
+    assert (white[first][0, 0] == 255).all()
+    assert (black[first][0, 0] == 0).all()
+    assert black["sheet.png"].mean() < white["sheet.png"].mean() - 20
 
 
 def test_render_of_a_path_with_a_video(run_dir: Path, tmp_path: Path) -> None:

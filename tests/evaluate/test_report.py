@@ -74,7 +74,7 @@ def test_report_of_a_run(tmp_path) -> None:
     over_time = "num_moving moving_fraction field_mb deform_fraction flicker flicker_error psnr_per_time psnr_person"
     parts = "ssim_person psnr_foreground psnr_moving psnr_static moving_from track_error_px track_within_5px"
     parts += " psnr_things track_motion_px psnr_right psnr_right_fitted psnr_own_poses own_poses"
-    parts += " silhouette_poses psnr_black ssim_black lpips_black"
+    parts += " silhouette_poses psnr_white psnr_black ssim_black lpips_black"
     rest = {*parts.split(), "seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
     facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
@@ -94,6 +94,27 @@ def test_report_of_a_run(tmp_path) -> None:
     assert len({view["name"] for view in stored["per_view"]}) == 3
     again = evaluate_run(run_dir)
     assert (again.psnr, again.ssim, again.flip) == (report.psnr, report.ssim, report.flip)
+
+
+def test_psnr_is_that_on_the_background_of_the_run(tmp_path) -> None:
+    """And the same number as on that colour; the scene is drawn once for both."""
+    reports = {name: evaluate_run(write_run(tmp_path / name, some_gaussians(), name)) for name in ("white", "black")}
+    assert reports["white"].psnr == reports["white"].psnr_white
+    assert reports["black"].psnr == reports["black"].psnr_black
+    for name in ("psnr_white", "psnr_black"):
+        on_white, on_black = (getattr(reports[x], name) for x in ("white", "black"))
+        assert on_white == pytest.approx(on_black, abs=1e-4)
+    assert reports["white"].psnr_white != pytest.approx(reports["white"].psnr_black, abs=0.1)
+
+
+def test_scenes_that_are_worse_on_one_background_are_warned_of(tmp_path) -> None:
+    report = evaluate_run(write_run(tmp_path, some_gaussians()))
+    assert replace(report, psnr_white=30.0, psnr_black=29.1).warnings == ()
+    (line,) = replace(report, psnr_white=30.0, psnr_black=28.5).warnings
+    assert "PSNR on black is 1.5 dB lower" in line
+    (line,) = replace(report, psnr_white=30.0, psnr_black=33.0).warnings
+    assert "PSNR on white is 3.0 dB lower" in line
+    assert replace(report, psnr_white=None, psnr_black=None).warnings == ()
 
 
 def test_an_unfinished_run_says_so(tmp_path) -> None:

@@ -21,7 +21,14 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split
-from dyngs.evaluate.view_scores import Drawing, mean_of, person_scores, right_half_scores, score_views
+from dyngs.evaluate.view_scores import (
+    Drawing,
+    background_scores,
+    mean_of,
+    person_scores,
+    right_half_scores,
+    score_views,
+)
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar import pose_fit
@@ -57,6 +64,23 @@ def camera(width: int = 20, height: int = 14, distance: float = 4.0) -> Cameras:
 
 def image(rgb: torch.Tensor, cameras: Cameras, name: str = "a", mask: torch.Tensor | None = None) -> Image:
     return Image(name=name, cameras=cameras, rgb_premultiplied=rgb, alpha=None, mask=mask, time=None)
+
+
+@pytest.mark.parametrize("background", [0.0, 0.3, 1.0])
+def test_a_hole_in_a_white_object_shows_on_black_alone(background: float) -> None:
+    """Half of the true image is a white object, the rendering is empty."""
+    cameras = camera()
+    alpha = torch.zeros(14, 20)
+    alpha[:, :10] = 1
+    truth = replace(image(alpha[..., None].expand(-1, -1, 3), cameras), alpha=alpha)
+    nothing = Rendering(torch.full((1, 14, 20, 3), background), torch.ones(1, 14, 20), None)
+    scores = background_scores(truth, nothing, torch.full((3,), background))
+    assert scores["psnr_white"] == pytest.approx(100.0)
+    assert scores["psnr_black"] == pytest.approx(-10 * math.log10(0.5), abs=1e-4)
+    masked = background_scores(replace(truth, mask=1 - alpha), nothing, torch.full((3,), background))
+    assert masked["psnr_black"] == pytest.approx(100.0)
+    without = background_scores(image(alpha[..., None].expand(-1, -1, 3), cameras), nothing, torch.zeros(3))
+    assert without == {"psnr_white": None, "psnr_black": None}
 
 
 def test_scores_are_those_of_the_images() -> None:
@@ -183,7 +207,8 @@ def test_scores_in_the_box_and_on_black() -> None:
     scores = person_scores(image, rendering, torch.ones(3), NO_LPIPS)
     assert scores["psnr_person"] == pytest.approx(20, abs=1e-4)
     larger = 10 * math.log10(12 * 20 / 20)
-    assert scores["psnr_black"] == pytest.approx(20 + larger, abs=1e-4)
+    on_black = background_scores(image, rendering, torch.ones(3))["psnr_black"]
+    assert on_black == pytest.approx(20 + larger, abs=1e-4)
     black = rendering.rgb[0] * image.alpha[..., None] if image.alpha is not None else rendering.rgb[0]
     assert scores["ssim_black"] == pytest.approx(ssim(black, image.rgb_premultiplied), abs=1e-6)
     assert scores["lpips_black"] is None
@@ -192,7 +217,7 @@ def test_scores_in_the_box_and_on_black() -> None:
 def test_masked_pixels_do_not_count() -> None:
     mask = torch.zeros(12, 20)
     mask[:, 8:] = 1
-    scores = person_scores(*of_a_square(mask), torch.ones(3), NO_LPIPS)
+    scores = background_scores(*of_a_square(mask), torch.ones(3))
     assert scores["psnr_black"] == pytest.approx(20 + 10 * math.log10(12 * 12 / 20), abs=1e-4)
 
 

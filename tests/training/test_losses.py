@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from scenes import random_scene
@@ -9,7 +11,9 @@ from scenes import random_scene
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.training.losses import StepCheck
+from dyngs.models.model import Drawn, Look
+from dyngs.models.renderable import Rendering
+from dyngs.training.losses import SilhouetteLoss, StepCheck
 
 CPU = torch.device("cpu")
 MOVES_BY = "field", "model.deform"
@@ -50,3 +54,22 @@ def test_gaussians_that_are_not_finite_come_first(image: Image) -> None:
     message = r"the field makes means, quats at 0\.25 not finite; lower the rates in model\.deform$"
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': {message}"):
         StepCheck(terms, gaussians.tensors(), CPU).loss(3, image, MOVES_BY)
+
+
+def test_the_error_of_alpha_counts_where_the_mask_does_and_fully_late_in_the_run(image: Image) -> None:
+    """Three of four pixels are opaque, nothing is rendered, and the mask ignores one of these."""
+    alpha = torch.tensor([[1.0, 1.0], [1.0, 0.0]])
+    mask = torch.tensor([[0.0, 1.0], [1.0, 1.0]])
+    nothing = Drawn(Rendering(torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2), None))
+    loss = SilhouetteLoss(0.1, steps=100)
+
+    def at(step: int, image: Image) -> float:
+        black = torch.zeros(2, 2, 3)
+        look = Look(0, step, image, nothing, black, black, None, torch.Generator())
+        return float(loss(look).get("alpha", 0.0))
+
+    opaque = replace(image, alpha=alpha)
+    assert at(100, opaque) == pytest.approx(0.1 * 3 / 4)
+    assert at(1, opaque) == pytest.approx(0.2 * 0.1 * 3 / 4)
+    assert at(100, replace(opaque, mask=mask)) == pytest.approx(0.1 * 2 / 4)
+    assert at(100, image) == 0.0
