@@ -297,6 +297,12 @@ def test_a_page_begins_with_the_same_view_in_any_unit(factor: float, tmp_path: P
         np.testing.assert_allclose(pose, np.array(b["camFromWorld"]).reshape(4, 4), atol=1e-4)
 
 
+def test_the_offset_of_a_far_scene_is_told(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path, moves=False, offset=(500_000.0, 4_600_000.0, 0.0))
+    (note,) = write_page(open_run(run), tmp_path / "a.html").notes
+    assert note == "the scene is far from the origin: 500000 4600000 0 is subtracted from its positions"
+
+
 def test_without_the_capture_a_page_begins_outside(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, moves=False)
     shutil.rmtree(tmp_path / "capture")
