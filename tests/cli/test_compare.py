@@ -188,9 +188,9 @@ def test_a_model_whose_images_were_shrunk_is_left_out(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("dyngs.budget.time.SMALLEST_SIDE", 8)
-    words = ["compare", str(capture), "--models", "static", "--minutes", "0.01", "--threads", "1"]
+    words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
     assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
-    said = "static: too few steps fit into 0.01 minutes of training, so its images were shrunk to 8 px"
+    said = "static: too few steps fit into 0.001 minutes of training, so its images were shrunk to 8 px"
     assert said in capsys.readouterr().err
 
 
