@@ -111,7 +111,7 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         "free": {},
     }
     field = tiny_options(kind).model_copy(update=rates[kind])
-    freeze_below_px = {"control_nodes": 1.5, "free": 0.05, "mlp": 0.6}.get(kind, 0.3)
+    freeze_below_px = {"control_nodes": 1.5, "free": 0.05}.get(kind, 0.6)
     phases = {
         "motion_from": 8 / 24,
         "time_window": 0.4,
