@@ -15,6 +15,7 @@ from dyngs.data.decoding import usual_threads
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
@@ -23,7 +24,13 @@ from dyngs.gaussians.start import FirstGaussians
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
-from dyngs.models.views import resolved_background, training_cameras, training_times
+from dyngs.models.views import (
+    background_colour,
+    resolved_background,
+    share_alike,
+    training_cameras,
+    training_times,
+)
 from dyngs.ops.device import device_for
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import exposures_of
@@ -37,6 +44,12 @@ from dyngs.training.priors.used import UsedPriors
 from dyngs.training.trainer import Trainer, ViewSampler
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
+
+MANY_ALIKE = 0.05
+"""Fraction of the opaque pixels of the background's colour from which moving things are found by their silhouettes."""
+EARLY_OPACITY = 0.2  # fraction of train.alpha_weight before other moving things, until their motion is followed
+FULL_OPACITY_FROM = 0.6  # fraction of the run; measured as the others, see docs/benchmarks.md#backgrounds
+ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
 
 def build(
@@ -85,6 +98,7 @@ def assemble(
     model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator, first))
     refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
     robust, exposures = _robust(config, capture, images), exposures_of(config.train, images)
+    early = _early_opacity(config, capture, images, background)
     findings: list[str] = []
     if capture.has_alpha and config.train.alpha_weight == 0 and background != "random":
         findings = [
@@ -93,7 +107,7 @@ def assemble(
         ]
     losses = [
         model.colour_loss or ImageLoss(config.train.ssim_weight),
-        SilhouetteLoss(config.train.alpha_weight, config.train.steps),
+        SilhouetteLoss(config.train.alpha_weight, early, FULL_OPACITY_FROM * config.train.steps),
         PenaltyLoss(),
         *([] if exposures is None else [exposures]),
         priors,
@@ -184,3 +198,16 @@ def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefin
     refinement = CameraRefinement(images.views, size, config.train.steps)
     images.corrected = refinement.corrections.applied
     return refinement
+
+
+def _early_opacity(config: Config, capture: Capture, images: ImageLoader, background: str) -> float:
+    """Return the fraction of train.alpha_weight that counts while motion is not followed yet.
+
+    It depends on the capture alone, so that a moving model begins exactly as a static one.
+    """
+    is_still = len(set(training_times(capture))) < 2
+    if is_still or not capture.has_alpha or config.train.alpha_weight == 0 or background == "random":
+        return 1.0
+    shown = (images[i] for i in evenly_spaced(len(images), ALIKE_IMAGES))
+    alike = share_alike(shown, background_colour(background))
+    return 1.0 if alike is None or alike >= MANY_ALIKE else EARLY_OPACITY

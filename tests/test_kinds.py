@@ -26,12 +26,14 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_config, packaged_presets
 from dyngs.conventions import RasterizeMode
+from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
+from dyngs.files.write import write_image
 from dyngs.gaussians.densify import DefaultDensifier, Densifier
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.mcmc import McmcDensifier
@@ -168,6 +170,26 @@ def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(ca
     assert weight_and_findings("blender", restored=True) == (0.0, [])
     assert weight_and_findings("blender", "data.background=random") == (0.0, [])
     assert weight_and_findings("static", "train.alpha_weight=0.3") == (0.3, [])
+
+
+@pytest.mark.parametrize(("level", "early"), [(0.95, 1.0), (0.5, 0.2)], ids=["white", "grey"])
+def test_opacity_counts_less_before_motion_is_followed_unless_things_are_white(
+    capture: Path, tmp_path: Path, level: float, early: float
+) -> None:
+    root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
+    for file in root.rglob("*.png"):
+        pixels = read_image(file).numpy().copy()
+        pixels[..., :3] = round(255 * level)
+        write_image(file, pixels)
+
+    def early_fraction(config: Config) -> float:
+        return next(x.early for x in assemble(config).losses if isinstance(x, SilhouetteLoss))
+
+    assert early_fraction(_dynamic(root)) == early
+    assert early_fraction(_dynamic(root, model=StaticModel())) == early, "both begin alike"
+    assert early_fraction(_dynamic(capture)) == 1.0, "no times"
+    black = DataConfig(root=root, background="black")
+    assert early_fraction(_dynamic(root, data=black)) == 0.2
 
 
 def test_a_run_of_an_earlier_version_that_left_the_weight_open_can_be_read() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -12,8 +12,30 @@ from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import scaled_intrinsics
 from dyngs.data.images.images import target_size
+from dyngs.data.loader import Image
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
+OPAQUE = 0.99  # Alpha from which a pixel shows no background
+ALIKE = 0.1  # Largest difference of a channel up to which a colour counts as that of the background
+
+
+def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
+    """Return the fraction of the opaque pixels whose channels all differ from ``background`` (3,) by ``ALIKE`` or less.
+
+    None where there are no opaque pixels next to a background. Masked pixels do not count.
+    """
+    opaque, alike, shows_background = 0, 0, False
+    for image in images:
+        if image.alpha is None:
+            continue
+        shows_background |= bool((image.alpha < OPAQUE).any())
+        counts = image.alpha >= OPAQUE
+        if image.mask is not None:
+            counts &= image.mask > 0
+        colours = image.rgb_premultiplied[counts] / image.alpha[counts][:, None]
+        opaque += len(colours)
+        alike += int(((colours - background).abs() <= ALIKE).all(1).sum())
+    return alike / opaque if opaque and shows_background else None
 
 
 def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:

@@ -28,16 +28,14 @@ class ImageLoss(Loss):
 class SilhouetteLoss(Loss):
     """Mean error of alpha, where the images have any, over the pixels that count.
 
-    A fifth of the weight makes white surfaces solid. More of it while motion is still followed costs 1 dB of the
-    moving parts, so the whole weight counts from 60 % of the run on (docs/benchmarks.md#backgrounds).
+    Args:
+        early: fraction of ``weight`` before ``full_from``, the first step with the whole weight.
     """
 
-    EARLY = 0.2  # fraction of the weight until then
-    FULL_FROM = 0.6  # fraction of the run
-
-    def __init__(self, weight: float, steps: int) -> None:
+    def __init__(self, weight: float, early: float = 1.0, full_from: float = 0.0) -> None:
         self.weight = weight
-        self._full_from = self.FULL_FROM * steps
+        self.early = early
+        self._full_from = full_from
 
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
         if self.weight == 0 or look.image.alpha is None:
@@ -45,7 +43,7 @@ class SilhouetteLoss(Loss):
         error = (look.drawn.rendering.alpha[0] - look.image.alpha).abs()
         if look.image.mask is not None:
             error = error * look.image.mask
-        fraction = 1.0 if look.step > self._full_from else self.EARLY
+        fraction = self.early if look.step < self._full_from else 1.0
         return {"alpha": fraction * self.weight * error.mean()}
 
 

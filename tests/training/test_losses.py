@@ -61,7 +61,7 @@ def test_the_error_of_alpha_counts_where_the_mask_does_and_fully_late_in_the_run
     alpha = torch.tensor([[1.0, 1.0], [1.0, 0.0]])
     mask = torch.tensor([[0.0, 1.0], [1.0, 1.0]])
     nothing = Drawn(Rendering(torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2), None))
-    loss = SilhouetteLoss(0.1, steps=100)
+    loss = SilhouetteLoss(0.1, early=0.2, full_from=60)
 
     def at(step: int, image: Image) -> float:
         black = torch.zeros(2, 2, 3)
@@ -70,6 +70,7 @@ def test_the_error_of_alpha_counts_where_the_mask_does_and_fully_late_in_the_run
 
     opaque = replace(image, alpha=alpha)
     assert at(100, opaque) == pytest.approx(0.1 * 3 / 4)
-    assert at(1, opaque) == pytest.approx(0.2 * 0.1 * 3 / 4)
+    assert at(59, opaque) == pytest.approx(0.2 * 0.1 * 3 / 4)
+    assert at(60, opaque) == pytest.approx(0.1 * 3 / 4)
     assert at(100, replace(opaque, mask=mask)) == pytest.approx(0.1 * 2 / 4)
     assert at(100, image) == 0.0

@@ -42,7 +42,8 @@ class TrainConfig(Section):
         default=0.1,
         ge=0,
         description="weight of the mean error of opacity, where images have alpha, so that a scene is right on any "
-        "background; a scene has a fifth of it until 60 % of the run; published: 0",
+        "background; a fifth of it in the first 60 % of a run on images with times, unless 5 % of the opaque pixels "
+        "have the background's colour; published: 0",
     )
     priors: tuple[Literal["depth", "flow", "tracks", "motion_masks"], ...] = Field(
         default=("depth", "flow", "tracks", "motion_masks"),
