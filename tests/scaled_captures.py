@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from dyngs.data.images.maps import read_depth
+from dyngs.splats.ply_header import double_ply
 
 
 def scaled_capture(source: Path, out: Path, scale: float, offset: tuple[float, float, float] = (0, 0, 0)) -> Path:
@@ -36,20 +37,6 @@ def scaled_capture(source: Path, out: Path, scale: float, offset: tuple[float, f
         body["scale"] = scale * body.get("scale", np.float64(1.0))
         np.savez(file, **body)
     for file in out.rglob("points*.ply"):
-        write_points(file, scale * (trimesh.load(file).vertices + offset), trimesh.load(file).colors[:, :3])
+        points = trimesh.load(file)
+        file.write_bytes(double_ply(scale * (points.vertices + offset), points.colors[:, :3]))
     return out
-
-
-def write_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
-    """Write coloured points as a .ply of doubles."""
-    rows = np.empty(
-        len(xyz), dtype=[*((name, "<f8") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
-    )
-    for i, name in enumerate("xyz"):
-        rows[name] = xyz[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        rows[name] = rgb[:, i]
-    kinds = ["double"] * 3 + ["uchar"] * 3
-    properties = "\n".join(f"property {kind} {name}" for kind, name in zip(kinds, rows.dtype.names or (), strict=True))
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}\nend_header\n"
-    path.write_bytes(header.encode() + rows.tobytes())

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Capture, PointCloud, Split, View
+from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.files.write import atomic_file, write_text
 from dyngs.runs.inputs import inputs_of
-from dyngs.splats.ply_header import header_bytes
+from dyngs.splats.ply_header import double_ply
 from dyngs.splats.similarity import Similarity
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
@@ -44,7 +44,8 @@ def write_cameras(
     if capture.fps is not None:
         content["fps"] = capture.fps
     if capture.points is not None:
-        _write_points(path.with_name(POINTS_NAME), capture.points, world)
+        with atomic_file(path.with_name(POINTS_NAME)) as temporary:
+            temporary.write_bytes(double_ply(world.points(capture.points.xyz), capture.points.rgb))
         content["ply_file_path"] = POINTS_NAME
     write_text(path, json.dumps(content | {"frames": frames}, indent=1) + "\n")
     return path
@@ -92,15 +93,3 @@ def _way(file: Path, folder: Path) -> str:
         return os.path.relpath(file, folder).replace(os.sep, "/")
     except ValueError:
         return file.as_posix()
-
-
-def _write_points(path: Path, points: PointCloud, world: Similarity) -> None:
-    colours = ("red", "green", "blue")
-    rows = np.empty(len(points.xyz), dtype=[*((name, "<f8") for name in "xyz"), *((name, "u1") for name in colours)])
-    for name, values in zip("xyz", world.points(points.xyz).T, strict=True):
-        rows[name] = values
-    for i, name in enumerate(colours):
-        rows[name] = points.rgb[:, i]
-    properties = [*(("double", name) for name in "xyz"), *(("uchar", name) for name in colours)]
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(header_bytes([("vertex", len(rows), properties)]) + rows.tobytes())

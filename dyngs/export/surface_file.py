@@ -26,7 +26,7 @@ from dyngs.ops.patches import MOST_SEGMENTS
 from dyngs.ops.rays import Space
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.ply_header import header_bytes
+from dyngs.splats.ply_header import double_ply
 from dyngs.splats.similarity import far_offset
 from dyngs.triangles import mesh as triangles
 from dyngs.triangles.scene import TriangleScene
@@ -91,7 +91,7 @@ def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: n
     detail = float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
     offset = far_offset(vertices, detail)
     if suffix == ".ply" and offset.any():
-        return _double_ply(vertices, faces, colours)
+        return double_ply(vertices, colours[:, :3], faces)
     mesh: Any = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
     if suffix == ".obj":
         decimals = 8 if detail == 0 else max(8, 3 - math.floor(math.log10(detail)))
@@ -102,21 +102,6 @@ def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: n
     scene: Any = trimesh.Scene()
     scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(offset))
     return scene.export(file_type="glb")
-
-
-def _double_ply(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
-    names = ("red", "green", "blue")
-    rows = np.empty(len(vertices), [*((name, "<f8") for name in "xyz"), *((name, "u1") for name in names)])
-    for i, name in enumerate("xyz"):
-        rows[name] = vertices[:, i]
-    for i, name in enumerate(names):
-        rows[name] = colours[:, i]
-    corners = np.empty(len(faces), [("count", "u1"), ("rows", "<i4", 3)])
-    corners["count"] = 3
-    corners["rows"] = faces
-    properties = [*(("double", name) for name in "xyz"), *(("uchar", name) for name in names)]
-    elements = [("vertex", len(rows), properties), ("face", len(faces), [("list uchar int", "vertex_indices")])]
-    return header_bytes(elements) + rows.tobytes() + corners.tobytes()
 
 
 def _surface(opened: Opened, time: float, cut: Cut) -> Surface:

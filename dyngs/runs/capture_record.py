@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from functools import cache
 from hashlib import blake2b
@@ -20,12 +21,10 @@ from dyngs.files.write import write_text
 
 RECORD_NAME = "capture.json"
 """In a run folder: the cameras and digests of the files of the training views."""
-SAMPLES = 4
 SAMPLE_BYTES = 2**14
-"""Number and size of the blocks of a file that its digest covers; smaller files are read whole."""
+"""Size of the blocks at the beginning and the end of a file that its digest covers."""
 TOLERANCE = 1e-6
 """Largest change of a number that is a rounding error; of positions in extents of all positions."""
-_PARTS = {"sizes": slice(0, 2), "times": slice(2, 3), "cameras": slice(3, None)}
 _CENTRE = slice(3, 6)
 _SHOWN = 3
 
@@ -64,29 +63,21 @@ def named(names: Sequence[str]) -> str:
 
 def _change(before: dict[str, list[float]], now: dict[str, list[float]]) -> str | None:
     """Return what differs between the views of two records; None where nothing does."""
-    removed = [name for name in before if name not in now]
-    if removed:
-        return f"without the training views {named(removed)}"
-    added = [name for name in now if name not in before]
-    if added:
-        return f"with the new training views {named(added)}"
-    rows = {name: (np.array(before[name]), np.array(now[name])) for name in now}
-    centres = np.array([one[_CENTRE] for one, _ in rows.values()])
-    extent = np.ptp(centres, axis=0).max() if centres.size else 0.0
-    for what, part in _PARTS.items():
-        others = [name for name, (one, other) in rows.items() if not _is_close(one, other, part, extent)]
-        if others:
-            return f"other {what} of {named(others)}"
-    return None
+    for text, names in (("without", before.keys() - now.keys()), ("with the new", now.keys() - before.keys())):
+        if names:
+            return f"{text} training views {named(sorted(names))}"
+    extent = np.ptp([row[_CENTRE] for row in before.values()], axis=0).max(initial=0.0)
+    others = [name for name, row in now.items() if not _is_close(np.array(row), np.array(before[name]), extent)]
+    return f"other sizes, times or cameras of {named(others)}" if others else None
 
 
-def _is_close(one: np.ndarray, other: np.ndarray, part: slice, extent: float) -> bool:
-    """Return whether ``part`` of two views differs by no more than rounding errors."""
+def _is_close(one: np.ndarray, other: np.ndarray, extent: float) -> bool:
+    """Return whether the numbers of two views differ by no more than rounding errors."""
     if one.shape != other.shape:
         return False
     tolerance = np.full(len(one), TOLERANCE)
     tolerance[_CENTRE] *= extent
-    return bool((np.abs(one - other) <= tolerance + 1e-9 * np.abs(one))[part].all())
+    return bool((np.abs(one - other) <= tolerance + 1e-9 * np.abs(one)).all())
 
 
 def _record(data: DataConfig, capture: Capture | None) -> dict[str, Any]:
@@ -125,20 +116,16 @@ def _files_of(view: View) -> Iterator[Path]:
 
 
 def _digest(path: Path) -> str:
-    """Return a digest of the size and some blocks of a file; "" where it cannot be read."""
+    """Return a digest of the size, the beginning and the end of a file; "" where it cannot be read."""
     try:
-        size = path.stat().st_size
-        digest = blake2b(str(size).encode(), digest_size=8)
         with path.open("rb") as file:
-            if size <= SAMPLES * SAMPLE_BYTES:
-                digest.update(file.read())
-                return digest.hexdigest()
-            for i in range(SAMPLES):
-                file.seek(i * (size - SAMPLE_BYTES) // (SAMPLES - 1))
-                digest.update(file.read(SAMPLE_BYTES))
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - SAMPLE_BYTES, 0))
+            end = file.read()
+            file.seek(0)
+            return blake2b(b"%d" % size + file.read(SAMPLE_BYTES) + end, digest_size=8).hexdigest()
     except OSError:  # the loader names what is missing
         return ""
-    return digest.hexdigest()
 
 
 def _listing(folder: Path) -> str:

@@ -187,3 +187,22 @@ def _ascii_row(line: bytes, width: int, index: int, path: Path) -> list[float]:
 
 def _shown(line: str) -> str:
     return repr(line if len(line) <= 60 else line[:57] + "...")
+
+
+def double_ply(xyz: np.ndarray, rgb: np.ndarray, faces: np.ndarray | None = None) -> bytes:
+    """Return a .ply of coloured points (V, 3) in float64, or of a mesh with triangles (F, 3).
+
+    ``rgb``: (V, 3) uint8.
+    """
+    rows = np.empty(len(xyz), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    rows["xyz"] = xyz
+    rows["rgb"] = rgb
+    properties = [*(("double", name) for name in "xyz"), *(("uchar", name) for name in ("red", "green", "blue"))]
+    elements = [("vertex", len(rows), properties)]
+    if faces is None:
+        return header_bytes(elements) + rows.tobytes()
+    corners = np.empty(len(faces), [("count", "u1"), ("rows", "<i4", 3)])
+    corners["count"] = 3
+    corners["rows"] = faces
+    elements.append(("face", len(faces), [("list uchar int", "vertex_indices")]))
+    return header_bytes(elements) + rows.tobytes() + corners.tobytes()

@@ -249,7 +249,7 @@ def test_a_resumed_run_refuses_another_capture(
     write_still_capture(other, StillOptions(size=24, num_train=4, num_test=1, samples=1))
     before = (interrupted / RESOLVED_NAME).read_text()
     assert main(["train", "--resume", str(interrupted), f"data.root={other}"]) == 2
-    assert "other sizes of train/r_000" in capsys.readouterr().err
+    assert "other sizes, times or cameras of train/r_000" in capsys.readouterr().err
     assert (interrupted / RESOLVED_NAME).read_text() == before
     (tmp_path / "capture").rename(copied)
     assert main(["train", "--resume", str(interrupted), f"data.root={copied}"]) == 0
