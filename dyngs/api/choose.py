@@ -114,6 +114,8 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     match plain_config.model:
         case DynamicModel() as model:
             moves = _motion_of_fixed_cameras(capture, config) if model.choose else True
+            if moves is False:
+                return choose(as_static(config), capture)
             views = _views_at_once(capture)
             if model.choose and moves and views >= FREE_VIEWS:
                 plain_config = best = _bounded(plain_config, views)
@@ -121,12 +123,10 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
                     plain_config, other = _what_moves(plain_config, model.deform, views >= MANY_VIEWS)
                     best = plain_config
                     settings.insert(0, other)
-            best = _with(best, "model", choose=False)
+            base = best = _with(best, "model", choose=False)
             if moves is None:
                 base, moving = _at_rest(plain_config), best
                 settings.insert(0, OpenSetting("model.kind=dynamic", lambda _: moving))
-            else:
-                base = best = best if moves else as_static(plain_config)
         case _ if not settings:
             return best, [], with_points(capture, best)
     settings = [x for x in settings if x.applied(best) is not None or x.applied(base) is not None]
@@ -134,7 +134,9 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     if len(plan.folds) * plan.runs < 2:
         if settings:
             keys = ", ".join(x.text for x in settings)
-            print(f"{keys}: too short a run, or too few views, to find out whether it pays", flush=True)
+            print(f"{keys}: not used, too short a run or too few views to find out whether it pays", flush=True)
+        if base != best:
+            return choose(as_static(config), capture)
         return best, [], with_points(capture, best)
     prepared = with_points(capture, base)
     found, choices = _decided(base, settings[: plan.runs - 1], plan, prepared)
@@ -184,17 +186,13 @@ def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
 
 
 def as_static(config: Config) -> Config:
-    """Return ``config`` as a static scene: what was requested stays where a static one has such a key.
+    """Return ``config`` as a static scene, as the preset ``static`` trains it: only what was requested is kept.
 
-    All else is as in the preset ``static``.
+    That includes ``train.steps``, where a static scene has such a key.
     """
     usual = load_config(packaged_preset("static"), [f"data.root={config.data.root}"])
-    names = ("model", "init", "strategy", "optim")
-    changed = {name: _requested(getattr(config, name), getattr(usual, name)) for name in names}
-    train = _requested(config.train, usual.train)
-    lengths = ("steps", "log_every", "save_every", "eval_every", "tensorboard")
-    kept = {name: getattr(config.train, name) for name in lengths}
-    return config.model_copy(update=changed | {"train": train.model_copy(update=kept)})
+    names = ("model", "init", "strategy", "optim", "train")
+    return config.model_copy(update={name: _requested(getattr(config, name), getattr(usual, name)) for name in names})
 
 
 def _at_rest(config: Config) -> Config:

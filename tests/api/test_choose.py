@@ -40,6 +40,10 @@ def decided(config: Config) -> tuple[Config, list[Choice]]:
     return best, found
 
 
+def without_name(config: Config) -> Config:
+    return config.model_copy(update={"run": config.run.model_copy(update={"name": "any"})})
+
+
 def scored(monkeypatch: pytest.MonkeyPatch, psnr_of: Any) -> list[Config]:
     """Let nothing be trained: a small run has the PSNR that ``psnr_of`` gives it, and differs a little by view."""
     tried: list[Config] = []
@@ -153,10 +157,11 @@ def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
 
 
 @pytest.mark.parametrize("keys", [("train.steps=400",), (LONG, "train.minutes=3")])
-def test_short_runs_ask_nothing(keys: tuple[str, ...], moving: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = preset(moving, *keys)
-    best, found = decided(config)
-    assert isinstance(best.model, DynamicModel)
+def test_where_nothing_can_be_found_out_the_scene_is_static(
+    keys: tuple[str, ...], moving: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    best, found = decided(preset(moving, *keys))
+    assert without_name(best) == without_name(preset(moving, *keys, name="static"))
     assert not found
     assert "too short a run" in capsys.readouterr().out
 
@@ -215,15 +220,31 @@ def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> Non
         decided(preset(still))
 
 
-def test_as_static_has_the_static_preset_and_what_was_requested(moving: Path) -> None:
-    plain = as_static(preset(moving, "train.steps=123"))
-    static = preset(moving, "train.steps=123", name="static")
-    assert plain.model_copy(update={"run": static.run}) == static
-    keys = ("model.sh_degree=2", "train.ssim_weight=0.5", "optim.lr_means=1e-3", "strategy.kind=mcmc")
-    found = as_static(preset(moving, *keys, "strategy.max_gaussians=77"))
-    assert found.model == static.model.model_copy(update={"sh_degree": 2})
-    assert (found.train.ssim_weight, found.optim.lr_means) == (0.5, 1e-3)
-    assert (found.strategy.kind, found.strategy.growth_limit) == ("mcmc", 77)
+@pytest.mark.parametrize(
+    "keys",
+    [
+        (),
+        ("train.steps=123", "train.minutes=2", "train.robust=auto"),
+        ("model.sh_degree=2", "train.ssim_weight=0.5", "optim.lr_means=1e-3"),
+        ("strategy.kind=mcmc", "strategy.max_gaussians=77", "init.kind=random", "colour.kind=network"),
+    ],
+)
+def test_as_static_is_the_static_preset_with_what_was_requested(
+    keys: tuple[str, ...], moving: Path, tmp_path: Path
+) -> None:
+    """Also by a copy of the preset, whose values its user has not requested."""
+    static = without_name(preset(moving, *keys, name="static"))
+    assert without_name(as_static(preset(moving, *keys))) == static
+    copy = tmp_path / "own.yaml"
+    copy.write_text(packaged_preset("dynamic").read_text() + "camera:\n  refine: always\n")
+    own = load_config(copy, [f"data.root={moving}", "run.threads=1", *keys])
+    assert without_name(as_static(own)) == static.model_copy(update={"camera": own.camera})
+    assert own.camera.refine == "always"
+
+
+def test_what_only_moving_scenes_have_is_left_out(moving: Path) -> None:
+    config = preset(moving, "model.deform.kind=hexplane", "model.time_window=0.5")
+    assert without_name(as_static(config)) == without_name(preset(moving, name="static"))
 
 
 def test_small_runs_with_and_without_motion_learn_equally_fast(moving: Path) -> None:
