@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -16,6 +17,7 @@ from two_balls import two_balls
 
 from dyngs.api import choose as module
 from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
+from dyngs.api.train import train
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel
 from dyngs.config.io import load_config, packaged_preset
@@ -25,6 +27,7 @@ from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dy
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import render
 from dyngs.runs.folder import CHOICES_NAME
+from dyngs.training.trainer import Trainer
 
 LONG = "train.steps=200_000"
 
@@ -294,6 +297,29 @@ def test_never_worse_than_static(
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
     assert f"model.kind=dynamic {'' if moves else 'not '}taken: " in capsys.readouterr().out
+
+
+def test_a_trial_that_is_interrupted_leaves_nothing_and_has_the_same_end_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_rolling_ball(tmp_path / "capture")
+    monkeypatch.setattr(module, "TRIAL_STEPS", 12)
+    monkeypatch.setattr(module, "FEWEST_MOVING", 1)
+    monkeypatch.setattr(module, "TRIAL_SPENT", 1000)
+    run, real = tmp_path / "run", Trainer.step
+    config = preset(tmp_path / "capture", "train.steps=12", "init.num_random=40", f"run.dir={run}")
+
+    def interrupted(trainer: Trainer[Any]) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return real(trainer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="nothing is written"):
+            train(config)
+    assert not list(run.glob("*"))
+    chosen = [decided(config) for _ in range(2)]
+    assert replace(chosen[0][1][0], seconds=0) == replace(chosen[1][1][0], seconds=0)
 
 
 def test_motion_is_not_asked_about_where_too_few_steps_fit_in_the_minutes(
