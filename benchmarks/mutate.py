@@ -27,9 +27,9 @@ SECONDS = 240
 # file, what is there once, what is put in its place, tests
 MUTATIONS = (
     ("api/choose.py", "gains = [after - before", "gains = [before - after", "api/test_choose.py"),
-    ("api/choose.py", "if choice is None or not choice.taken:", "if choice is None or choice.taken:", "api/test_choose.py"),
+    ("api/choose.py", "    if not choice.taken:", "    if choice.taken:", "api/test_choose.py"),
     ("api/choose.py", "both = still, moving", "both = moving, still", "api/test_choose.py"),
-    ("api/choose.py", "None if moves is False else _trial", "None if moves is True else _trial", "test_quality.py"),
+    ("api/choose.py", "if moves is False:", "if moves is True:", "api/test_choose.py test_quality.py"),
     ("api/choose.py", "moves = fraction > MIN_DIFFERING", "moves = fraction < MIN_DIFFERING", "api/test_choose.py test_quality.py"),
     ("splats/antimatter.py", "* 255).round()", "* 255)", "splats/test_formats.py"),
     ("splats/antimatter.py", "* 128 + 128).round()", "* 128 + 128)", "splats/test_formats.py"),

@@ -1,10 +1,10 @@
-"""Decide before a run which settings pay, by short trainings that are scored on training views held out.
+"""Decide before a run which settings pay, by short trainings scored on held-out training views.
 
-A setting is taken if the mean gain over these views, pair by pair, is above twice its standard error. The simpler side
-wins a tie, and wherever nothing could be compared. The winner is trained in full, on all training views. Settings that
-the user has requested are never compared.
+A setting is taken if the mean gain over these views, pair by pair, is above twice its standard
+error. The simpler side wins a tie, and wherever nothing could be compared. The winner is trained in
+full, on all training views. Settings that the user has requested are never compared.
 
-- Motion: one static model is trained for a while and then twice as long again, with motion and without.
+- Motion: one static model is trained for a while, and then twice as long, with motion and without.
 - Other settings: small runs of the same images, steps and cap on Gaussians differ in one setting.
 """
 
@@ -58,14 +58,15 @@ FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
 TRIAL_STEPS, TRIAL_SIDE, TRIAL_GAUSSIANS, TRIAL_RANDOM = 600, 96, 5000, 1000
-"""Of the trial of motion: steps of each model, of which the first third is shared; longest side of the images, px; most
-Gaussians; most random ones that motion begins with. In 300 steps the motion of a turning head is not found yet."""
+"""Of the trial of motion: steps of each model, of which the first third is shared; longest side of
+the images, px; most Gaussians; most random ones that motion begins with. In 300 steps the motion of
+a turning head is not found yet."""
 TRIAL_COST = 1.4
 """Work of the trial, in steps of a moving scene, for each of its steps: a step with motion costs two without."""
 TRIAL_SPENT = 0.2  # Most of a run's work, or of its ``train.minutes``, that the trial may take
 FEWEST_MOVING = 1500
-"""Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static model of it, in
-3,000 it gains."""
+"""Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static
+model of it, in 3,000 it gains."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
 FREE_VIEWS, MANY_VIEWS = 3.0, 6.0
 """Views of each time by fixed cameras, in the mean, from which free primitives may be used for what moves, and from
@@ -120,32 +121,38 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     problem = kind_of(config.model).refusal(capture)
     if problem is not None:
         raise DyngsError(f"{config.data.root}: {problem}")
-    settings, config = _settings(config), _without_auto(config)
-    if not isinstance(config.model, DynamicModel) or not config.model.choose:
-        return _compared(config, settings, capture)
+    settings = _settings(config)
+    model = config.model
+    if not isinstance(model, DynamicModel) or not model.choose:
+        return _compared(_without_auto(config), settings, capture)
     moves = _motion_of_fixed_cameras(capture, config)
+    if moves is False:
+        return choose(as_static(config), capture)
     views = _views_at_once(capture)
-    moving = _with(config, "model", choose=False)
+    moving = _with(_without_auto(config), "model", choose=False)
     if moves and views >= FREE_VIEWS:
         moving = _bounded(moving)
-        if not config.model.deform.model_fields_set:
-            moving, other = _what_moves(moving, config.model.deform, views >= MANY_VIEWS)
+        if not model.deform.model_fields_set:
+            moving, other = _what_moves(moving, model.deform, views >= MANY_VIEWS)
             settings.insert(0, other)
-    choice = None if moves is False else _trial_of_motion(moving, capture)
-    found = [] if choice is None else [choice]
-    if choice is None and moves is not False:
+    choice = _trial_of_motion(moving, capture)
+    if choice is None:
         print(
-            "model.kind=dynamic not taken: too short a run, or too few views, to find out whether motion pays; trained "
-            "as a static scene (model.choose=false: as a moving one)",
+            "model.kind=dynamic not taken: too short a run, or too few views, to find out whether "
+            "motion pays; trained as a static scene (model.choose=false: as a moving one)",
             flush=True,
         )
-    if choice is None or not choice.taken:
-        best, choices, capture = choose(as_static(config), capture)
-    else:
-        if moving.model.filter_3d and not config.model.filter_3d:
-            print(f"fixed cameras, {views:.0f} at a time: nothing is drawn thinner than they show (model.filter_3d)")
-        best, choices, capture = _compared(moving, settings, capture)
-    return best, found + choices, capture
+        return choose(as_static(config), capture)
+    if not choice.taken:
+        still, choices, capture = choose(as_static(config), capture)
+        return still, [choice, *choices], capture
+    if moving.model.filter_3d and not model.filter_3d:
+        print(
+            f"fixed cameras, {views:.0f} at a time: nothing is drawn thinner than they show (model.filter_3d)",
+            flush=True,
+        )
+    best, choices, capture = _compared(moving, settings, capture)
+    return best, [choice, *choices], capture
 
 
 def _trial_of_motion(config: Config, capture: Capture) -> Choice | None:
@@ -162,19 +169,21 @@ def _trial_of_motion(config: Config, capture: Capture) -> Choice | None:
     if not folds or config.train.steps < max(affordable, FEWEST_MOVING):
         return None
     capture = with_points(capture, config, quiet=True)
-    given, begun = 60 * (config.train.minutes or math.inf), time.monotonic()
+    given = 60 * (config.train.minutes or math.inf)
+    begun = time.monotonic()
     pairs = list[tuple[float, float]]()
     for held_out in folds:
         both = _with_and_without_motion(small, capture, held_out, begun + TRIAL_SPENT * given)
         if both is None:
             return None
         pairs += [plain(*both, index) for index in sorted(held_out)]
-    seconds = time.monotonic() - begun
+    seconds = max(time.monotonic() - begun, 1e-6)
     steps_that_fit = (given - seconds) / seconds * work / _work_of_step(config, views[0])
     if steps_that_fit < FEWEST_MOVING:
         return None
     choice = _choice("model.kind=dynamic", pairs, TRIAL_STEPS, seconds)
-    print(f"trial of {counted(TRIAL_STEPS, 'step')}, compared on training views that are held out:", flush=True)
+    steps = counted(TRIAL_STEPS, "step")
+    print(f"trial of {steps}, compared on training views that are held out:", flush=True)
     print(f"  {choice}", flush=True)
     return choice
 
@@ -196,7 +205,7 @@ def _with_and_without_motion(
 def _compared(
     config: Config, settings: Sequence[OpenSetting], capture: Capture
 ) -> tuple[Config, list[Choice], Capture]:
-    """Return ``config`` with the settings that win small runs, all figures, and the capture with its first points."""
+    """Return ``config`` with the settings that win small runs, all figures, and the prepared capture."""
     settings = [x for x in settings if x.applied(config) is not None]
     capture = with_points(capture, config)
     plan = _Plan.of(config, capture, len(settings)) if settings else None

@@ -99,6 +99,15 @@ def test_where_motion_does_not_pay_the_scene_is_static_and_no_more_is_asked(
     assert len(tried) == 4, "two of each"
 
 
+def test_what_is_open_in_a_static_scene_is_asked_once_it_is_found_still(
+    moving: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scored(monkeypatch, lambda c: 20.0 - isinstance(c.model, DynamicModel) + (c.train.robust == "always"))
+    best, found = decided(preset(moving, LONG, "train.robust=auto"))
+    assert [choice.setting for choice in found] == ["model.kind=dynamic", "train.robust=always"]
+    assert without_name(best) == without_name(preset(moving, LONG, "train.robust=always", name="static"))
+
+
 def test_what_was_requested_is_not_questioned(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tried = scored(monkeypatch, lambda _: 20.0 + len(tried))
     keys = ("colour.kind=sh", "model.deform.move_opacities=false", "camera.refine=never")
