@@ -63,7 +63,7 @@ the images, px; most Gaussians; most random ones that motion begins with. In 300
 a turning head is not found yet."""
 TRIAL_COST = 1.4
 """Work of the trial, in steps of a moving scene, for each of its steps: a step with motion costs two without."""
-TRIAL_SPENT = 0.2  # Most of a run's work, or of its ``train.minutes``, that the trial may take
+TRIAL_SPENT = 0.25  # Most of a run's work, or of its ``train.minutes``, that the trial may take
 FEWEST_MOVING = 1500
 """Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static
 model of it, in 3,000 it gains."""

@@ -341,7 +341,7 @@ def test_motion_is_not_asked_about_where_too_few_steps_fit_in_the_minutes(
     assert decided(preset(moving, "train.minutes=0.2"))[1] == []
 
 
-def test_the_trial_is_a_fifth_of_the_run_at_most(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_trial_is_a_quarter_of_the_run_at_most(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tried = scored(monkeypatch, moving_wins)
     view = read_capture(preset(moving).data).splits["train"][0]
     for steps in (1000, 2000, 4000, 8000, 16_000):
@@ -350,4 +350,4 @@ def test_the_trial_is_a_fifth_of_the_run_at_most(moving: Path, monkeypatch: pyte
         decided(config)
         work = sum(module.TRIAL_COST * c.train.steps * module._work_of_step(c, view) for c in tried if c.model.may_move)
         assert work <= module.TRIAL_SPENT * steps * module._work_of_step(config, view)
-        assert bool(work) == (steps > 8000)
+        assert bool(work) == (steps > 4000)
