@@ -27,9 +27,9 @@ SECONDS = 240
 # file, what is there once, what is put in its place, tests
 MUTATIONS = (
     ("api/choose.py", "gains = [after - before", "gains = [before - after", "api/test_choose.py"),
-    ('api/choose.py', 'settings.insert(0, OpenSetting("model.kind=dynamic"', 'settings.append(OpenSetting("model.kind=dynamic"', "api/test_choose.py"),
-    ("api/choose.py", "base, moving = _at_rest(plain_config), best", "base, moving = best, _at_rest(plain_config)", "api/test_choose.py"),
-    ("api/choose.py", "base = best = best if moves else as_static(plain_config)", "base = best = as_static(plain_config) if moves else best", "api/test_choose.py test_quality.py"),
+    ("api/choose.py", "    if not choice.taken:", "    if choice.taken:", "api/test_choose.py"),
+    ("api/choose.py", "both = still, moving", "both = moving, still", "api/test_choose.py"),
+    ("api/choose.py", "if moves is False:", "if moves is True:", "api/test_choose.py test_quality.py"),
     ("api/choose.py", "moves = fraction > MIN_DIFFERING", "moves = fraction < MIN_DIFFERING", "api/test_choose.py test_quality.py"),
     ("splats/antimatter.py", "* 255).round()", "* 255)", "splats/test_formats.py"),
     ("splats/antimatter.py", "* 128 + 128).round()", "* 128 + 128)", "splats/test_formats.py"),

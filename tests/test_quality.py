@@ -75,13 +75,14 @@ def test_a_static_scene_by_mcmc(still_life: Captured) -> None:
 
 
 def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
-    """With all decisions on: the scene ends moving, follows its material points, is no worse than a static one.
+    """The scene ends moving, follows its material points, and is no worse than a static one.
 
     That learns at the same rates: its own, for so short a run, would favour it.
     """
     captured = Captured.of(tmp_path, "wave", "--size", "32", "--views", "32")
     keys = ("train.steps=800", "init.num_random=1000", "strategy.max_gaussians=1500", "train.initial_downscale=1")
-    moving, static = (captured.report(preset, *keys, "optim.rate_factor=1") for preset in ("dynamic", "static"))
+    moving = captured.report("dynamic", *keys, "model.choose=false", "optim.rate_factor=1")
+    static = captured.report("static", *keys, "optim.rate_factor=1")
     assert moving.moving_fraction > 0.9
     assert moving.psnr > 22.5  # 22.86 to 23.06 by instruction set; after 600 steps too little is learned to tell
     assert moving.psnr > static.psnr  # 22.37 to 22.42
@@ -142,13 +143,15 @@ def test_what_stays_before_fixed_cameras_is_trained_as_static(still_life: Captur
     assert checkpoint_bytes(runs[0]) == checkpoint_bytes(runs[1])
 
 
-def test_what_moves_before_fixed_cameras_is_trained_as_moving(
+def test_what_moves_is_trained_as_static_where_the_run_is_too_short_to_follow_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     room = Captured.of(tmp_path, "room", "--size", "32", "--views", "6", "--cameras", "3")
     run = room.trained("dynamic", "train.steps=20")
-    assert load_resolved(run).model.kind == "dynamic"
-    assert "something moves" in capsys.readouterr().out
+    assert load_resolved(run).model.kind == "static"
+    printed = capsys.readouterr().out
+    assert "something moves" in printed
+    assert "too short a run" in printed
 
 
 def test_the_command_trains_the_same_bytes_as_python(still_life: Captured) -> None:

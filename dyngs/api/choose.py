@@ -1,8 +1,11 @@
-"""What is decided before a run, by one procedure: small runs that differ in one setting, compared view by view.
+"""Decide before a run which settings pay, by short trainings scored on held-out training views.
 
-All small runs of a capture have the same images, steps and cap on Gaussians, and hold out the same training views. A
-setting is taken if the mean gain over these views, pair by pair, is above twice its standard error; a tie goes to the
-simpler one, which is what comes first. The winner is trained in full. What was requested is never asked.
+A setting is taken if the mean gain over these views, pair by pair, is above twice its standard
+error. The simpler side wins a tie, and wherever nothing could be compared. The winner is trained in
+full, on all training views. Settings that the user has requested are never compared.
+
+- Motion: one static model is trained for a while, and then twice as long, with motion and without.
+- Other settings: small runs of the same images, steps and cap on Gaussians differ in one setting.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from statistics import fmean, stdev
 
 from dyngs.api.from_scene import first_of
 from dyngs.api.pair_scores import PairScore, after_colour_fit, after_pose_fit, explained, plain
+from dyngs.budget.time import refitted
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -34,10 +38,10 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.images.images import target_size
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
+from dyngs.deform.schedule import motion_begins_after
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.errors import DyngsError, counted
 from dyngs.files.write import write_text
-from dyngs.gaussians.schedule import rate_factors
 from dyngs.kinds import GaussianTrainer, assemble, with_points
 from dyngs.models.kind import kind_of
 from dyngs.models.schedule import image_divisor
@@ -48,13 +52,21 @@ from dyngs.training.loop import Interrupts
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000  # Of small runs: longest side of the images, px, and most Gaussians
 STEPS, FEWEST_STEPS = 2000, 1000  # Most steps of a small run; with fewer than the latter it says nothing
-"""Whether anything moves takes the former: of a cloth of 64 px, seen once per time, 1,200 steps found 0.2 dB (standard
-error 0.3) where full runs differ by 2.8 dB; 2,000 steps found 1.0 (0.4)."""
 SPENT = 0.1  # Most of a run's work that small runs may take
 STEP_COST, GAUSSIAN_COST = 20_000, 2  # Work of a step next to its images, and of a Gaussian in it, in pixels
 FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
+TRIAL_STEPS, TRIAL_SIDE, TRIAL_GAUSSIANS, TRIAL_RANDOM = 600, 96, 5000, 1000
+"""Of the trial of motion: steps of each model, of which the first third is shared; longest side of
+the images, px; most Gaussians; most random ones that motion begins with. In 300 steps the motion of
+a turning head is not found yet."""
+TRIAL_COST = 1.4
+"""Work of the trial, in steps of a moving scene, for each of its steps: a step with motion costs two without."""
+TRIAL_SPENT = 0.25  # Most of a run's work, or of its ``train.minutes``, that the trial may take
+FEWEST_MOVING = 1500
+"""Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static
+model of it, in 3,000 it gains."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
 FREE_VIEWS, MANY_VIEWS = 3.0, 6.0
 """Views of each time by fixed cameras, in the mean, from which free primitives may be used for what moves, and from
@@ -98,52 +110,112 @@ class Choice:
 
 
 def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
-    """Return ``config`` with all decided that was not requested, and what small runs said; lines say so, too.
+    """Resolve every setting that is left open, by short trainings, and print what they found.
 
-    The capture is returned with the points that the scene begins with.
+    Returns the resolved config, the figures, and the capture with the points that the scene begins with.
 
     Raises:
         DyngsError: images that cannot be read, or a capture that this kind of model cannot be trained on.
-        KeyboardInterrupt: during small runs; nothing has been written.
+        KeyboardInterrupt: during short trainings; nothing has been written.
     """
     problem = kind_of(config.model).refusal(capture)
     if problem is not None:
         raise DyngsError(f"{config.data.root}: {problem}")
-    settings, plain_config = _settings(config), _without_auto(config)
-    base = best = plain_config
-    match plain_config.model:
-        case DynamicModel() as model:
-            moves = _motion_of_fixed_cameras(capture, config) if model.choose else True
-            views = _views_at_once(capture)
-            if model.choose and moves and views >= FREE_VIEWS:
-                plain_config = best = _bounded(plain_config, views)
-                if not model.deform.model_fields_set:
-                    plain_config, other = _what_moves(plain_config, model.deform, views >= MANY_VIEWS)
-                    best = plain_config
-                    settings.insert(0, other)
-            best = _with(best, "model", choose=False)
-            if moves is None:
-                base, moving = _at_rest(plain_config), best
-                settings.insert(0, OpenSetting("model.kind=dynamic", lambda _: moving))
-            else:
-                base = best = best if moves else as_static(plain_config)
-        case _ if not settings:
-            return best, [], with_points(capture, best)
-    settings = [x for x in settings if x.applied(best) is not None or x.applied(base) is not None]
-    plan = _Plan.of(best, capture, len(settings), FEWEST_STEPS if base == best else STEPS)
-    if len(plan.folds) * plan.runs < 2:
+    settings = _settings(config)
+    model = config.model
+    if not isinstance(model, DynamicModel) or not model.choose:
+        return _compared(_without_auto(config), settings, capture)
+    moves = _motion_of_fixed_cameras(capture, config)
+    if moves is False:
+        return choose(as_static(config), capture)
+    views = _views_at_once(capture)
+    moving = _with(_without_auto(config), "model", choose=False)
+    if moves and views >= FREE_VIEWS:
+        moving = _bounded(moving)
+        if not model.deform.model_fields_set:
+            moving, other = _what_moves(moving, model.deform, views >= MANY_VIEWS)
+            settings.insert(0, other)
+    choice = _trial_of_motion(moving, capture)
+    if choice is None:
+        print(
+            "model.kind=dynamic not taken: too short a run, or too few views, to find out whether "
+            "motion pays; trained as a static scene (model.choose=false: as a moving one)",
+            flush=True,
+        )
+        return choose(as_static(config), capture)
+    if not choice.taken:
+        still, choices, capture = choose(as_static(config), capture)
+        return still, [choice, *choices], capture
+    if moving.model.filter_3d and not model.filter_3d:
+        print(
+            f"fixed cameras, {views:.0f} at a time: nothing is drawn thinner than they show (model.filter_3d)",
+            flush=True,
+        )
+    best, choices, capture = _compared(moving, settings, capture)
+    return best, [choice, *choices], capture
+
+
+def _trial_of_motion(config: Config, capture: Capture) -> Choice | None:
+    """Compare ``config`` with the same model at rest; None where the run is too short, or has too few views.
+
+    Both begin as one static model, and train on the same views in the same order. That compares motion alone: at the
+    rates of the preset ``static``, a still model would win by its faster learning.
+    """
+    views = capture.splits["train"]
+    folds = _held_out(views)
+    small = _trial_config(config)
+    work = len(folds) * TRIAL_COST * TRIAL_STEPS * _work_of_step(small, views[0])
+    affordable = work / (TRIAL_SPENT * _work_of_step(config, views[0]))
+    if not folds or config.train.steps < max(affordable, FEWEST_MOVING):
+        return None
+    capture = with_points(capture, config, quiet=True)
+    given = 60 * (config.train.minutes or math.inf)
+    begun = time.monotonic()
+    pairs = list[tuple[float, float]]()
+    for held_out in folds:
+        both = _with_and_without_motion(small, capture, held_out, begun + TRIAL_SPENT * given)
+        if both is None:
+            return None
+        pairs += [plain(*both, index) for index in sorted(held_out)]
+    seconds = max(time.monotonic() - begun, 1e-6)
+    steps_that_fit = (given - seconds) / seconds * work / _work_of_step(config, views[0])
+    if steps_that_fit < FEWEST_MOVING:
+        return None
+    choice = _choice("model.kind=dynamic", pairs, TRIAL_STEPS, seconds)
+    steps = counted(TRIAL_STEPS, "step")
+    print(f"trial of {steps}, compared on training views that are held out:", flush=True)
+    print(f"  {choice}", flush=True)
+    return choice
+
+
+def _with_and_without_motion(
+    config: Config, capture: Capture, held_out: frozenset[int], deadline: float
+) -> tuple[GaussianTrainer, GaussianTrainer] | None:
+    """Return trainers without and with motion after the trial ``config``; None where it takes too long."""
+    moving = assemble(config, capture, held_out=held_out)
+    begins = motion_begins_after(config, config.train.steps) or 1
+    if not _trained(moving, begins - 1, deadline):
+        return None
+    still = refitted(moving, _with(config, "model", motion_from=1.0))
+    # In the last step of its schedule the model at rest would begin to move.
+    both = still, moving
+    return both if all(_trained(trainer, config.train.steps - 1, deadline) for trainer in both) else None
+
+
+def _compared(
+    config: Config, settings: Sequence[OpenSetting], capture: Capture
+) -> tuple[Config, list[Choice], Capture]:
+    """Return ``config`` with the settings that win small runs, all figures, and the prepared capture."""
+    settings = [x for x in settings if x.applied(config) is not None]
+    capture = with_points(capture, config)
+    plan = _Plan.of(config, capture, len(settings)) if settings else None
+    if plan is None or len(plan.folds) * plan.runs < 2:
         if settings:
             keys = ", ".join(x.text for x in settings)
-            print(f"{keys}: too short a run, or too few views, to find out whether it pays", flush=True)
-        return best, [], with_points(capture, best)
-    prepared = with_points(capture, base)
-    found, choices = _decided(base, settings[: plan.runs - 1], plan, prepared)
-    if isinstance(found.model, StaticModel) and isinstance(plain_config.model, DynamicModel):
-        best = _with(as_static(plain_config), "train", exposure=found.train.exposure, robust=found.train.robust)
-        found = best.model_copy(update={"camera": found.camera})
-    if found.init != base.init:
-        prepared = with_points(capture, found, quiet=True)
-    return found, choices, prepared
+            print(f"{keys} not taken: too short a run, or too few views, to find out whether it pays", flush=True)
+        return config, [], capture
+    found, choices = _decided(config, settings[: plan.runs - 1], plan, capture)
+    return found, choices, capture
 
 
 def _decided(
@@ -184,24 +256,13 @@ def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
 
 
 def as_static(config: Config) -> Config:
-    """Return ``config`` as a static scene: what was requested stays where a static one has such a key.
+    """Return ``config`` as a static scene, as the preset ``static`` trains it: only what was requested is kept.
 
-    All else is as in the preset ``static``.
+    That includes ``train.steps``, where a static scene has such a key.
     """
     usual = load_config(packaged_preset("static"), [f"data.root={config.data.root}"])
-    names = ("model", "init", "strategy", "optim")
-    changed = {name: _requested(getattr(config, name), getattr(usual, name)) for name in names}
-    train = _requested(config.train, usual.train)
-    lengths = ("steps", "log_every", "save_minutes", "save_every", "eval_every", "tensorboard")
-    kept = {name: getattr(config.train, name) for name in lengths}
-    return config.model_copy(update=changed | {"train": train.model_copy(update=kept)})
-
-
-def _at_rest(config: Config) -> Config:
-    """Return ``config`` without motion, and with the same learning rates as with it."""
-    shared = {key: getattr(config.model, key) for key in StaticModel.model_fields if key != "kind"}
-    alike = _with(config, "optim", rate_factor=rate_factors(config)[0])
-    return alike.model_copy(update={"model": StaticModel.model_validate(shared)})
+    names = ("model", "init", "strategy", "optim", "train")
+    return config.model_copy(update={name: _requested(getattr(config, name), getattr(usual, name)) for name in names})
 
 
 def _requested(given: Section, usual: Section) -> Section:
@@ -223,7 +284,7 @@ class _Plan:
     first_side: float  # longest side of the images that the run itself begins with, px; small runs begin with no less
 
     @staticmethod
-    def of(config: Config, capture: Capture, num_settings: int, fewest_steps: int = FEWEST_STEPS) -> _Plan:
+    def of(config: Config, capture: Capture, num_settings: int) -> _Plan:
         """Return the plan for a run of ``config`` in which so many settings are open; later ones may be left out."""
         folds, view = _held_out(capture.splits["train"]), capture.splits["train"][0]
         first = _longest_side(config, view) / config.train.initial_downscale
@@ -233,24 +294,30 @@ class _Plan:
         spent = SPENT * config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
         for runs in range(1 + num_settings, 1, -1):
             steps = min(STEPS, int(spent / max(runs * len(folds), 1)))
-            if steps >= fewest_steps:
+            if steps >= FEWEST_STEPS:
                 return _Plan(folds, steps, runs, first)
         return _Plan(folds, 0, 0, first)
 
     def trained(self, config: Config, capture: Capture) -> list[GaussianTrainer]:
         """Return the trainers of ``config`` after a small run for each fold."""
-        return [_trained(_small(config, self.steps, self.first_side), capture, held_out) for held_out in self.folds]
+        return [_small_run(_small(config, self.steps, self.first_side), capture, held_out) for held_out in self.folds]
 
 
-def _trained(config: Config, capture: Capture, held_out: frozenset[int]) -> GaussianTrainer:
+def _small_run(config: Config, capture: Capture, held_out: frozenset[int]) -> GaussianTrainer:
     trainer = assemble(config, capture, held_out=held_out, first=first_of(config, capture))
+    _trained(trainer, config.train.steps)
+    return trainer
+
+
+def _trained(trainer: GaussianTrainer, steps: int, deadline: float = math.inf) -> bool:
+    """Train up to ``steps``, and return True; False where that takes until ``deadline``."""
     with Interrupts() as interrupts:
-        while trainer.done < config.train.steps:
+        while trainer.done < steps and time.monotonic() < deadline:
             if interrupts.requested:
                 raise KeyboardInterrupt("stopped before training began: nothing is written, give the command again")
             trainer.step()
     trainer.images.rest()
-    return trainer
+    return trainer.done >= steps
 
 
 def _work_of_step(config: Config, view: View) -> float:
@@ -264,20 +331,28 @@ def _longest_side(config: Config, view: View) -> int:
     return max(target_size(view.width, view.height, config.data.downscale, config.data.longest_side))
 
 
-def _small(config: Config, steps: int, first_side: float) -> Config:
+def _trial_config(config: Config) -> Config:
+    small = _small(config, TRIAL_STEPS, math.inf, TRIAL_SIDE, TRIAL_GAUSSIANS)
+    small = _with(small, "init", num_random=min(config.init.num_random, TRIAL_GAUSSIANS))
+    return _with(small, "model", num_random_moving=min(config.model.added_for_motion, TRIAL_RANDOM))
+
+
+def _small(
+    config: Config, steps: int, first_side: float, side: int = SMALL_SIDE, most_gaussians: int = SMALL_GAUSSIANS
+) -> Config:
     """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits.
 
     They begin with no smaller images than the run itself, ``first_side`` px: in smaller ones motion is lost that it
     follows.
     """
-    side = min(config.data.longest_side or SMALL_SIDE, SMALL_SIDE)
+    side = min(config.data.longest_side or side, side)
     divisors = (n for n in (16, 8, 4, 2) if n <= config.train.initial_downscale and side / n >= first_side)
     first = next(divisors, 1)
     length = {"steps": steps, "minutes": None, "save_every": 0, "eval_every": 0, "initial_downscale": first}
     return config.model_copy(
         update={
             "data": config.data.model_copy(update={"longest_side": side}),
-            "strategy": config.strategy.limited(SMALL_GAUSSIANS),
+            "strategy": config.strategy.limited(most_gaussians),
             "train": config.train.model_copy(update=length),
             "budget": BudgetConfig(),
             "prune": PruneConfig(),
@@ -355,19 +430,14 @@ def _what_moves(given: Config, field: DeformField, free: bool) -> tuple[Config, 
     return first(given), OpenSetting(f"model.deform.kind={kind}", other)
 
 
-def _bounded(config: Config, views: float) -> Config:
+def _bounded(config: Config) -> Config:
     """Return the configuration for fixed cameras, with the filter in space unless that was requested.
 
     What is thinner than few cameras show fits these alone. Before eight, against 3DGS's wider filter in the image, a
     room has -1.4 dB on other cameras without the filter in space and +0.7 with it, a die +0.9 and +2.2. Small runs
     cannot tell: a camera whose image is held out is trained on at other times.
     """
-    if "filter_3d" in config.model.model_fields_set:
-        return config
-    print(
-        f"fixed cameras, {views:.0f} at a time: nothing is drawn thinner than they show (model.filter_3d)", flush=True
-    )
-    return _with(config, "model", filter_3d=True)
+    return config if "filter_3d" in config.model.model_fields_set else _with(config, "model", filter_3d=True)
 
 
 def _network(config: Config) -> Config | None:

@@ -145,9 +145,8 @@ def train(
         with progress() as report:
             config = settled(with_capture(config, report=report))
     keep_freed_memory()
-    threads = config.run.threads or max(1, num_cores() // processes.local_size)
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
-    with writing(folder) as held, kernel_threads(threads), bytewise:
+    with writing(folder) as held, kernel_threads(_num_threads(config, processes)), bytewise:
         tidy(folder, sole_writer=held.alone)
         if resume_from is not None:
             note_root(folder, config.data)
@@ -166,10 +165,11 @@ def train(
         asked = asked_for(folder) if resume_from is not None else config
         if resumed is not None:
             resumed.require_settings(config)
+        watch = Stopwatch()
         config, choices, capture = _chosen(config, resumed)
         if resumed is not None:
             _warn_of_changed_files(folder, config, capture)
-        run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, threads=threads)
+        run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, watch=watch)
         write_choices(run.folder, choices)
         lines = run.run(listeners)
         folder = run.folder
@@ -203,7 +203,7 @@ class _Run:
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen.
         held: the lock of the folder, which knows where that is if it is renamed.
-        threads: of the kernels in each of them.
+        watch: seconds since the capture was read, which include those of short trainings before the run.
     """
 
     def __init__(
@@ -216,9 +216,8 @@ class _Run:
         capture: Capture | None,
         held: Held,
         processes: Processes,
-        threads: int,
+        watch: Stopwatch,
     ) -> None:
-        watch = Stopwatch()
         if resumed is None:
             require_room(config)
         first = None if resumed is not None or capture is None else first_of(config, capture)
@@ -226,7 +225,7 @@ class _Run:
         self._held, self._capture = held, capture
         self.folder, self.limits = folder, dict[str, Limit]()
         self.loop = Loop(trainer, config.total_steps, watch, lambda: last_good(self.folder))
-        self._leader = Leader(processes, config, threads)
+        self._leader = Leader(processes, config, _num_threads(config, processes))
         self.loop.before_step = self._leader.before_step
         if resumed is not None:
             trainer.restore(resumed)
@@ -451,6 +450,11 @@ def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -
     save_config(longer, folder / RESOLVED_NAME)
     (folder / ASKED_NAME).unlink(missing_ok=True)  # what was asked for now is what is there
     return with_length(config.model_copy(update={"train": config.train.model_copy(update={"steps": was})}), done, steps)
+
+
+def _num_threads(config: Config, processes: Processes) -> int:
+    """Return the number of threads of the kernels in each process."""
+    return config.run.threads or max(1, num_cores() // processes.local_size)
 
 
 def num_cores() -> int:

@@ -214,7 +214,7 @@ def _pilot(config: Config, trainer: Trainer[Any], seconds: float) -> tuple[Forec
 
 def refitted(trainer: Trainer[Any], config: Config) -> Trainer[Any]:
     """Return a trainer that is where ``trainer`` is, but on the schedules of ``config``."""
-    fitted = assemble(config, trainer.capture, restored=True, images=trainer.images)
+    fitted = assemble(config, trainer.capture, restored=True, images=trainer.images, held_out=trainer.held_out)
     fitted.bad_gradients = trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
     step = trainer.done + 1

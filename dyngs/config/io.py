@@ -59,7 +59,8 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
 
     Returns:
         the checked configuration; ``data.root`` and ``data.body`` are made absolute, so that later commands work from
-        any folder. ``model_fields_set`` of its sections has what overrides, or a file of the user's own, say.
+        any folder. ``model_fields_set`` of its sections has the keys of overrides, and those of a file that differ
+        from the packaged presets of its model.
 
     Raises:
         DyngsError: naming the file and line or the override, the key, and what is allowed.
@@ -70,7 +71,7 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
         file = find_preset(Path(preset))
         layers.add(read_file(file))
         if file.resolve() not in [packaged.resolve() for packaged in packaged_presets().values()]:
-            own |= layers.origins.keys()
+            own |= _own_keys(layers)
     own |= layers.add_overrides(overrides)
     config = _validate(layers)
     _note_requested(config, (), own)
@@ -237,6 +238,21 @@ class _Layers:
         """Where the value at ``keys``, or else the first one below it, was written; "" if nowhere."""
         below = (origin for k, origin in self.origins.items() if k[: len(keys)] == keys)
         return self.origins.get(keys) or next(below, "")
+
+
+def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
+    """Return the keys of a preset file to which no packaged preset of the same ``model.kind`` gives the same value.
+
+    A copy of a packaged preset is that preset: its user has requested nothing.
+    """
+    own = set(layers.origins)
+    kind = layers.value_at(("model", "kind"))
+    for file in packaged_presets().values():
+        packaged = _Layers()
+        packaged.add(read_file(file))
+        if packaged.value_at(("model", "kind")) == kind:
+            own -= {keys for keys in own & packaged.origins.keys() if packaged.value_at(keys) == layers.value_at(keys)}
+    return own
 
 
 def _fill_in_kinds(section: type[BaseModel], node: dict[str, Any]) -> None:

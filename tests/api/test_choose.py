@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -16,6 +17,7 @@ from two_balls import two_balls
 
 from dyngs.api import choose as module
 from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
+from dyngs.api.train import train
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel
 from dyngs.config.io import load_config, packaged_preset
@@ -24,9 +26,8 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import render
-from dyngs.gaussians.schedule import rate_factors
-from dyngs.kinds import with_points
 from dyngs.runs.folder import CHOICES_NAME
+from dyngs.training.trainer import Trainer
 
 LONG = "train.steps=200_000"
 
@@ -40,24 +41,39 @@ def decided(config: Config) -> tuple[Config, list[Choice]]:
     return best, found
 
 
+def without_name(config: Config) -> Config:
+    return config.model_copy(update={"run": config.run.model_copy(update={"name": "any"})})
+
+
 def scored(monkeypatch: pytest.MonkeyPatch, psnr_of: Any) -> list[Config]:
-    """Let nothing be trained: a small run has the PSNR that ``psnr_of`` gives it, and differs a little by view."""
+    """Let nothing be trained: a short training has the PSNR that ``psnr_of`` gives it, and differs a little by view.
+
+    The model at rest of a trial of motion has no ``deform`` there. Returns the configs that were tried.
+    """
     tried: list[Config] = []
 
-    def trained(config: Config, capture: Capture, held_out: frozenset[int]) -> Any:
+    def small_run(config: Config, capture: Capture, held_out: frozenset[int]) -> Any:
         tried.append(config)
         return SimpleNamespace(config=config, held_out=held_out)
+
+    def both(config: Config, capture: Capture, held_out: frozenset[int], deadline: float) -> Any:
+        return tuple(small_run(c, capture, held_out) for c in (as_static(config), config))
 
     def score(one: Any, other: Any, index: int) -> tuple[float, float]:
         return psnr_of(one.config), psnr_of(other.config) + 0.02 * (index % 2)
 
-    monkeypatch.setattr(module, "_trained", trained)
+    monkeypatch.setattr(module, "_small_run", small_run)
+    monkeypatch.setattr(module, "_with_and_without_motion", both)
     for name in ("plain", "explained", "after_pose_fit", "after_colour_fit"):
         monkeypatch.setattr(module, name, score)
     real = module._settings
     monkeypatch.setattr(module, "_settings", lambda config: [replace(x, score=score) for x in real(config)])
     monkeypatch.setattr(module, "OpenSetting", lambda text, applied, _=None: OpenSetting(text, applied, score))
     return tried
+
+
+def moving_wins(config: Config) -> float:
+    return 20.0 + isinstance(config.model, DynamicModel)
 
 
 def test_all_runs_differ_in_one_setting_and_winners_stay(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,8 +83,9 @@ def test_all_runs_differ_in_one_setting_and_winners_stay(moving: Path, monkeypat
     assert isinstance(best.model, DynamicModel)
     assert not best.model.choose
     assert best.colour.kind == "sh"
-    assert [c.model.kind for c in tried[::2]] == ["static", "dynamic", "dynamic", "dynamic"], "twice, as views are few"
-    assert len({(c.train.steps, c.data.longest_side, c.strategy.growth_limit) for c in tried}) == 1
+    assert [c.model.kind for c in tried[:4]] == ["static", "dynamic"] * 2, "twice, as views are few"
+    assert len({(c.train.steps, c.data.longest_side, c.strategy.growth_limit) for c in tried[4:]}) == 1
+    assert [c.colour.kind for c in tried[4::2]] == ["sh", "network", "sh"]
 
 
 def test_where_motion_does_not_pay_the_scene_is_static_and_no_more_is_asked(
@@ -80,6 +97,15 @@ def test_where_motion_does_not_pay_the_scene_is_static_and_no_more_is_asked(
     assert best == as_static(config)
     assert [choice.setting for choice in found] == ["model.kind=dynamic"]
     assert len(tried) == 4, "two of each"
+
+
+def test_what_is_open_in_a_static_scene_is_asked_once_it_is_found_still(
+    moving: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scored(monkeypatch, lambda c: 20.0 - isinstance(c.model, DynamicModel) + (c.train.robust == "always"))
+    best, found = decided(preset(moving, LONG, "train.robust=auto"))
+    assert [choice.setting for choice in found] == ["model.kind=dynamic", "train.robust=always"]
+    assert without_name(best) == without_name(preset(moving, LONG, "train.robust=always", name="static"))
 
 
 def test_what_was_requested_is_not_questioned(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,37 +131,43 @@ def test_before_fixed_cameras_free_primitives_and_nodes_are_compared(
         assert kind == "free" or config.model.deform == preset(root).model.deform  # type: ignore[union-attr]
         return kind
 
+    def psnr_of(config: Config, winner: str) -> float:
+        return 20.0 + (1 + 2 * (config.model.deform.kind == winner) if isinstance(config.model, DynamicModel) else 0)
+
     for winner in ("control_nodes", "free"):
-        tried = scored(monkeypatch, lambda c, winner=winner: 20.0 + 2 * (c.model.deform.kind == winner))
+        tried = scored(monkeypatch, lambda c, winner=winner: psnr_of(c, winner))
         best, found = decided(preset(root, LONG))
-        assert kind_of(tried[0]) == first
-        assert found[0].setting == f"model.deform.kind={({'control_nodes', 'free'} - {first}).pop()}"
-        assert found[0].taken == (winner != first)
+        assert kind_of(tried[1]) == first
+        assert found[0].setting == "model.kind=dynamic"
+        assert found[1].setting == f"model.deform.kind={({'control_nodes', 'free'} - {first}).pop()}"
+        assert found[1].taken == (winner != first)
         assert kind_of(best) == winner
-    assert kind_of(decided(preset(root, "train.steps=400"))[0]) == first
 
 
-def test_what_is_requested_for_what_moves_is_used(tmp_path: Path) -> None:
+def test_what_is_requested_for_what_moves_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = write_dynamic_capture("room", tmp_path / "room", DynamicOptions(size=24, num_times=8, samples=1))
-    short, _ = decided(preset(root, "train.steps=400", "train.resolution_grows_from=0.2"))
-    assert isinstance(short.model, DynamicModel)
-    assert (short.model.deform.kind, short.train.resolution_grows_from) == ("free", 0.2)
+    scored(monkeypatch, moving_wins)
+    best, _ = decided(preset(root, LONG, "train.resolution_grows_from=0.2"))
+    assert isinstance(best.model, DynamicModel)
+    assert (best.model.deform.kind, best.train.resolution_grows_from) == ("free", 0.2)
     for key in ("model.deform.kind=hexplane", "model.deform.rigidity=0.3"):
-        requested, _ = decided(preset(root, "train.steps=400", key))
+        requested, _ = decided(preset(root, LONG, key))
         assert isinstance(requested.model, DynamicModel)
         assert requested.model.deform.kind == ("hexplane" if "hex" in key else "control_nodes")
 
 
 def test_before_fixed_cameras_nothing_is_thinner_than_they_show(
-    moving: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = DynamicOptions(size=24, num_times=8, num_cameras=3, samples=1)
     fixed = write_dynamic_capture("room", tmp_path / "room", options)
-    short = "train.steps=400"
-    assert decided(preset(fixed, short))[0].model.filter_3d
+    scored(monkeypatch, moving_wins)
+    assert decided(preset(fixed, LONG))[0].model.filter_3d
     assert "fixed cameras, 3 at a time: nothing is drawn thinner than they show" in capsys.readouterr().out
-    assert not decided(preset(fixed, short, "model.filter_3d=false"))[0].model.filter_3d
-    assert not decided(preset(moving, short))[0].model.filter_3d
+    assert not decided(preset(fixed, LONG, "model.filter_3d=false"))[0].model.filter_3d
+    assert not decided(preset(moving, LONG))[0].model.filter_3d
+    scored(monkeypatch, lambda c: 20.0 - isinstance(c.model, DynamicModel))
+    assert not decided(preset(fixed, LONG))[0].model.filter_3d
     assert "thinner" not in capsys.readouterr().out
 
 
@@ -152,11 +184,12 @@ def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
     assert [choice.setting for choice in found] == ["train.exposure=always", "train.robust=always"]
 
 
-@pytest.mark.parametrize("keys", [("train.steps=400",), (LONG, "train.minutes=3")])
-def test_short_runs_ask_nothing(keys: tuple[str, ...], moving: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = preset(moving, *keys)
-    best, found = decided(config)
-    assert isinstance(best.model, DynamicModel)
+@pytest.mark.parametrize("keys", [("train.steps=400",), (LONG, "train.minutes=0.0001")])
+def test_where_nothing_can_be_found_out_the_scene_is_static(
+    keys: tuple[str, ...], moving: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    best, found = decided(preset(moving, *keys))
+    assert without_name(best) == without_name(preset(moving, *keys, name="static"))
     assert not found
     assert "too short a run" in capsys.readouterr().out
 
@@ -186,17 +219,6 @@ def test_small_runs_keep_within_a_tenth_and_leave_out_the_last_settings(moving: 
     assert _Plan.of(preset(moving, "train.steps=400_000"), capture, 3).runs == 4
 
 
-def test_small_runs_that_ask_whether_anything_moves_are_not_short(moving: Path) -> None:
-    """Rather are the other settings not asked: motion pays only after it has been followed."""
-    capture = read_capture(preset(moving).data)
-    plans = [
-        _Plan.of(preset(moving, f"train.steps={steps}"), capture, 3, module.STEPS)
-        for steps in range(5000, 200_000, 5000)
-    ]
-    assert {plan.steps for plan in plans} == {0, module.STEPS}
-    assert {plan.runs for plan in plans} == {0, 2, 3, 4}
-
-
 def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
     def views(count: int) -> list[Any]:
         return [SimpleNamespace(time=i / count, name=str(i)) for i in range(count)]
@@ -215,22 +237,31 @@ def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> Non
         decided(preset(still))
 
 
-def test_as_static_has_the_static_preset_and_what_was_requested(moving: Path) -> None:
-    plain = as_static(preset(moving, "train.steps=123"))
-    static = preset(moving, "train.steps=123", name="static")
-    assert plain.model_copy(update={"run": static.run}) == static
-    keys = ("model.sh_degree=2", "train.ssim_weight=0.5", "optim.lr_means=1e-3", "strategy.kind=mcmc")
-    found = as_static(preset(moving, *keys, "strategy.max_gaussians=77"))
-    assert found.model == static.model.model_copy(update={"sh_degree": 2})
-    assert (found.train.ssim_weight, found.optim.lr_means) == (0.5, 1e-3)
-    assert (found.strategy.kind, found.strategy.growth_limit) == ("mcmc", 77)
+@pytest.mark.parametrize(
+    "keys",
+    [
+        (),
+        ("train.steps=123", "train.minutes=2", "train.robust=auto"),
+        ("model.sh_degree=2", "train.ssim_weight=0.5", "optim.lr_means=1e-3"),
+        ("strategy.kind=mcmc", "strategy.max_gaussians=77", "init.kind=random", "colour.kind=network"),
+    ],
+)
+def test_as_static_is_the_static_preset_with_what_was_requested(
+    keys: tuple[str, ...], moving: Path, tmp_path: Path
+) -> None:
+    """Also by a copy of the preset, whose values its user has not requested."""
+    static = without_name(preset(moving, *keys, name="static"))
+    assert without_name(as_static(preset(moving, *keys))) == static
+    copy = tmp_path / "own.yaml"
+    copy.write_text(packaged_preset("dynamic").read_text() + "camera:\n  refine: always\n")
+    own = load_config(copy, [f"data.root={moving}", "run.threads=1", *keys])
+    assert without_name(as_static(own)) == static.model_copy(update={"camera": own.camera})
+    assert own.camera.refine == "always"
 
 
-def test_small_runs_with_and_without_motion_learn_equally_fast(moving: Path) -> None:
-    """Else a static scene would win by its faster learning, which a full run hardly has."""
-    config = preset(moving, "train.steps=1000")
-    assert rate_factors(module._at_rest(config)) == rate_factors(config) == (1, 1)
-    assert rate_factors(as_static(config)) > (1, 1)
+def test_what_only_moving_scenes_have_is_left_out(moving: Path) -> None:
+    config = preset(moving, "model.deform.kind=hexplane", "model.time_window=0.5")
+    assert without_name(as_static(config)) == without_name(preset(moving, name="static"))
 
 
 def test_choices_are_a_table_in_the_run_folder(tmp_path: Path) -> None:
@@ -259,19 +290,64 @@ def write_rolling_ball(root: Path) -> None:
 
 
 @pytest.mark.parametrize(("moves", "steps"), [(True, 200), (False, 300)])
-def test_never_worse_than_static(moves: bool, steps: int, tmp_path: Path) -> None:
-    """Real small runs: motion wins where something moves, the static model where nothing does."""
+def test_never_worse_than_static(
+    moves: bool, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A real trial: motion wins where something moves, the static model where nothing does."""
     root, keys = tmp_path / "capture", ["init.num_random=200", "model.num_random_moving=60"]
     if moves:
         write_rolling_ball(root)
     else:
         write_still_capture(root, StillOptions(size=24, num_train=48, num_test=1, samples=1))
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
-    config = preset(root, "train.steps=40_000", "train.initial_downscale=1", *keys)
-    capture = read_capture(config.data)
-    plan = replace(_Plan.of(config, capture, 1), steps=steps, runs=2)
-    moving = config.model_copy(update={"model": config.model.model_copy(update={"choose": False})})
-    settings, base = [OpenSetting("model.kind=dynamic", lambda _: moving)], module._at_rest(config)
-    best, (choice,) = module._decided(base, settings, plan, with_points(capture, base))
+    monkeypatch.setattr(module, "TRIAL_STEPS", steps)
+    config = preset(root, "train.steps=20_000", *keys, "colour.kind=sh", "model.deform.move_opacities=false")
+    best, (choice,) = decided(config)
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
+    assert f"model.kind=dynamic {'' if moves else 'not '}taken: " in capsys.readouterr().out
+
+
+def test_a_trial_that_is_interrupted_leaves_nothing_and_has_the_same_end_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_rolling_ball(tmp_path / "capture")
+    monkeypatch.setattr(module, "TRIAL_STEPS", 12)
+    monkeypatch.setattr(module, "FEWEST_MOVING", 1)
+    monkeypatch.setattr(module, "TRIAL_SPENT", 1000)
+    run, real = tmp_path / "run", Trainer.step
+    config = preset(tmp_path / "capture", "train.steps=12", "init.num_random=40", f"run.dir={run}")
+
+    def interrupted(trainer: Trainer[Any]) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return real(trainer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="nothing is written"):
+            train(config)
+    assert not list(run.glob("*"))
+    chosen = [decided(config) for _ in range(2)]
+    assert replace(chosen[0][1][0], seconds=0) == replace(chosen[1][1][0], seconds=0)
+
+
+def test_motion_is_not_asked_about_where_too_few_steps_fit_in_the_minutes(
+    moving: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scored(monkeypatch, moving_wins)
+    clock = iter(range(0, 1000, 10))
+    monkeypatch.setattr(module.time, "monotonic", lambda: float(next(clock)))
+    assert decided(preset(moving, "train.minutes=10"))[1][0].taken, "10 s of the trial, 10 min of the run"
+    assert decided(preset(moving, "train.minutes=0.2"))[1] == []
+
+
+def test_the_trial_is_a_quarter_of_the_run_at_most(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = scored(monkeypatch, moving_wins)
+    view = read_capture(preset(moving).data).splits["train"][0]
+    for steps in (1000, 2000, 4000, 8000, 16_000):
+        config = preset(moving, f"train.steps={steps}")
+        tried.clear()
+        decided(config)
+        work = sum(module.TRIAL_COST * c.train.steps * module._work_of_step(c, view) for c in tried if c.model.may_move)
+        assert work <= module.TRIAL_SPENT * steps * module._work_of_step(config, view)
+        assert bool(work) == (steps > 4000)

@@ -187,6 +187,19 @@ def test_resumed_equals_uninterrupted(
     assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole)]
 
 
+@pytest.mark.parametrize("stop_at", [2, 8])
+def test_a_scene_that_dynamic_finds_still_has_the_bytes_of_static_also_if_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
+) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    words = [f"data.root={root}", "train.steps=14", "init.num_random=40", "run.threads=1"]
+    still = train(load_config("static", [*words, f"run.dir={tmp_path / 'static'}"]))
+    whole = train(load_config("dynamic", [*words, f"run.dir={tmp_path / 'dynamic'}"]))
+    config = load_config("dynamic", [*words, f"run.dir={tmp_path / 'parts'}"])
+    resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
+    assert _final_bytes(resumed) == _final_bytes(whole) == _final_bytes(still)
+
+
 def test_sigterm_saves_too(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _interrupt_after(3, monkeypatch, signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt, match="stopped after step 3"):

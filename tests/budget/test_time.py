@@ -160,7 +160,7 @@ def alone(config: Config, folder: Path, resumed: Checkpoint | None = None) -> _R
     capture = read_capture(config.data) if resumed else prepared(config)
     folder.mkdir(exist_ok=True)
     held = Held(folder, alone=True)
-    return _Run(config, folder, resumed, config, capture=capture, held=held, processes=Processes(), threads=1)
+    return _Run(config, folder, resumed, config, capture=capture, held=held, processes=Processes(), watch=Stopwatch())
 
 
 def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,16 @@ from dyngs.training.trainer import Trainer
 
 TRAINED = {
     "static": ("still", ["init.num_random=40"]),
-    "dynamic": ("moving", ["init.num_random=40", "model.motion_from=0.3", "model.motion_threshold=0", "train.steps=6"]),
+    "dynamic": (
+        "moving",
+        [
+            "model.choose=false",
+            "init.num_random=40",
+            "model.motion_from=0.3",
+            "model.motion_threshold=0",
+            "train.steps=6",
+        ],
+    ),
     "human": ("person", ["model.resolution=16", "model.fit=false", "model.sh_degree=0"]),
     "ngp": ("still", ["model.levels=4", "model.log2_rows=10", "model.log2_samples=10", "model.cells=16"]),
     "nerf": ("still", ["model.width=16", "model.coarse=8", "model.fine=8", "model.rays=32"]),

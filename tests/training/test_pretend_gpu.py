@@ -40,7 +40,13 @@ def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.devic
 
 
 STATIC = ("train.steps=12", "init.kind=random", "init.num_random=100")
-DYNAMIC = ("train.steps=16", "model.num_random_moving=100", "init.kind=random", "init.num_random=300")
+DYNAMIC = (
+    "train.steps=16",
+    "model.choose=false",
+    "model.num_random_moving=100",
+    "init.kind=random",
+    "init.num_random=300",
+)
 CASES = {
     "growing": ("static", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.grad_threshold=1e-7")),
     "mcmc": ("static_mcmc", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.min_opacity=0.09")),
