@@ -18,7 +18,7 @@ _EPILOG = """\
 examples:
   dyngs compare scans/bench --models static,mip,static_mcmc --minutes 2       -> compare/bench
   dyngs compare scans/dance --models static,dynamic,mine.yaml --steps 7000 data.longest_side=400
-  dyngs compare scans/bench --models static,mip --max-mb 2 --peers published.csv --out study
+  dyngs compare scans/bench --models static,mip --max-mb 2 --out study
   dyngs compare HELD_OUT_PEOPLE --models gps,runs/net --predict 2,3,4    networks that predict people from 2, 3, 4 views
 
 Each model is a preset or a YAML file. An interrupted command continues when it is given again. Details: docs/cli.md.
@@ -48,8 +48,6 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--predict", type=_counts, metavar="N,N,...", help=predict)
     spread = "with --predict: from views evenly around the person, not 30 degrees apart"
     parser.add_argument("--spread", action="store_true", help=spread)
-    peers = "CSV of published or foreign figures: columns model, source, psnr, ..."
-    parser.add_argument("--peers", type=args.input_path, metavar="FILE", help=peers)
     kind = args.whole("a number of views", 1, 20)
     parser.add_argument("--views", type=kind, default=4, metavar="N", help="views on the page (default 4)")
     args.add_split(parser)
@@ -86,7 +84,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.spread:
         raise DyngsError("--spread goes with --predict")
     from dyngs.compare.bench import compare, is_finished, require_same_comparison
-    from dyngs.compare.peers import read_peers
     from dyngs.compare.plan import planned
     from dyngs.compare.report import about, table_cells, table_rows, write_report
     from dyngs.runs.inputs import inputs_of
@@ -95,7 +92,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     bench = _bench(arguments)
     args.computing_device(bench.device)
-    peers = [] if arguments.peers is None else read_peers(arguments.peers)
     plan = planned(bench, arguments.models)
     for entry in plan.entries:
         inputs_of(entry.config).require_output(bench.out)
@@ -107,8 +103,8 @@ def run(arguments: argparse.Namespace) -> int:
             results, left_out = compare(bench, plan, lambda line: print(line, flush=True), arguments.ray)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("finished models are kept; the same command continues") from None
-        files = write_report(bench, results, peers, left_out)
-    print_tables(numbers_table(about(bench, results), *table_cells(table_rows(results, peers))))
+        files = write_report(bench, results, left_out)
+    print_tables(numbers_table(about(bench, results), *table_cells(table_rows(results))))
     for name, problem in left_out.items():
         print(f"left out: {name}: {problem}")
     if was_finished:
@@ -126,7 +122,7 @@ def _predict(arguments: argparse.Namespace) -> int:
     from dyngs.compare.people import STEM, PeopleBench, compare_people
     from dyngs.ops.native import kernel_threads
 
-    for option in ("steps", "max_mb", "peers", "ray"):
+    for option in ("steps", "max_mb", "ray"):
         if getattr(arguments, option) is not None:
             raise DyngsError(f"--{option.replace('_', '-')} does not go with --predict")
     other = [word for word in arguments.overrides if not word.startswith("data.")]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dyngs.compare.plan import Bench
-from dyngs.compare.result import MEASURED, TRUTH, Result
+from dyngs.compare.result import TRUTH, Result
 from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.study.tables import html_table
 
@@ -19,20 +19,17 @@ HERE = Path(__file__).parent
 def page_text(
     bench: Bench,
     results: Sequence[Result],
-    rows: Sequence[Mapping[str, Any]],
     left_out: Mapping[str, str],
     parts: tuple[str, list[str], list[list[str]], str],
 ) -> str:
     """Return the page; ``parts``: what all had the same of, head and cells of the table, and the plot as SVG or ""."""
     about, head, cells, svg = parts
     style, script = (_file(f"page.{suffix}") for suffix in ("css", "js"))
-    foreign = [row["source"] != MEASURED for row in rows]
     plot = "" if not svg else f'<img class="plot" alt="PSNR over seconds of training" src="{_data("svg+xml", svg)}">'
     missing = "".join(f"<p>Left out: <b>{escape(n)}</b>: {escape(why)}</p>" for n, why in left_out.items())
-    note = "<p>Shaded rows are figures of others, not measured here; their protocols may differ.</p>"
     pieces = {"style": style, "style_hash": source_hash(style), "script": script, "script_hash": source_hash(script)}
-    pieces |= {"about": escape(about), "plot": plot, "left_out": missing + (note if any(foreign) else "")}
-    pieces |= {"table": html_table(head, cells, foreign), "views": script_safe(_views(bench, results))}
+    pieces |= {"about": escape(about), "plot": plot, "left_out": missing}
+    pieces |= {"table": html_table(head, cells), "views": script_safe(_views(bench, results))}
     return filled(_file("page.html"), pieces)
 
 

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dyngs.compare.page import page_text
-from dyngs.compare.peers import NUMBERS, Peer
 from dyngs.compare.plan import Bench
-from dyngs.compare.result import MEASURED, Result
+from dyngs.compare.result import Result
 from dyngs.study.plots import can_plot, svg_of, write_files
 from dyngs.study.tables import csv_text, markdown_table
 
@@ -23,28 +22,22 @@ _LABELS |= {"mb": ("MB", ".2f"), "gaussians": ("Gaussians", ",.0f"), "steps": ("
 _LABELS |= {"seconds": ("s", ".0f")}
 
 
-def table_rows(results: Sequence[Result], peers: Sequence[Peer]) -> list[dict[str, Any]]:
-    """Return a row per model, the best PSNR first, then those of others as they were given."""
-    own = [_row(result) for result in sorted(results, key=lambda result: -result.psnr)]
-    theirs = [{"model": p.name, "source": p.source} | {key: p.figures.get(key) for key in NUMBERS} for p in peers]
-    return own + theirs
+def table_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Return a row per model, the best PSNR first."""
+    return [_row(result) for result in sorted(results, key=lambda result: -result.psnr)]
 
 
 def _row(result: Result) -> dict[str, Any]:
     fps = None if result.speed is None else 1e3 / result.speed.ms.median
-    values = {key: fps if key == "fps" else getattr(result, key) for key in NUMBERS}
-    return {"model": result.name, "source": MEASURED} | values
+    return {"model": result.name} | {key: fps if key == "fps" else getattr(result, key) for key in _LABELS}
 
 
 def table_cells(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Return head and cells for people, without columns that nobody has; figures of others say whose they are."""
-    shown = [key for key in NUMBERS if any(row[key] is not None for row in rows)]
+    """Return head and cells of a table, without columns in which no model has a figure."""
+    shown = [key for key in _LABELS if any(row[key] is not None for row in rows)]
     head = ["model", *(_LABELS[key][0] for key in shown)]
     cells = [
-        [
-            row["model"] if row["source"] == MEASURED else f"{row['model']} ({row['source']}, not measured here)",
-            *("-" if row[key] is None else format(row[key], _LABELS[key][1]) for key in shown),
-        ]
+        [row["model"], *("-" if row[key] is None else format(row[key], _LABELS[key][1]) for key in shown)]
         for row in rows
     ]
     return head, cells
@@ -56,17 +49,15 @@ def about(bench: Bench, results: Sequence[Result]) -> str:
     return f"{bench.capture.name}: {bench.limit} each, {views}; PSNR in dB, seconds of training"
 
 
-def write_report(
-    bench: Bench, results: Sequence[Result], peers: Sequence[Peer], left_out: Mapping[str, str]
-) -> list[Path]:
+def write_report(bench: Bench, results: Sequence[Result], left_out: Mapping[str, str]) -> list[Path]:
     """Write the table, the page and, with matplotlib, the plot; return their paths."""
-    rows, out = table_rows(results, peers), bench.out
+    rows, out = table_rows(results), bench.out
     head, cells = table_cells(rows)
     missing = "".join(f"\nLeft out: {name}: {problem}\n" for name, problem in left_out.items())
     figure = _curves(results) if can_plot() and any(result.curve for result in results) else None
     texts = {"csv": csv_text(rows), "md": f"{about(bench, results)}\n\n{markdown_table(head, cells)}{missing}"}
     svg = "" if figure is None else svg_of(figure)
-    texts["html"] = page_text(bench, results, rows, left_out, (about(bench, results), head, cells, svg))
+    texts["html"] = page_text(bench, results, left_out, (about(bench, results), head, cells, svg))
     return write_files(out / STEM, texts, svg, figure)
 
 

@@ -31,8 +31,6 @@ from dyngs.study.runs import finished
 from dyngs.study.speed import Speed
 from dyngs.study.stored import AS_STORED, read_stored, write_stored
 
-MEASURED = "measured here"
-"""Source of the figures of a result; those of others have another."""
 TRUTH = ".truth"
 """Folder of the images themselves: no model has a name that begins like that."""
 

@@ -80,16 +80,10 @@ def test_the_same_command_trains_nothing(
     finished: Path, capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.delattr(result, "finished")
-    peers = tmp_path / "peers.csv"
-    peers.write_text("model,source,psnr\n<b>NGP</b>,a paper,36.39\n")
     words = ["compare", str(capture), "--models", "mip,static,dynamic", *OPTIONS, "--out", str(finished)]
-    assert main([*words, "--peers", str(peers)]) == 0
+    assert main(words) == 0
     said = capsys.readouterr().out
     assert "holds just this comparison, finished: nothing was trained" in said
-    assert "NGP" in said
-    page = (finished / "comparison.html").read_text()
-    assert "&lt;b&gt;NGP&lt;/b&gt; (a paper, not measured here)" in page
-    assert "<b>NGP" not in page
     before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     said = error_line(capsys, *words, "init.half_extent=2", "--split", "train")
     assert "split is test there and train here" in said
@@ -133,7 +127,6 @@ def test_what_was_stopped_goes_on(
         ("--models dynamic,human,human_predictor --steps 3", "none of the models can be trained on"),
         ("--models static --steps 3 train.steps=9", "the comparison sets this itself"),
         ("--models static --steps 3 --split val", "the split 'val' has no views"),
-        ("--models static --steps 3 --peers nowhere.csv", "nowhere.csv: cannot be read (No such file"),
         ("--models static --steps 3 train.stesp=2", "did you mean 'train.steps'?"),
     ],
 )
