@@ -218,7 +218,7 @@ def _coloured(
         Config(
             data=DataConfig(root=capture),
             model=StaticModel(sh_degree=1),
-            init=RandomInit(num_random=50),
+            init=RandomInit(num_random=50, half_extent=1.3),
             colour=colour,
             strategy=strategy or DefaultStrategy(),
             train=TrainConfig(steps=40, sh_every=1),
