@@ -276,7 +276,8 @@ def _validate(layers: _Layers) -> Config:
         problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
     if _take_as_text(layers, problems):
         return _validate(layers)
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    others = len({keys_of_location(problem["loc"]) for problem in problems}) - 1
+    more = f" (and {others} more)" if others else ""
     raise DyngsError(_explain(layers, problems[0]) + more)
 
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -94,7 +94,9 @@ def allowed_values(info: FieldInfo, plural: bool = False) -> str:
     many = {bool: "true or false", int: "integers", float: "numbers", str: "texts", Path: "paths"}
     choices = choices_of(plain)
     if choices:
-        text = f"one of {', '.join(choices)}"
+        text = choices[0] if len(choices) == 1 else f"one of {', '.join(choices)}"
+    elif len(get_args(plain)) > 1 and get_origin(plain) in (Union, UnionType):
+        text = " or ".join(allowed_values(FieldInfo.from_annotation(option)) for option in get_args(plain))
     elif get_origin(plain) is tuple:
         some = any(getattr(item, "min_length", None) for item in info.metadata)
         items = allowed_values(FieldInfo.from_annotation(get_args(plain)[0]), plural=True)

@@ -166,6 +166,7 @@ def test_home_is_expanded() -> None:
         ("steps=5", ["did you mean 'train.steps'"]),
         ("train.seed=5", ["did you mean 'run.seed'"]),
         ("train.steps=0", ["train.steps must be an integer >= 1", "not 0"]),
+        ("model.near=-1", ["model.near must be a number > 0 and <= 1e+09 or auto, not -1"]),
         ("train.steps=many", ["train.steps must be an integer >= 1", "not 'many'"]),
         ("train.ssim_weight=2", ["a number >= 0 and <= 1"]),
         ("optim.lr_means=inf", ["optim.lr_means must be a number > 0"]),
