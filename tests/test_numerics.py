@@ -19,7 +19,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.scene_space import expressed, normalised
+from dyngs.data.scene_space import change_coordinates, normalise_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -332,14 +332,14 @@ def image_of(capture: Capture) -> Tensor:
 def test_world_origin_far_away_is_rebased_on_load() -> None:
     """Subtracted in float64 the offset costs 1e-9 units; kept, float32 cannot even resolve 0.25 units there."""
     near, far = capture_at(np.zeros(3)), capture_at(GEOREFERENCED)
-    rebased = normalised(far)
-    rebased = expressed(rebased, 1.0, rebased.world_offset)
+    rebased = normalise_capture(far)
+    rebased = change_coordinates(rebased, 1.0, rebased.world_offset)
     truth = image_of(near)
     assert np.linalg.norm(rebased.world_offset - GEOREFERENCED) < 10
     assert (image_of(rebased) - truth).abs().quantile(0.99) < 1e-4
     assert (image_of(rebased) - truth).abs().max() < 2 / 255
     assert (image_of(far) - truth).abs().max() > 0.1
-    assert not normalised(near).world_offset.any()
+    assert not normalise_capture(near).world_offset.any()
 
 
 # --- many of them -----------------------------------------------------------------------------------------------------

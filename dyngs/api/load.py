@@ -11,7 +11,7 @@ from dyngs.camera import Cameras
 from dyngs.config import DataConfig
 from dyngs.data import read
 from dyngs.data.capture import Capture
-from dyngs.data.scene_space import expressed
+from dyngs.data.scene_space import change_coordinates
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
@@ -69,7 +69,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         image.cameras, image.rgb_premultiplied  # what to render from, and what should come out
     """
     capture = read.read_capture(source, decode_videos)
-    return expressed(capture, 1.0, capture.world_offset)
+    return change_coordinates(capture, 1.0, capture.world_offset)
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from dyngs.api.train import num_cores, train
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import read_capture, require_folder
+from dyngs.data.read import require_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.files.outputs import new_folder
-from dyngs.kinds import assemble
+from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
@@ -96,7 +94,7 @@ def prune_within(
     with kernel_threads(config.run.threads or num_cores()), bytewise:
         trainer = assemble(config, read_capture_of(config.data, start.info), restored=True)
         trainer.restore(start)
-        chosen, file, promise = Search(trainer, start, tell, unseen_images(config, trainer.device)).run(max_loss)
+        chosen, file, promise = Search(trainer, start, tell, unseen_images(trainer)).run(max_loss)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
@@ -117,16 +115,16 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     return config
 
 
-def unseen_images(config: Config, device: torch.device) -> list[Image]:
+def unseen_images(trainer: GaussianTrainer) -> list[Image]:
     """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people none.
 
     They play other motions there, in which poses are not refined.
     """
-    views = read_capture(config.data).splits.get("val", ())
-    if not views or config.model.is_posed:
+    views = trainer.capture.splits.get("val", ())
+    if not views or trainer.config.model.is_posed:
         return []
-    loader = ImageLoader(views, config.data)
-    loader.device = device
+    loader = ImageLoader(views, trainer.config.data)
+    loader.device = trainer.device
     return [loader[i] for i in evenly_spaced(len(loader), MOST_HELD_OUT)]
 
 

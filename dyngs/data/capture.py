@@ -180,7 +180,7 @@ class Capture:
         points: sparse points or None.
         points_file: the .ply that the points are from, which is not known to fit the cameras; None for other points.
         world_scale: power of two, length of a scene unit in the unit of the files. A point x in scene coordinates is
-            ``world_scale * x + world_offset`` in the files. See ``scene_space.normalised``.
+            ``world_scale * x + world_offset`` in the files. See ``scene_space.normalise_capture``.
         world_offset: (3,) float64 in the unit of the files; zero unless the scene lies far from its origin.
         has_alpha: images carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people.

@@ -16,7 +16,7 @@ from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
 from dyngs.data.readers import blender, camera_folders, colmap, nerfies, neuman, people_snapshot, zju_mocap
-from dyngs.data.scene_space import normalised
+from dyngs.data.scene_space import normalise_capture
 from dyngs.errors import DyngsError, NoCaptureError, reading
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
@@ -47,7 +47,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and ``pose_frames`` those
     of a person that become the split pose. Where the format names no test views, every ``test_every``-th image is
     one. Times are scaled to [0, 1] over all splits. Poses, points and bodies are in scene coordinates, see
-    ``scene_space.normalised``. The splits train, val and test are always present, val and test possibly empty.
+    ``scene_space.normalise_capture``. The splits train, val and test are always present, val and test possibly empty.
 
     Example::
 
@@ -138,7 +138,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         has_alpha=_first_has_alpha(splits["train"]),
         warnings=(*warnings, *lacking, *notes, *more, *absent),
     )
-    return normalised(capture if options.body is None else with_fitted_body(capture, options.body))
+    return normalise_capture(capture if options.body is None else with_fitted_body(capture, options.body))
 
 
 def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[str]]:

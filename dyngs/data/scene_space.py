@@ -96,7 +96,7 @@ MAX_DISTANCE = 100.0
 """Distance from the origin, in extents, from which a scene is moved there: float32 is 0.01 px coarse at a focal length
 of 1,000 px."""
 DEPTH_PER_EXTENT = 20.0  # Median depth of the points, in extents, beyond which the depth decides
-ROUNDING = 2e-7  # Relative error of a position in float32, as many programs write it
+ROUNDING = 1e-8  # Relative error of a position written with eight digits
 NEGLIGIBLE = 1e-3  # Extent, in median depths of the points, below which the cameras tell nothing about lengths
 
 
@@ -107,7 +107,7 @@ def extent_of(centers: np.ndarray) -> float:
     return EXTENT_MARGIN * largest if largest > ROUNDING * float(np.abs(centers).max()) else 0.0
 
 
-def normalised(capture: Capture) -> Capture:
+def normalise_capture(capture: Capture) -> Capture:
     """Return the capture in scene coordinates: near the origin, and in a unit in which thresholds are meaningful.
 
     The unit is the power of two of the files' unit in which the extent of all cameras is at least ``SMALLEST_EXTENT``
@@ -125,11 +125,11 @@ def normalised(capture: Capture) -> Capture:
         focus, origin = focus_point(poses), median
         if focus is not None and fraction_in_front(poses, focus) > 0.5 and np.linalg.norm(focus - median) < length:
             origin = focus
-        capture = expressed(capture, capture.world_scale, origin * capture.world_scale + capture.world_offset)
+        capture = change_coordinates(capture, capture.world_scale, origin * capture.world_scale + capture.world_offset)
     if not length:
         return capture
     scale = 2.0 ** math.floor(math.log2(length / SMALLEST_EXTENT))
-    return expressed(capture, scale * capture.world_scale, capture.world_offset)
+    return change_coordinates(capture, scale * capture.world_scale, capture.world_offset)
 
 
 def _length(capture: Capture, centers: np.ndarray) -> float:
@@ -147,7 +147,7 @@ def _length(capture: Capture, centers: np.ndarray) -> float:
     return depth if extent < NEGLIGIBLE * depth else max(extent, depth / DEPTH_PER_EXTENT)
 
 
-def expressed(capture: Capture, scale: float, offset: Sequence[float] | np.ndarray) -> Capture:
+def change_coordinates(capture: Capture, scale: float, offset: Sequence[float] | np.ndarray) -> Capture:
     """Return the capture in other scene coordinates, with this ``world_scale`` and ``world_offset`` (3,)."""
     offset = np.asarray(offset, np.float64)
     if scale == capture.world_scale and (offset == capture.world_offset).all():

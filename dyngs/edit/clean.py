@@ -101,7 +101,7 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to clean")
     with kernel_threads(threads or num_cores()), deterministic(device_for(config.run.device), True), torch.no_grad():
         trainer = at_end(config, run_dir)
-        unseen = unseen_images(config, trainer.device)
+        unseen = unseen_images(trainer)
         held = () if unseen else evenly_held_out(len(trainer.images))
         if not unseen and not held:
             raise DyngsError(f"{run_dir}: --clean needs two views or more, of which one judges what it costs")

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.data.scene_space import expressed
+from dyngs.data.scene_space import change_coordinates
 from dyngs.errors import DyngsError
 from dyngs.state import part_of
 
@@ -51,7 +51,7 @@ def read_capture_of(data: DataConfig, info: CheckpointInfo) -> Capture:
 
     Those of ``read_capture`` may differ: the capture has changed since, or another version of dyngs trained the run.
     """
-    return expressed(read_capture(data), info.world_scale, info.world_offset)
+    return change_coordinates(read_capture(data), info.world_scale, info.world_offset)
 
 
 @dataclass(frozen=True)

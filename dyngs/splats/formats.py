@@ -22,7 +22,7 @@ from dyngs.splats.splat_file import (
     Nonfinite,
     SplatFile,
     drawable,
-    near_origin,
+    move_to_origin,
     offset_notes,
     require_writable,
     unit_rotations,
@@ -131,7 +131,7 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
             splat = replace(splat, up=own.up)
         if splat.edited == UNMOVED and own.home[0] != "ply":
             splat = replace(splat, edited=read_note(path))
-        return drawable(near_origin(splat), path, nonfinite)
+        return drawable(move_to_origin(splat), path, nonfinite)
 
 
 def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:

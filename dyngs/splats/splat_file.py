@@ -73,7 +73,7 @@ class SplatFile:
         return self.edited.after(Similarity(self.turned))
 
 
-def near_origin(splat: SplatFile) -> SplatFile:
+def move_to_origin(splat: SplatFile) -> SplatFile:
     """Return the contents, whose means may be float64, with float32 means: less an offset where they are far away."""
     means = splat.gaussians.means.double()
     sizes = splat.gaussians.log_scales.amax(1)
@@ -112,8 +112,8 @@ def drawing_options(splat: SplatFile) -> RenderOptions:
     """Return ``splat_options`` with a near plane that suits the size of the scene."""
     means = splat.gaussians.means.double().numpy()
     distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    # Of a scene that cameras surround, about their extent.
-    extent = 2 * float(np.quantile(distances, 0.9))
+    # About the extent of cameras around it. The median ignores a far background, which must not push the plane away.
+    extent = 2 * float(np.median(distances))
     return replace(splat_options(splat), near=near_plane(extent)) if extent else splat_options(splat)
 
 

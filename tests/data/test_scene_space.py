@@ -24,10 +24,10 @@ from dyngs.data.geometry import (
 from dyngs.data.scene_space import (
     FAR_PER_BASELINE,
     SMALLEST_EXTENT,
+    change_coordinates,
     depth_bounds,
-    expressed,
     extent_of,
-    normalised,
+    normalise_capture,
     outside_of_cube,
     points_in_frusta,
 )
@@ -101,7 +101,7 @@ def capture_at(offset: np.ndarray, radius: float = 4.0, count: int = 6) -> Captu
 
 def scaled(capture: Capture, factor: float) -> Capture:
     """Return the capture as if its files had a unit of length ``1 / factor`` as long."""
-    capture = expressed(capture, 1 / factor, np.zeros(3))
+    capture = change_coordinates(capture, 1 / factor, np.zeros(3))
     return capture.replace(world_scale=1.0)
 
 
@@ -116,7 +116,7 @@ def file_centers(capture: Capture) -> np.ndarray:
 def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
     """The scene keeps its shape to 1e-8 units (float64 at 1e6 has 1e-10), and the offset restores it."""
     before = capture_at(np.array(offset))
-    after = normalised(before)
+    after = normalise_capture(before)
     assert np.linalg.norm(after.world_offset - offset) < 10
     np.testing.assert_allclose(file_centers(after), file_centers(before), rtol=0, atol=1e-8)
     for moved, view in zip(all_views(after.splits), all_views(before.splits), strict=True):
@@ -130,7 +130,7 @@ def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
 @pytest.mark.parametrize("scale", [1.0, 1e-4, 300.0])
 def test_projection_does_not_change(scale: float) -> None:
     before = scaled(capture_at(np.array([1e6, -2e6, 3e5])), scale)
-    after = normalised(before)
+    after = normalise_capture(before)
     assert before.points is not None
     assert after.points is not None
     for old, new in zip(before.splits["train"], after.splits["train"], strict=True):
@@ -143,7 +143,7 @@ def test_projection_does_not_change(scale: float) -> None:
 @pytest.mark.parametrize("offset", [0.0, 5e7])
 def test_power_of_two_scale_gives_the_same_scene_coordinates(scale: float, offset: float) -> None:
     before = capture_at(np.array([offset, 0.0, 0.0]))
-    one, other = normalised(before), normalised(scaled(before, scale))
+    one, other = normalise_capture(before), normalise_capture(scaled(before, scale))
     assert other.world_scale == scale * one.world_scale
     np.testing.assert_array_equal(other.world_offset, scale * one.world_offset)
     for a, b in zip(all_views(one.splits), all_views(other.splits), strict=True):
@@ -155,7 +155,7 @@ def test_power_of_two_scale_gives_the_same_scene_coordinates(scale: float, offse
 
 @pytest.mark.parametrize("scale", [1e-6, 0.05, 0.7, 1.0, 1e5])
 def test_extent_of_a_normalised_scene(scale: float) -> None:
-    capture = normalised(scaled(capture_at(np.zeros(3)), scale))
+    capture = normalise_capture(scaled(capture_at(np.zeros(3)), scale))
     centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
     assert SMALLEST_EXTENT <= extent_of(centers) < 2 * SMALLEST_EXTENT
 
@@ -163,7 +163,16 @@ def test_extent_of_a_normalised_scene(scale: float) -> None:
 @pytest.mark.parametrize(("distance", "radius", "moves"), [(5.0, 4.0, False), (350, 4.0, False), (900, 4.0, True)])
 def test_only_far_scenes_move(distance: float, radius: float, moves: bool) -> None:
     capture = capture_at(np.array([distance, 0, 0]), radius)
-    assert normalised(capture).world_offset.any() == moves
+    assert normalise_capture(capture).world_offset.any() == moves
+
+
+def test_small_capture_at_utm_coordinates_without_points() -> None:
+    """Cameras 20 cm apart, 4,600 km from the origin: in float32 they would coincide."""
+    capture = capture_at(np.array([5e5, 4.6e6, 100.0]), radius=0.2).replace(points=None)
+    capture = normalise_capture(capture)
+    centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
+    assert SMALLEST_EXTENT <= extent_of(centers) < 2 * SMALLEST_EXTENT
+    assert np.abs(centers).max() < 10 * SMALLEST_EXTENT
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-9])
@@ -173,13 +182,13 @@ def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
     moved = [view.cam_from_world + np.diag([jitter * i, 0, 0], 1) for i in range(5)]
     views = tuple(View(str(i), view.image_path, pose, np.eye(3), 1, 1) for i, pose in enumerate(moved))
     capture = Capture(Path(), "blender", {"train": views})
-    assert normalised(capture) is capture
+    assert normalise_capture(capture) is capture
 
 
 def test_fixed_camera_gets_its_unit_from_the_points() -> None:
     before = scaled(capture_at(np.zeros(3)), 1e-3)
     view = before.splits["train"][0]
-    capture = normalised(before.replace(splits={"train": (view,)}))
+    capture = normalise_capture(before.replace(splits={"train": (view,)}))
     assert capture.points is not None
     depth = np.median(np.linalg.norm(capture.points.xyz - camera_center(capture.splits["train"][0].cam_from_world)))
     assert 1 < depth < 20
@@ -187,11 +196,13 @@ def test_fixed_camera_gets_its_unit_from_the_points() -> None:
 
 def test_capture_in_the_coordinates_of_its_files_and_back() -> None:
     before = capture_at(np.array([3e4, 0.0, 0.0]), radius=0.01)
-    after = normalised(before)
+    after = normalise_capture(before)
     assert after.world_scale != 1
     assert after.world_offset.any()
-    np.testing.assert_allclose(file_centers(expressed(after, 1.0, np.zeros(3))), file_centers(before), atol=1e-11)
-    assert expressed(after, after.world_scale, after.world_offset) is after
+    np.testing.assert_allclose(
+        file_centers(change_coordinates(after, 1.0, np.zeros(3))), file_centers(before), atol=1e-11
+    )
+    assert change_coordinates(after, after.world_scale, after.world_offset) is after
 
 
 def test_inverse_of_a_pose() -> None:
@@ -217,7 +228,7 @@ def test_infinite_position_is_an_error() -> None:
 def test_bodies_move_and_scale_with_the_cameras() -> None:
     body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[1e6, 2.0, 3.0]], np.zeros(10), scale=0.5)
     capture = Capture(Path("x"), "blender", {}).replace(body=of_one_clip(body))
-    moved = expressed(capture, 0.5, np.array([1e6, 0.0, 0.0]))
+    moved = change_coordinates(capture, 0.5, np.array([1e6, 0.0, 0.0]))
     assert moved.body is not None
     assert moved.body["train"].trans.tolist() == [[0.0, 4.0, 6.0]]
     assert moved.body["train"].scale.tolist() == [1.0]
@@ -225,7 +236,7 @@ def test_bodies_move_and_scale_with_the_cameras() -> None:
 
 def test_unit_of_people_is_the_metre() -> None:
     body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[0.1, 2.0, 3.0]], np.zeros(10), scale=1e-3)
-    capture = normalised(capture_at(np.zeros(3)).replace(body=of_one_clip(body)))
+    capture = normalise_capture(capture_at(np.zeros(3)).replace(body=of_one_clip(body)))
     assert capture.world_scale == 2.0**-10
     assert capture.body is not None
     assert capture.body["train"].scale.tolist() == [1.024]

@@ -16,7 +16,7 @@ from tiny_people import people
 from dyngs.config import DataConfig
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
-from dyngs.data.scene_space import expressed
+from dyngs.data.scene_space import change_coordinates
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 from dyngs.runs.capture_record import RECORD_NAME, SAMPLE_BYTES, changed_files, named, write_record
@@ -123,7 +123,7 @@ def test_another_capture_is_refused(change: Callable[[Path], None], said: str, c
 
 
 def test_where_the_reader_puts_the_origin_does_not_matter(capture: Path, tmp_path: Path) -> None:
-    moved = expressed(read_capture(capture), 4.0, np.array([0.3, -7.0, 1e3]))
+    moved = change_coordinates(read_capture(capture), 4.0, np.array([0.3, -7.0, 1e3]))
     assert changed_files(tmp_path, DataConfig(root=capture), moved) == []
     elsewhere = replace(moved, world_offset=moved.world_offset + np.array([0.0, 0.0, 0.01]))
     with pytest.raises(DyngsError, match="or cameras of"):
