@@ -142,8 +142,8 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     choice = _trial_of_motion(moving, capture)
     if choice is None:
         print(
-            "model.kind=dynamic not taken: too short a run, or too few views, to find out whether "
-            "motion pays; trained as a static scene (model.choose=false: as a moving one)",
+            "model.kind=dynamic not taken: too short a run, or too few views, to compare it with a static model; "
+            "training a static scene (model.choose=false trains a moving one)",
             flush=True,
         )
         return choose(as_static(config), capture)
@@ -216,7 +216,7 @@ def _compared(
     if plan is None or len(plan.folds) * plan.runs < 2:
         if settings:
             keys = ", ".join(x.text for x in settings)
-            print(f"{keys} not taken: too short a run, or too few views, to find out whether it pays", flush=True)
+            print(f"{keys} not taken: too short a run, or too few views, to compare held-out PSNR", flush=True)
         return config, [], capture
     found, choices = _decided(config, settings[: plan.runs - 1], plan, capture)
     return found, choices, capture
