@@ -112,9 +112,10 @@ def cost_table(before: Cost, after: Cost, promise: Promise | None = None) -> Tab
     """Return a table that compares a run with the file of a pruned one."""
     from rich.table import Table
 
-    table = Table("", "before", "after, from the file", "")
+    # Short cells, so that no label wraps at 80 columns.
+    table = Table("", "before", "pruned file", "")
     ratio = before.num_gaussians / after.num_gaussians
-    table.add_row("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", f"{ratio:.1f} times fewer")
+    table.add_row("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", f"{ratio:.1f}x fewer")
     rows = [
         ("PSNR, training views", before.psnr_train, after.psnr_train),
         ("PSNR, held-out views", before.psnr_test, after.psnr_test),
@@ -125,9 +126,9 @@ def cost_table(before: Cost, after: Cost, promise: Promise | None = None) -> Tab
         if old is not None and new is not None:
             table.add_row(label, f"{old:.2f} dB", f"{new:.2f} dB", f"{new - old:+.2f} dB")
     faster, smaller = after.fps / before.fps, before.megabytes / after.megabytes
-    table.add_row("rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", f"{faster:.1f} times as fast")
-    table.add_row("model", f"{before.megabytes:.2f} MB", f"{after.megabytes:.2f} MB", f"{smaller:.1f} times smaller")
+    table.add_row("rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", f"{faster:.1f}x as fast")
+    table.add_row("model", f"{before.megabytes:.2f} MB", f"{after.megabytes:.2f} MB", f"{smaller:.1f}x smaller")
     if after.stored is not None:
         smaller = before.megabytes / after.stored
-        table.add_row("file", f"{before.megabytes:.2f} MB", f"{after.stored:.3f} MB", f"{smaller:.1f} times smaller")
+        table.add_row("file", f"{before.megabytes:.2f} MB", f"{after.stored:.3f} MB", f"{smaller:.1f}x smaller")
     return table
