@@ -124,8 +124,8 @@ def _add_people(verbs: args.Commands) -> None:
         run_people,
         "find a person in a video and fit the body to them",
         "Find a person in every frame, their silhouette and key points, follow them through the clip, and fit the body "
-        "as `data fit` does. OUT is a capture for `dyngs train human`. MediaPipe does it in an environment of its own, "
-        "or torchvision's R-CNN with weights of yours (docs/person.md).",
+        "as `data fit` does. OUT is a capture for `dyngs train human`. MediaPipe detects the person, in an environment "
+        "of its own (docs/person.md).",
     )
     about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
@@ -133,8 +133,6 @@ def _add_people(verbs: args.Commands) -> None:
     parser.add_argument("--person", type=int, default=1, metavar="N", help="which of several people (1: the largest)")
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
-    about = "weights of torchvision's Keypoint R-CNN, and once more of its Mask R-CNN, instead of MediaPipe"
-    parser.add_argument("--weights", type=args.input_path, action="append", default=[], metavar="FILE", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
 
 
@@ -301,11 +299,11 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
-    from dyngs.human.detection.detector import chosen_detector
     from dyngs.human.detection.find_person import write_found_person
+    from dyngs.human.detection.mediapipe import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
-    detector = chosen_detector(arguments.weights, arguments.mediapipe)
+    detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_found_person(options, arguments.out, detector, report, number=arguments.person)
     print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")

@@ -38,6 +38,8 @@ RESOLVED_NAME = "config.yaml"
 
 MAX_WHOLE = 2**63 - 1
 """The largest whole number of a configuration."""
+REMOVED_KEYS = {("model", "loose"): False}
+"""Keys of earlier versions that configurations of runs may still have, with the value at which they had no effect."""
 MOST_KEYS = 40  # Of a section that are listed in one line
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
@@ -98,7 +100,8 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     if file == path and command_for(path):
         raise DyngsError(f"{path}: not a run folder; {command_for(path)}")
     layers = _Layers()
-    layers.add(read_file(file))
+    leaves = read_file(file)
+    layers.add(x for x in leaves if x.keys not in REMOVED_KEYS or x.value != REMOVED_KEYS[x.keys])
     if not layers.tree.get("data"):
         raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
     body = layers.value_at(("data", "body"))

@@ -19,7 +19,6 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.loose import past_motion, remembering
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
@@ -244,8 +243,6 @@ class Opened(LoadedRun):
             unit = self.info.world_scale
             motion = replace(motion, trans=trans / unit, scale=motion.scale / unit)
         clip = motion_clip(motion)
-        if scene.hold is not None:
-            clip = replace(clip, past=past_motion(clip, np.arange(len(clip)) / motion.fps))
         if not is_fit:
             clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         playing, notes = scene.playing(clip), self.notes
@@ -379,4 +376,4 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
     if split != "pose" and same_bodies(own, trained):
         return run.renderable
     shown = captured_motion(capture.root, own, split_views(capture, split), avatar.skeleton.joints)
-    return avatar.playing(shown.clip if avatar.hold is None else remembering(shown, capture.fps))
+    return avatar.playing(shown.clip)

@@ -27,8 +27,9 @@ from dyngs.errors import DyngsError, counted
 from dyngs.files.outputs import note_sources, require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import write_image, write_text
-from dyngs.human.detection.detector import Detection, Detector, chosen_detector
+from dyngs.human.detection.detector import Detection, Detector
 from dyngs.human.detection.following import followed, with_sides
+from dyngs.human.detection.mediapipe import MediaPipe
 from dyngs.human.detection.warnings import warnings_of
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 
@@ -127,7 +128,7 @@ def _write_masks(camera: _Camera, person: Sequence[Detection | None], folder: Pa
     """Write the masks of all views at their size; nothing where the detector makes no masks."""
     seen = [x for x in person if x is not None]
     if any(x.mask is None for x in seen):
-        raise DyngsError("no silhouettes without weights of Mask R-CNN; give both files, as in docs/person.md")
+        raise DyngsError("the detector returns no silhouettes, which the fit needs; use another detector")
     size = camera.images.shape[1:3]
     masks = np.stack([np.zeros(size, bool) if x is None or x.mask is None else x.mask > 127 for x in person])
     better = outlined(camera.images, masks)
@@ -190,7 +191,7 @@ def with_found_person(
     if folder.is_dir():
         say(f"person:  found before, in {folder}")
     else:
-        detector = chosen_detector((), None)
+        detector = MediaPipe()
         say(f"person:  found first, as by `dyngs data people`, into {folder}")
         say(write_found_person(data, folder, detector, report, say).summary())
     note_sources(folder, data.root)
