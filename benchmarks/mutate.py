@@ -106,7 +106,6 @@ MUTATIONS = (
     ("prune/floaters.py", "most > MAIN_FRACTION * total", "most < MAIN_FRACTION * total", "prune/test_floaters.py"),
     ("prune/floaters.py", "count > MOST * before", "count > 10 * before", "prune/test_floaters.py"),
     ("budget/count.py", "and count > self.most and", "and count > 2 * self.most and", "budget/test_count.py"),
-    ("budget/time.py", "AIM * given - now - self.refit_seconds - reserve", "AIM * given - now - self.refit_seconds", "budget/test_time.py"),
     ("storage/tensors.py", "np.floor(np.abs(scaled) + rounding)", "np.floor(np.abs(scaled))", "storage/test_tensors.py"),
     ("storage/tensors.py", "step / 8, 1 - step / 64", "step / 8, 1", "storage/test_tensors.py"),
     ("storage/precision.py", "MOST_VISIBLE = 0.9", "MOST_VISIBLE = 0.1", "storage/test_precision.py"),

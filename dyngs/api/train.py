@@ -21,7 +21,6 @@ from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
-from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, fit_to_time
 from dyngs.capture.unposed import is_unposed, with_poses
 from dyngs.config import Config, HumanModel
@@ -78,7 +77,7 @@ from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
-_COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"  # Names of the limits' states in a checkpoint
+_COUNT, _TIME = "budget.count", "budget.time"  # Names of the limits' states in a checkpoint
 
 
 @contextmanager
@@ -282,12 +281,6 @@ class _Run:
         return list(self._reached())
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None, first: FirstGaussians | None) -> None:
-        budget, speed = run.config.budget, None
-        if budget.min_fps is not None:
-            speed = SpeedLimit(run, budget.min_fps)
-            if resumed is not None:
-                speed.restore(resumed.part(_SPEED))
-            speed.begin()
         minutes = run.config.train.minutes
         if minutes is not None:
             run.given = 60 * minutes
@@ -297,12 +290,7 @@ class _Run:
                 refit_seconds = fit_to_time(run, first, lambda line: print(line, flush=True))
                 self.loop.total = run.config.total_steps
             self.limits[_TIME] = Deadline(
-                run,
-                wanted,
-                fits=resumed is None,
-                refit_seconds=refit_seconds,
-                save=self._save,
-                on_refit=(lambda: None) if speed is None else speed.hold,
+                run, wanted, fits=resumed is None, refit_seconds=refit_seconds, save=self._save
             )
             self._meter = CostMeter(run, wanted) if resumed is None and self._gaussians is not None else None
         count = count_limit(run)
@@ -310,8 +298,6 @@ class _Run:
             self.limits[_COUNT] = count
             if resumed is not None:
                 count.restore(resumed.part(_COUNT))
-        if speed is not None:
-            self.limits[_SPEED] = speed
 
     def _save_and_evaluate(self, event: Event) -> None:
         match event:
@@ -378,8 +364,6 @@ class _Run:
             yield f"{cost}; {self._how_to_go_on(cost.steps)}"
         if self.limited is not None and self.config.budget.max_mb is not None:
             yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
-        if _SPEED in self.limits:
-            yield self.limits[_SPEED].reached()
 
 
 def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None) -> None:

@@ -38,7 +38,7 @@ RESOLVED_NAME = "config.yaml"
 
 MAX_WHOLE = 2**63 - 1
 """The largest whole number of a configuration."""
-REMOVED_KEYS = {("model", "loose"): False}
+REMOVED_KEYS: dict[tuple[str, ...], object] = {("model", "loose"): False, ("budget", "min_fps"): None}
 """Keys of earlier versions that configurations of runs may still have, with the value at which they had no effect."""
 MOST_KEYS = 40  # Of a section that are listed in one line
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")

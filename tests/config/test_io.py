@@ -357,5 +357,5 @@ def test_a_run_of_an_earlier_version_may_have_a_removed_key_that_had_no_effect(t
         if works:
             assert load_resolved(tmp_path).model.kind == "human"
         else:
-            with pytest.raises(DyngsError, match="unknown key 'model.loose'"):
+            with pytest.raises(DyngsError, match=r"unknown key 'model\.loose'"):
                 load_resolved(tmp_path)
