@@ -12,6 +12,7 @@ from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.files.child import home_of_dyngs
+from dyngs.files.containment import following_links_of_runs, follows_links_of_runs
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Listener
 
@@ -55,7 +56,8 @@ def done_in_turn(
         os.chdir(here)
     try:
         remote: Any = ray.remote(num_cpus=ray_cores)(_attempted_in)
-        waiting = {remote.remote(here, do, task): task for task in tasks}
+        links = follows_links_of_runs()
+        waiting = {remote.remote(here, links, do, task): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting))
             yield waiting.pop(ready), ray.get(ready)
@@ -63,9 +65,11 @@ def done_in_turn(
         ray.shutdown()
 
 
-def _attempted_in(folder: str, do: Callable[[T], R], task: T) -> R | DyngsError:
-    os.chdir(folder)  # of the process that asks: paths of tasks may be relative
-    return _attempted(do, task)
+def _attempted_in(folder: str, links: bool, do: Callable[[T], R], task: T) -> R | DyngsError:
+    """Attempt a task in another process, with the current folder and permissions of that which asks for it."""
+    os.chdir(folder)
+    with following_links_of_runs(links):
+        return _attempted(do, task)
 
 
 def _attempted(do: Callable[[T], R], task: T) -> R | DyngsError:
