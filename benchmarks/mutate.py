@@ -118,7 +118,7 @@ MUTATIONS = (
     ("runs/checkpoint.py", "if int(s) < step}", "if int(s) != step}", "runs/test_checkpoint.py"),
     ("runs/lock.py", "fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "runs/test_lock.py"),
     ("runs/folder.py", "if not same or checkpoint_paths(folder)", "if not same", "runs/test_folder.py"),
-    ("runs/folder.py", "RunConfig(seed=c.run.seed)", "RunConfig()", "runs/test_folder.py"),
+    ("runs/folder.py", "RunConfig(seed=config.run.seed)", "RunConfig()", "runs/test_folder.py"),
     ("files/limits.py", "amount > most and amount > allowed(most)", "amount > most", "files/test_limits.py"),
     ("files/containment.py", "startswith(root.rstrip(os.sep) + os.sep)", "startswith(root.rstrip(os.sep))", "files/test_containment.py"),
     ("files/containment.py", "max(channels / 4, 1)", "1", "files/test_containment.py"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import torch
@@ -16,7 +15,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, reading, warn
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
@@ -171,7 +170,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
             why = outside_of_cube(views, cube_half_side(init.half_extent, views, capture.world_scale))
             lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]
     for line in [] if quiet else [*lines, *before_training(capture)]:
-        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
+        warn(line)
     return capture
 
 

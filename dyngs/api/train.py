@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -28,7 +27,7 @@ from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture, require_folder
-from dyngs.errors import DyngsError, as_word, counted
+from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.start import FirstGaussians
 from dyngs.human.fit.fitted_capture import with_fitted_body
@@ -174,7 +173,7 @@ def train(
         folder = run.folder
         note_asked(folder, asked)
         for line in lines:
-            print(line, flush=True)
+            show(line)
     return folder
 
 
@@ -287,7 +286,7 @@ class _Run:
             wanted = run.config.train.steps
             refit_seconds = 0.0
             if resumed is None:
-                refit_seconds = fit_to_time(run, first, lambda line: print(line, flush=True))
+                refit_seconds = fit_to_time(run, first, show)
                 self.loop.total = run.config.total_steps
             self.limits[_TIME] = Deadline(
                 run, wanted, fits=resumed is None, refit_seconds=refit_seconds, save=self._save
@@ -372,7 +371,7 @@ def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None
     if changed:
         views = counted(len(changed), "training view")
         line = f"files of {views} have changed since the run began: {named(changed)}"
-        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
+        warn(line)
 
 
 def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
@@ -382,7 +381,7 @@ def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
         forecast.require_possible()
         warning = forecast.warning()
         if warning is not None:
-            print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)
+            warn(warning)
 
 
 def _free(folder: Path) -> Path:
@@ -450,7 +449,7 @@ def num_cores() -> int:
 
 
 def with_capture(
-    config: Config, *, say: Callable[[str], None] = print, report: ReportProgress = report_nothing
+    config: Config, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> Config:
     """Return the configuration with a capture that can be trained on; what is found for it is kept for other runs."""
     data, model = config.data, config.model

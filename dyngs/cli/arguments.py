@@ -7,12 +7,12 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, show, warn
 
 if TYPE_CHECKING:
     import torch
@@ -161,8 +161,9 @@ def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> 
 
 
 def add_data_root(parser: argparse.ArgumentParser) -> None:
-    """Add ``data.root=FOLDER`` to a command that reads the capture of a run."""
-    add_overrides(parser, "data.root=FOLDER", "where the capture of the run lies by now")
+    """Add ``data.root=FOLDER`` and ``data.follow_links=true`` to a command that reads the capture of a run."""
+    about = "where the capture of the run lies by now; data.follow_links=true: its files may lie elsewhere"
+    add_overrides(parser, "data.root=FOLDER", about)
     parser.set_defaults(takes_root=True)
 
 
@@ -171,13 +172,23 @@ def data_root(arguments: argparse.Namespace) -> Path | None:
     found = None
     for word in arguments.overrides:
         key, equals, value = word.partition("=")
+        if word in ("data.follow_links=true", "data.follow_links=false"):
+            continue
         if key.strip() != "data.root" or not equals or not value.strip():
             raise DyngsError(
                 f"{word!r}: the run keeps its own configuration; only data.root=FOLDER, where its capture was moved "
-                "to, may be given"
+                "to, and data.follow_links=true may be given"
             )
         found = Path(value.strip())
     return found
+
+
+def follows_links(overrides: Sequence[str]) -> bool:
+    """Return whether overrides say that files of captures may lie outside their folders."""
+    from dyngs.config.yaml_reader import read_override
+
+    leaves = [leaf for word in overrides if word.startswith("data") and "=" in word for leaf in read_override(word)]
+    return any(leaf.keys == ("data", "follow_links") and leaf.value is True for leaf in leaves)
 
 
 def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
@@ -265,9 +276,9 @@ def run_of_scene_file(path: Path) -> Path:
 def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
     """Print notes to stdout and warnings to stderr."""
     for note in notes:
-        print(f"note: {note}")
+        show(f"note: {note}")
     for warning in warnings:
-        print(f"dyngs: warning: {warning}", file=sys.stderr)
+        warn(warning)
 
 
 def print_written(*paths: Path) -> None:

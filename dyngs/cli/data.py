@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError, as_word, counted
+from dyngs.errors import DyngsError, as_word, counted, show
 
 if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
@@ -200,9 +200,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
-            print(f"also: {problem}")
+            show(f"also: {problem}")
         raise DyngsError(report.problems[0])
-    print(format_report(report))
+    show(format_report(report))
     if arguments.image is not None:
         from dyngs.capture.inspection.report import draw_cameras
 
@@ -218,7 +218,7 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
     if arguments.image is not None:
         raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
     with images_up_to(args.data_section(arguments.overrides).max_megapixels):
-        print(video_report(arguments.path))
+        show(video_report(arguments.path))
     return 0
 
 
@@ -250,7 +250,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
             said = poses_of_videos(images, out, options, report)
         else:
             said = estimate_poses(images, out, options, report).summary()
-    print(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
+    show(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
     print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
     return 0
 
@@ -293,7 +293,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
+    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
     return 0
 
 
@@ -306,7 +306,7 @@ def run_people(arguments: argparse.Namespace) -> int:
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_found_person(options, arguments.out, detector, report, number=arguments.person)
-    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
 

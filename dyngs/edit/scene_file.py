@@ -15,7 +15,7 @@ from dyngs.edit.frame import Frame, GeoFrame
 from dyngs.edit.gps import gps_frame
 from dyngs.edit.merge import merged
 from dyngs.edit.run_folder import write_edited_run
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 from dyngs.export.redrawn import Redrawn, compare_run, compare_splats
 from dyngs.export.splat_files import SUFFIX, UP, Writing, read_moment, splats_at, up_of, write_moving
 from dyngs.gaussians.scene import GaussianScene
@@ -112,7 +112,7 @@ class _Source:
 
 
 def edit_scene(
-    source: Path, out: Path, edits: Edits, reads: Sequence[Path] = (), data_root: Path | None = None, tell: Tell = print
+    source: Path, out: Path, edits: Edits, reads: Sequence[Path] = (), data_root: Path | None = None, tell: Tell = show
 ) -> EditedFile:
     """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the format, none is a run.
 

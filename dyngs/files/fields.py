@@ -12,6 +12,7 @@ import numpy as np
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
+from dyngs.files.limits import read_limited
 
 LARGEST = 1e30
 """Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
@@ -21,7 +22,7 @@ def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict
     """Read the JSON object in ``path``; a byte order mark is allowed. ``what``: the error for anything else."""
     with reading(path, "it must be a JSON file; copy or export it again"):
         try:
-            fields = json.loads(inside(path).read_text(encoding="utf-8-sig"))
+            fields = json.loads(read_limited(inside(path)).decode("utf-8-sig"))
         except json.JSONDecodeError as error:
             where = f"{path}, line {error.lineno} column {error.colno}"
             raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error

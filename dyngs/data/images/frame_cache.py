@@ -24,6 +24,7 @@ from dyngs.data.capture import VideoFrame
 from dyngs.data.images.video import VideoInfo, probe_video, read_numbered_frames
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
+from dyngs.files.limits import read_limited
 from dyngs.files.temporary import CACHE_VARIABLE, cache_folder
 from dyngs.files.write import atomic_file, image_error, write_text
 
@@ -150,10 +151,10 @@ def _stored_info(folder: Path) -> VideoInfo | None:
     if folder.is_symlink() or mark.is_symlink():
         return None
     try:
-        fields = json.loads(mark.read_text(encoding="utf-8"))
+        fields = json.loads(read_limited(mark))
         width, height, count = (int(fields[key]) for key in ("width", "height", "num_frames"))
         return VideoInfo(width, height, count, float(fields["fps"])) if fields["what"] == _MARK else None
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+    except (DyngsError, OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
 
 

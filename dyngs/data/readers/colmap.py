@@ -26,6 +26,7 @@ from dyngs.data.readers.transforms import view_name
 from dyngs.data.times import read_seconds
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
+from dyngs.files.limits import read_limited
 
 if TYPE_CHECKING:
     import pycolmap
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
 TEST_LIST = "test.txt"
 """Names of the images for testing, a line each, in the model's folder (as 3DGS has it)."""
-MAX_LIST_BYTES = 10_000_000
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 _EXTENSIONS = (".bin", ".txt")
 # Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as OpenCV does.
@@ -141,7 +141,7 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     if not path.is_file():
         return {"train": tuple(views)}, []
     with reading(path, "it must list names of images, a line each; repair or remove it"):
-        text = inside(path).read_bytes()[:MAX_LIST_BYTES].decode()
+        text = read_limited(inside(path)).decode()
     listed = {line.strip() for line in text.splitlines() if line.strip()}
     unknown = sorted(listed - set(names))
     notes = [f"{path}: {len(unknown)} listed images have no pose, first {unknown[0]:.80}"] if unknown else []

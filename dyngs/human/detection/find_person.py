@@ -23,7 +23,7 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 from dyngs.files.outputs import note_sources, require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import write_image, write_text
@@ -54,7 +54,7 @@ def find_person(
     detector: Detector,
     folder: Path,
     report: ReportProgress,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = show,
     number: int = 1,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they are.
@@ -159,7 +159,7 @@ def write_found_person(
     out: Path,
     detector: Detector,
     report: ReportProgress = report_nothing,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = show,
     number: int = 1,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the new folder ``out``.
@@ -179,7 +179,7 @@ def write_found_person(
 
 
 def with_found_person(
-    data: DataConfig, *, say: Callable[[str], None] = print, report: ReportProgress = report_nothing
+    data: DataConfig, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is looked at once.
 
