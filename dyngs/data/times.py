@@ -26,6 +26,9 @@ SECONDS_FILE = "times.json"
 """Seconds of the images of a capture, next to them: COLMAP's models have no times."""
 SAME_TIME = 1e-6
 """Times closer than this are the same time: files of one capture are often rounded differently."""
+SAME_POSE = 1e-5
+"""Entries of rotations, and positions in distances of the farthest camera from the mean one, up to which poses of a
+camera that does not move differ by rounding: 0.01 px at a focal length of 1,000 px."""
 MENTIONED_CHANGE = 0.05
 """Times that are scaled by less than this are not mentioned: the last of n times is often written as (n - 1) / n."""
 SCATTERED = 0.5
@@ -282,6 +285,53 @@ def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[
     new = {time: (time - picked[0]) / span if span else 0.0 for time in picked}
     unit = {written: new[time] for written, time in distinct.items() if time in new}
     return {name: tuple(replace(v, time=unit[v.time]) for v in kept if v.time in unit) for name, kept in splits.items()}
+
+
+def number_cameras(splits: Splits) -> Splits:
+    """Return the views with a number for each camera, where they share one although they are of several cameras.
+
+    A pose that repeats at another time, up to rounding, is a camera that does not move, and its views
+    get exactly one pose. The views left are of one camera that moves. Nothing changes where all poses
+    follow each other in time, where most views are left, or where several of those have the same time.
+    """
+    views = sorted(all_views(splits), key=lambda view: view.name)
+    if len({view.camera_id for view in views}) != 1 or any(view.time is None for view in views):
+        return splits
+    firsts = _first_of_pose(views)
+    distinct = distinct_times(views)
+    times: defaultdict[int, set[float]] = defaultdict(set)
+    for view, first in zip(views, firsts, strict=True):
+        times[first].add(distinct[view.time or 0.0])
+    fixed = [first for first, own in times.items() if len(own) > 1]
+    moving = [time for own in times.values() if len(own) == 1 for time in own]
+    is_simultaneous = sum(map(len, times.values())) > len(set(distinct.values()))
+    if not is_simultaneous or 2 * len(moving) > len(views) or len(set(moving)) < len(moving):
+        return splits
+    first_of = dict(zip((view.name for view in views), firsts, strict=True))
+
+    def numbered(view: View) -> View:
+        first = first_of[view.name]
+        number = fixed.index(first) if first in fixed else len(fixed)
+        return replace(view, camera_id=number, cam_from_world=views[first].cam_from_world)
+
+    return each_view(splits, numbered)
+
+
+def _first_of_pose(views: Sequence[View]) -> np.ndarray:
+    """Return for each view the index of the first one with its pose; only up to a pose for every two views."""
+    poses = np.stack([inverse_rigid(view.cam_from_world)[:3] for view in views])
+    centers = poses[:, :, 3] - poses[:, :, 3].mean(axis=0)
+    poses[:, :, 3] = centers / (np.linalg.norm(centers, axis=1).max() or 1.0)
+    rows = poses.reshape(len(views), -1)
+    firsts = np.arange(len(views))
+    left = np.arange(len(views))
+    for _ in range(len(views) // 2):
+        if not len(left):
+            break
+        is_same = np.abs(rows[left] - rows[left[0]]).max(axis=1) < SAME_POSE
+        firsts[left[is_same]] = left[0]
+        left = left[~is_same]
+    return firsts
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
