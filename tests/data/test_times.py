@@ -185,7 +185,7 @@ def test_poses_that_repeat_at_the_same_times_are_cameras(noise: float, counts: l
 
 def test_a_moving_camera_beside_fixed_ones() -> None:
     walk = tuple(view(f"walk/{i}", i / 30, pose=opengl_pose(0.1 * i + 9)) for i in range(5))
-    numbered = number_cameras(sharing_one_number({"train": walk, "test": rig([6])["test"]}))
+    numbered = number_cameras({"train": walk, "test": rig([6])["test"]})
     assert [v.camera_id for v in numbered["train"]] == [1] * 5
     assert {v.camera_id for v in numbered["test"]} == {0}
     np.testing.assert_array_equal([v.cam_from_world for v in numbered["train"]], [v.cam_from_world for v in walk])
