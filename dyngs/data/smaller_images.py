@@ -38,7 +38,9 @@ def with_smaller_images(root: Path, splits: Splits, options: DataConfig) -> tupl
     found = {view.name: _shrunk(view, paths[view.name], max(fitting)) for view in views}
     small = {name: view for name, view in found.items() if view is not None}
     if len(small) < len(views):
-        return splits, [f"{names}: not read, because {folder.name} lacks {len(views) - len(small)} images"]
+        return splits, [
+            f"{names}: not read, because {folder.name} lacks {len(views) - len(small)} of them at that size"
+        ]
     smaller = each_view(splits, lambda view: small.get(view.name, view))
     return smaller, [f"{folder.name} is read in place of images: training takes images of that size or smaller ones"]
 
@@ -46,8 +48,9 @@ def with_smaller_images(root: Path, splits: Splits, options: DataConfig) -> tupl
 def _shrunk(view: View, path: Path, factor: int) -> View | None:
     """Return the view with a copy of its image that is ``factor`` times smaller; None where there is no such image."""
     header = header_if_readable(path)
-    if header is None:
-        return None
     described = (view.width, view.height)
-    intrinsics, size, _ = match_size(view.intrinsics, described, header.size_for(described), str(path))
+    stored = (0, 0) if header is None else header.size_for(described)
+    if any(abs(factor * small - large) >= factor for small, large in zip(stored, described, strict=True)):
+        return None
+    intrinsics, size, _ = match_size(view.intrinsics, described, stored, str(path))
     return replace(view, image_path=path, intrinsics=intrinsics, width=size[0], height=size[1], shrunk=factor)

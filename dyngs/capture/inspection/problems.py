@@ -26,6 +26,7 @@ from dyngs.data.times import distinct_times, evenly_spaced
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import staying_within
 from dyngs.files.fields import read_json_object
+from dyngs.files.find import FileFinder
 
 MAX_LINES_PER_KIND = 5  # problems of one kind that are listed; the others are counted
 MAX_VIEWS = 300  # views, chosen at random, in which points are looked for
@@ -268,7 +269,8 @@ def transforms_file_problems(root: Path, known: str) -> list[str]:
             with reading(file):
                 entries = [(str(frame["file_path"]), np.array(frame["transform_matrix"], float)) for frame in frames]
                 names = Counter(name for name, _ in entries)
-                missing = [n for n in names if not any((root / (n + suffix)).is_file() for suffix in ("", *SUFFIXES))]
+                images = FileFinder(root)
+                missing = [n for n in names if not any(images.find(n + suffix).is_file() for suffix in ("", *SUFFIXES))]
         except DyngsError as error:
             if str(file) not in known:
                 why = reason(error.__cause__ or error)
