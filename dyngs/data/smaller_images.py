@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,29 +25,26 @@ def with_smaller_images(root: Path, splits: Splits, options: DataConfig) -> tupl
     views = [view for view in all_views(splits) if view.image_path.is_relative_to(images)]
     if not copies or not views:
         return splits, []
-    names = ", ".join(copies[number].name for number in sorted(copies))
     factor = min(max(view.width, view.height) / max(view_size(view, options)) for view in views)
-    fitting = [number for number in copies if number <= factor]
-    if not fitting:
-        hint = f"data.downscale={min(copies)} reads {copies[min(copies)].name}"
-        return splits, [f"{names}: not read, because training takes larger images; {hint}"]
-    folder = copies[max(fitting)]
-    if any(view.mask_path or view.silhouette or view.depth_path or view.motion_mask_path for view in views):
-        return splits, [f"{names}: not read, because masks and depth maps have the size of images"]
-    finder = FileFinder(folder)
-    paths = {view.name: finder.find(str(view.image_path.relative_to(images))) for view in views}
-    found = {view.name: _shrunk(view, paths[view.name], max(fitting)) for view in views}
-    small = {name: view for name, view in found.items() if view is not None}
+    number = max((number for number in copies if number <= factor), default=min(copies))
+    finder = FileFinder(copies[number])
+    small: dict[str, View] = {}
+    for view in views if number <= factor else ():
+        copy = _shrunk(view, finder.find(os.path.relpath(view.image_path, images)), number)
+        if copy is not None:
+            small[view.name] = copy
     if len(small) < len(views):
-        return splits, [
-            f"{names}: not read, because {folder.name} lacks {len(views) - len(small)} of them at that size"
-        ]
-    smaller = each_view(splits, lambda view: small.get(view.name, view))
-    return smaller, [f"{folder.name} is read in place of images: training takes images of that size or smaller ones"]
+        names = ", ".join(copies[key].name for key in sorted(copies))
+        conditions = "in which every image must have its copy, and none a mask or a depth map"
+        return splits, [f"{names}: not read; data.downscale={number} reads {copies[number].name}, {conditions}"]
+    line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
+    return each_view(splits, lambda view: small.get(view.name, view)), [line]
 
 
 def _shrunk(view: View, path: Path, factor: int) -> View | None:
-    """Return the view with a copy of its image that is ``factor`` times smaller; None where there is no such image."""
+    """Return the view with a copy of its image that is ``factor`` times smaller, None where that does not do."""
+    if view.mask_path or view.silhouette or view.depth_path or view.motion_mask_path:
+        return None
     header = header_if_readable(path)
     described = (view.width, view.height)
     stored = (0, 0) if header is None else header.size_for(described)

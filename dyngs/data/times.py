@@ -290,34 +290,28 @@ def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[
 def number_cameras(splits: Splits) -> Splits:
     """Return the views with a number for each camera, where they share one although they are of several cameras.
 
-    A pose that repeats at another time, up to rounding, is a camera that does not move, and its views
-    get exactly one pose. The views left are of one camera that moves. Nothing changes where all poses
-    follow each other in time, where most views are left, or where several of those have the same time.
+    These are cameras that do not move: each pose repeats at another time, up to rounding, and some
+    times are seen from several poses. The views of a camera get exactly one pose.
     """
     views = sorted(all_views(splits), key=lambda view: view.name)
     if len({view.camera_id for view in views}) != 1 or any(view.time is None for view in views):
         return splits
-    firsts = _first_of_pose(views)
     distinct = distinct_times(views)
-    times: defaultdict[int, set[float]] = defaultdict(set)
-    for view, first in zip(views, firsts, strict=True):
-        times[first].add(distinct[view.time or 0.0])
-    fixed = [first for first, own in times.items() if len(own) > 1]
-    moving = [time for own in times.values() if len(own) == 1 for time in own]
-    is_simultaneous = sum(map(len, times.values())) > len(set(distinct.values()))
-    if not is_simultaneous or 2 * len(moving) > len(views) or len(set(moving)) < len(moving):
+    firsts = dict(zip((view.name for view in views), _first_of_pose(views), strict=True))
+    seen = {(firsts[view.name], distinct[view.time or 0.0]) for view in views}
+    num_times = Counter(first for first, _ in seen)
+    if min(num_times.values()) < 2 or len(seen) == len(set(distinct.values())):
         return splits
-    first_of = dict(zip((view.name for view in views), firsts, strict=True))
+    cameras = sorted(num_times)
 
     def numbered(view: View) -> View:
-        first = first_of[view.name]
-        number = fixed.index(first) if first in fixed else len(fixed)
-        return replace(view, camera_id=number, cam_from_world=views[first].cam_from_world)
+        first = firsts[view.name]
+        return replace(view, camera_id=cameras.index(first), cam_from_world=views[first].cam_from_world)
 
     return each_view(splits, numbered)
 
 
-def _first_of_pose(views: Sequence[View]) -> np.ndarray:
+def _first_of_pose(views: Sequence[View]) -> list[int]:
     """Return for each view the index of the first one with its pose; only up to a pose for every two views."""
     poses = np.stack([inverse_rigid(view.cam_from_world)[:3] for view in views])
     centers = poses[:, :, 3] - poses[:, :, 3].mean(axis=0)
@@ -326,12 +320,12 @@ def _first_of_pose(views: Sequence[View]) -> np.ndarray:
     firsts = np.arange(len(views))
     left = np.arange(len(views))
     for _ in range(len(views) // 2):
-        if not len(left):
-            break
         is_same = np.abs(rows[left] - rows[left[0]]).max(axis=1) < SAME_POSE
         firsts[left[is_same]] = left[0]
         left = left[~is_same]
-    return firsts
+        if not len(left):
+            break
+    return firsts.tolist()
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
