@@ -161,8 +161,8 @@ def renamed(root: Path, change: Callable[[str], str]) -> None:
     "change",
     [
         lambda name: name.replace("/", "\\"),
-        lambda name: "C:\\Users\\me\\scan\\images\\" + name.replace("/", "\\"),
-        lambda name: "/home/" + "me/scan/" + name,
+        lambda name: "D:\\scans\\house\\images\\" + name.replace("/", "\\"),
+        lambda name: "/scans/house/" + name,
         lambda name: name.replace(".jpg", ".JPG").replace("left", "Left"),
     ],
     ids=["backslashes", "windows", "absolute", "case"],
