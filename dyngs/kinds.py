@@ -12,7 +12,7 @@ from dyngs.config import Config, ModelSection, PointsInit, RandomInit
 from dyngs.data.capture import Capture
 from dyngs.data.decoding import usual_threads
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import read_capture
+from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading, warn
@@ -155,7 +155,7 @@ def prepared(config: Config) -> Capture:
 
     What is suspicious about the capture, and where the points are from, is printed to stderr.
     """
-    return with_points(read_capture(config.data), config)
+    return with_points(require_images(read_capture(config.data)), config)
 
 
 def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:

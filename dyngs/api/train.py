@@ -26,7 +26,7 @@ from dyngs.config import Config, HumanModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
-from dyngs.data.read import read_capture, require_folder
+from dyngs.data.read import read_capture, require_folder, require_images
 from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.start import FirstGaussians
@@ -183,7 +183,7 @@ def _chosen(config: Config, resumed: Checkpoint | None) -> tuple[Config, list[Ch
         return config, [], None  # it has several captures
     if resumed is not None:
         return config, [], read_capture_of(config.data, resumed.info)
-    return choose(config, read_capture(config.data))
+    return choose(config, require_images(read_capture(config.data)))
 
 
 def _told_again(config: Config, folder: Path) -> str:

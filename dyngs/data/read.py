@@ -17,6 +17,7 @@ from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
 from dyngs.data.readers import blender, camera_folders, colmap, nerfies, neuman, people_snapshot, zju_mocap
 from dyngs.data.scene_space import normalise_capture
+from dyngs.data.smaller_images import with_smaller_images
 from dyngs.errors import DyngsError, NoCaptureError, reading
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
@@ -116,17 +117,18 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
 
 
 def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
+    if options.skip_missing:
+        capture = _without_missing(capture)
     capture, notes = _with_splits(capture, options)
-    splits = _wide(capture.splits) if options.undistort == "wide" else capture.splits
+    splits, copies = with_smaller_images(capture.root, capture.splits, options)
+    splits = _wide(splits) if options.undistort == "wide" else splits
     for view in all_views(splits):
         _check_places(view)
     splits, tracks, absent = _present_priors(splits, capture.tracks_path)
     if decode_videos:
         frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
-    seen = all_views(splits)
-    missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
-    lacking = [f"{len(missing)} of {len(seen)} images are missing, first {missing[0]}"] if missing else []
+    lacking = _missing(splits)
     points, more = _finite_points(capture.points)
     warnings = [*capture.warnings, *_check_names(capture.root, splits)]
     capture = replace(
@@ -136,9 +138,36 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         tracks_path=tracks,
         points_file=capture.points_file if points is not None else None,
         has_alpha=_first_has_alpha(splits["train"]),
-        warnings=(*warnings, *lacking, *notes, *more, *absent),
+        warnings=(*warnings, *lacking, *notes, *copies, *more, *absent),
     )
     return normalise_capture(capture if options.body is None else with_fitted_body(capture, options.body))
+
+
+def _is_missing(view: View) -> bool:
+    return view.video is None and not view.image_path.is_file()
+
+
+def _missing(splits: Splits) -> list[str]:
+    """Return a line on the images that are not there, none if all are."""
+    views = all_views(splits)
+    missing = [view.image_path for view in views if _is_missing(view)]
+    return [f"{len(missing)} of {len(views)} images are missing, first {missing[0]}"] if missing else []
+
+
+def _without_missing(capture: Capture) -> Capture:
+    """Return the capture without the views whose images are not there, with a warning."""
+    present: Splits = {}
+    for name, views in capture.splits.items():
+        present[name] = tuple(view for view in views if not _is_missing(view))
+    lines = [f"{line}; these views are left out" for line in _missing(capture.splits)]
+    return replace(capture, splits=present, warnings=(*capture.warnings, *lines))
+
+
+def require_images(capture: Capture) -> Capture:
+    """Return the capture. Raises DyngsError: images of it are missing; says how many."""
+    for line in _missing(capture.splits):
+        raise DyngsError(f"{line}; restore them, or train on the others with data.skip_missing=true")
+    return capture
 
 
 def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[str]]:
@@ -149,10 +178,6 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
     if capture.body is not None:  # people are drawn in the poses of their frames, which are found by their times
         splits = times.times_of_frames(splits)
     new_poses = splits.pop("pose", None)
-    if options.train_cameras is not None:
-        splits = times.split_by_camera(capture.root, splits, options.train_cameras)
-        said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
-        capture = replace(capture, warnings=said)
     by_name: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
@@ -162,6 +187,11 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         raise DyngsError(
             f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
         )
+    splits = times.number_cameras(splits)
+    if options.train_cameras is not None:
+        splits = times.split_by_camera(capture.root, splits, options.train_cameras)
+        said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
+        capture = replace(capture, warnings=said)
     written = splits
     # People move by frame number: of their captures, times within [0, 1] are left as they are.
     splits, notes = times.unit_times(capture.root, splits, stretch=capture.body is None)

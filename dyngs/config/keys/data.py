@@ -52,6 +52,9 @@ class DataConfig(Section):
         gt=0,
         description="with times=order: so many numbers, or places in the order, are a second; null: not known",
     )
+    skip_missing: bool = Field(
+        default=False, description="leave out views whose images are missing, instead of stopping with an error"
+    )
     downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the images by this")
     longest_side: int | None = Field(
         default=None, ge=1, description="shrink images so that the longer side has at most this many px; null: do not"
