@@ -1,0 +1,69 @@
+"""Colours of point clouds, by the names and types that programs give to them in a .ply file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+GREY = 128
+_NAMES = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)
+_HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
+"""Colours of a file of Gaussians: those of spherical harmonics of degree 0."""
+_SH_DEGREE_0 = 0.28209479177387814
+_PACKED = ("rgb", "rgba")
+"""The Point Cloud Library packs 0xAARRGGBB into one number, an integer or the bits of a float32."""
+
+
+def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
+    """Return (P, 3) uint8 colours of ``count`` points, grey where ``columns`` (by property name) hold none."""
+    by_name = {name.lower(): np.asarray(column).reshape(-1) for name, column in columns.items()}
+    known = {name: column for name, column in by_name.items() if len(column) == count and column.dtype.kind in "iuf"}
+    for names in _NAMES:
+        if known.keys() >= set(names):
+            return _as_bytes(np.stack([known[name] for name in names], axis=1))
+    if known.keys() >= set(_HARMONICS):
+        harmonics = np.stack([known[name] for name in _HARMONICS], axis=1)
+        return _rounded(255 * (0.5 + _SH_DEGREE_0 * harmonics.astype(np.float64)))
+    for name in _PACKED:
+        if name in known:
+            return _unpacked(known[name])
+    return np.full((count, 3), GREY, np.uint8)
+
+
+def _as_bytes(values: np.ndarray) -> np.ndarray:
+    """Return colours as bytes, from the range that their type and their largest value suggest."""
+    if values.dtype == np.uint8:
+        return values
+    finite = values[np.isfinite(values)]
+    largest = finite.max(initial=0)
+    scale = 1.0
+    if values.dtype.kind == "f" and largest <= 1:
+        scale = 255.0
+    elif largest > 255:
+        scale = 1 / 257  # 16 bits
+    return _rounded(scale * values.astype(np.float64))
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.nan_to_num(values, nan=GREY) + 0.5, 0, 255).astype(np.uint8)
+
+
+def _unpacked(packed: np.ndarray) -> np.ndarray:
+    """Return the red, green and blue bytes of 0xAARRGGBB."""
+    if packed.dtype.kind == "f" and not _are_integers(packed):
+        bits = np.ascontiguousarray(packed, np.float32).view(np.uint32)
+    else:
+        bits = packed.astype(np.uint32)
+    return np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
+
+
+def _are_integers(packed: np.ndarray) -> bool:
+    """Whether floats are colours as numbers up to 0xFFFFFF; the bits of a colour never are: they make tiny floats."""
+    if not ((packed >= 0) & (packed < 2**24)).all():
+        return False
+    return bool((packed % 1 == 0).all() and packed.max(initial=0) >= 1)
