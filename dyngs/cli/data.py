@@ -76,7 +76,8 @@ def _add_inspect(verbs: args.Commands) -> None:
         "Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos without poses: "
         "size, rate, length, sound, sharpness, motion, and what to run next.",
     )
-    parser.add_argument("path", type=args.input_path, metavar="PATH", help="capture folder, video, or folder of videos")
+    path = "capture (folder or .zip), video, or folder of videos"
+    parser.add_argument("path", type=args.input_path, metavar="PATH", help=path)
     args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
     parser.add_argument("--image", type=args.output_path, metavar="FILE", help="draw cameras and points to this image")
@@ -195,7 +196,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, or on videos without poses."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
     from dyngs.capture.unposed import is_videos
+    from dyngs.data.read import capture_folder
 
+    arguments.path = capture_folder(arguments.path)
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
     options = args.data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})

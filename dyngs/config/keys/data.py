@@ -14,7 +14,7 @@ from dyngs.section import Positive, Section
 class DataConfig(Section):
     """Where the images are and how they are read."""
 
-    root: Path = Field(description="folder of the capture")
+    root: Path = Field(description="folder or .zip of the capture")
     format: Literal[
         "auto",
         "body_json",

@@ -1,0 +1,109 @@
+"""Captures in a .zip: unpacked once, into the user's cache, under names that cannot leave their folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import stat
+import zipfile
+from pathlib import Path, PurePosixPath
+
+from dyngs.errors import DyngsError, reading
+from dyngs.files.limits import require_at_most
+from dyngs.files.temporary import cache_folder, temporary_folder_beside
+
+SUFFIXES = (".zip", ".r3d")
+"""Endings of archives; the app Record3D calls its own .r3d."""
+MOST_FILES = 200_000
+MOST_BYTES = 2**36
+MOST_SMALL_BYTES = 2**27
+"""Bytes that any archive may hold; beyond, the compression ratio is limited."""
+HIGHEST_RATIO = 50
+"""Images do not shrink in an archive; text of points and cameras does, about ten times; bombs a thousand."""
+_CHUNK = 2**20
+_JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")
+_BAD_PART = re.compile(r"\.\.|[a-z]:.*|.*[\x00-\x1f].*|(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+"""Parts of a path that lead elsewhere, at least on Windows, or name a device there."""
+_ADVICE = "it must be a .zip without a password; download it again, or unpack it and give the folder"
+
+
+def is_archive(path: Path) -> bool:
+    """Whether ``path`` is a file that ``unpacked`` unpacks."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def unpacked(path: Path) -> Path:
+    """Return the folder in the cache with the files of an archive; the same archive is unpacked once.
+
+    Raises DyngsError: a damaged or encrypted archive; too many files or bytes; a name that leads out of the folder,
+    a link; no room on the disk. Nothing is left in the cache then.
+    """
+    with reading(path, _ADVICE), zipfile.ZipFile(path) as archive:
+        members = _checked_members(path, archive)
+        status = path.stat()
+        content = [(name, info.file_size, info.CRC) for name, info in members.items()]
+        digest = hashlib.sha256(repr((status.st_size, status.st_mtime_ns, content)).encode()).hexdigest()[:16]
+        folder = cache_folder("captures") / f"{re.sub(r'[^A-Za-z0-9-]', '_', path.stem)[:40]}.{digest}"
+        if folder.is_dir():
+            return folder
+        temporary = temporary_folder_beside(folder)
+        try:
+            _require_room(path, members, temporary)
+            for name, info in members.items():
+                _extract(archive, info, temporary / name)
+            _move(temporary, folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    return folder
+
+
+def _checked_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return the files of an archive by their paths below its folder, without junk."""
+    found: dict[str, zipfile.ZipInfo] = {}
+    require_at_most(path, len(archive.filelist), MOST_FILES, "files")
+    for info in archive.infolist():
+        name = info.filename.replace("\\", "/")
+        parts = PurePosixPath(name).parts
+        if name.endswith("/") or not parts or parts[0] == _JUNK[0] or parts[-1] in _JUNK or parts[-1].startswith("._"):
+            continue
+        if name.startswith("/") or any(_BAD_PART.fullmatch(part) for part in parts):
+            raise DyngsError(f"{path}: holds the file {name!r:.80}, which is no name below its folder; pack it anew")
+        if stat.S_ISLNK(info.external_attr >> 16):
+            raise DyngsError(f"{path}: holds the link {name!r:.80}; pack the file that it leads to instead")
+        if info.flag_bits & 1:
+            raise DyngsError(f"{path}: is encrypted; unpack it with its password and give the folder")
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise DyngsError(f"{path}: is compressed by another method than deflate; unpack it and give the folder")
+        if found.setdefault(name, info) is not info:
+            raise DyngsError(f"{path}: holds {name!r:.80} twice; pack it anew")
+    total = sum(info.file_size for info in found.values())
+    require_at_most(path, total, min(MOST_BYTES, max(MOST_SMALL_BYTES, HIGHEST_RATIO * path.stat().st_size)), "bytes")
+    return found
+
+
+def _require_room(path: Path, members: dict[str, zipfile.ZipInfo], folder: Path) -> None:
+    total = sum(info.file_size for info in members.values())
+    free = shutil.disk_usage(folder).free
+    if total > free:
+        raise DyngsError(
+            f"{path}: its files need {total / 1e6:.4g} MB in {folder.parent}, where {free / 1e6:.4g} MB are free; set "
+            "DYNGS_CACHE_DIR to a folder on another disk"
+        )
+
+
+def _extract(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> None:
+    """Write a member as a new file. Its size cannot exceed what the archive states, which ``ZipFile`` checks."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with archive.open(info) as source, path.open("xb") as target:
+        shutil.copyfileobj(source, target, _CHUNK)
+
+
+def _move(temporary: Path, folder: Path) -> None:
+    """Rename the complete folder; another process may have been faster, with the same files."""
+    try:
+        os.rename(temporary, folder)
+    except OSError:
+        if not folder.is_dir():
+            raise
