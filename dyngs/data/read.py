@@ -15,7 +15,17 @@ from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits,
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
-from dyngs.data.readers import blender, camera_folders, colmap, nerfies, neuman, people_snapshot, zju_mocap
+from dyngs.data.readers import (
+    blender,
+    camera_folders,
+    colmap,
+    nerfies,
+    neuman,
+    people_snapshot,
+    phone_apps,
+    photogrammetry,
+    zju_mocap,
+)
 from dyngs.data.scene_space import normalise_capture
 from dyngs.errors import DyngsError, NoCaptureError, reading
 from dyngs.files.archive import is_archive, unpacked
@@ -36,6 +46,11 @@ FORMATS: tuple[CaptureFormat, ...] = (
     blender.NERFSTUDIO_FORMAT,
     colmap.FORMAT,
     nerfies.FORMAT,
+    phone_apps.POLYCAM_FORMAT,
+    phone_apps.RECORD3D_FORMAT,
+    photogrammetry.METASHAPE_FORMAT,
+    photogrammetry.REALITYCAPTURE_FORMAT,
+    photogrammetry.ODM_FORMAT,
     camera_folders.FORMAT,
     camera_folders.LLFF_FORMAT,
 )

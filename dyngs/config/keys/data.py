@@ -25,6 +25,11 @@ class DataConfig(Section):
         "nerfstudio",
         "colmap",
         "nerfies",
+        "polycam",
+        "record3d",
+        "metashape",
+        "realitycapture",
+        "odm",
         "llff",
         "camera_folders",
     ] = Field(default="auto", description="layout of the capture's files (docs/formats.md); auto: detected")

@@ -1,0 +1,110 @@
+"""Readers for exports of phone apps: Polycam's raw data and Record3D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.data.capture import Capture, CaptureFormat
+from dyngs.data.images.images import SUFFIXES, files_in
+from dyngs.data.readers.blender import capture_of
+from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
+from dyngs.errors import DyngsError
+from dyngs.files.fields import entry, numbers_of, read_json_object
+
+_INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
+"""Keys of transforms files, and those of Polycam."""
+
+
+def read_polycam(root: Path) -> Capture:
+    """Read ``keyframes`` of Polycam's raw data: an image, a camera and, if there, a depth map of the same name each.
+
+    Poses are OpenGL camera-to-world, y up. Corrected images have no distortion, corrected cameras closed loops.
+    """
+    images, cameras = _polycam_folders(root)[0]
+    frames: list[FrameEntry] = []
+    for image in files_in(images, SUFFIXES):
+        path = cameras / f"{image.stem}.json"
+        fields = read_json_object(path)
+        own = {key: entry(path, fields, name) for key, name in _INTRINSICS.items()}
+        own["transform_matrix"] = [[entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+        frames.append(_frame(image, str(path), own, root / "keyframes" / "depth" / f"{image.stem}.png"))
+    return _capture(root, "polycam", FrameFile(root / "keyframes", frames))
+
+
+def _polycam_folders(root: Path) -> list[tuple[Path, Path]]:
+    """Return the folders of images and of cameras, the better ones first."""
+    found: list[tuple[Path, Path]] = []
+    for prefix in ("corrected_", ""):
+        folders = root / "keyframes" / f"{prefix}images", root / "keyframes" / f"{prefix}cameras"
+        if all(folder.is_dir() for folder in folders):
+            found.append(folders)
+    return found
+
+
+def _frame(image: Path, where: str, own: dict[str, object], depth: Path) -> FrameEntry:
+    own["file_path"] = str(image)
+    if depth.is_file():
+        own["depth_file_path"] = str(depth)
+    return FrameEntry(where, own, image=image)
+
+
+def _capture(root: Path, format: str, file: FrameFile) -> Capture:
+    views, warnings = read_views(file)
+    return capture_of(root, format, file, {"train": tuple(views.values())}, warnings)
+
+
+POLYCAM_FORMAT = CaptureFormat(
+    "polycam", "keyframes/images and keyframes/cameras", lambda root: bool(_polycam_folders(root)), read_polycam
+)
+
+
+def read_record3d(root: Path) -> Capture:
+    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or those of an unpacked ``.r3d``.
+
+    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is written column by column.
+    """
+    from scipy.spatial.transform import Rotation  # late: other captures do not need it
+
+    path, images = _record3d_files(root)[0]
+    fields = read_json_object(path)
+    poses = numbers_of(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
+    fx, _, _, _, fy, _, cx, cy, _ = numbers_of(f"{path}: K", entry(path, fields, "K"), (9,))
+    lenses = np.tile((fx, fy, cx, cy), (len(poses), 1))
+    own_lenses = fields.get("perFrameIntrinsicCoeffs")
+    if own_lenses:
+        lenses = numbers_of(f"{path}: perFrameIntrinsicCoeffs", own_lenses, (len(poses), 4))
+    frames: list[FrameEntry] = []
+    for image in files_in(images, SUFFIXES):
+        if not image.stem.isdecimal():  # a copy, such as "12(1).jpg"
+            continue
+        number = int(image.stem)
+        if number >= len(poses):
+            raise DyngsError(f"{image}: has no pose, {path} has {len(poses)}, from number 0 on; export it again")
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(poses[number, :4]).as_matrix()
+        pose[:3, 3] = poses[number, 4:]
+        own: dict[str, object] = {"w": entry(path, fields, "w"), "h": entry(path, fields, "h")}
+        own.update(zip(("fl_x", "fl_y", "cx", "cy"), lenses[number].tolist(), strict=True))
+        own["transform_matrix"] = pose.tolist()
+        frames.append(_frame(image, f"{path}, pose {number}", own, images.parent / "depth" / f"{number}.exr"))
+    return _capture(root, "record3d", FrameFile(root / "metadata.json", frames, fields))
+
+
+def _record3d_files(root: Path) -> list[tuple[Path, Path]]:
+    """Return the metadata and the folder of images: of an export, or of an unpacked ``.r3d``."""
+    found: list[tuple[Path, Path]] = []
+    for metadata, images in (
+        ("EXR_RGBD/metadata.json", "EXR_RGBD/rgb"),
+        ("metadata.json", "rgb"),
+        ("metadata", "rgbd"),
+    ):
+        if (root / metadata).is_file() and (root / images).is_dir():
+            found.append((root / metadata, root / images))
+    return found
+
+
+RECORD3D_FORMAT = CaptureFormat(
+    "record3d", "metadata.json and rgb, or both in EXR_RGBD", lambda root: bool(_record3d_files(root)), read_record3d
+)
