@@ -26,7 +26,7 @@ _CHUNK = 2**20
 _JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")
 _BAD_PART = re.compile(r"\.\.|[a-z]:.*|.*[\x00-\x1f].*|(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Parts of a path that lead elsewhere, at least on Windows, or name a device there."""
-_ADVICE = "it must be a .zip without a password; download it again, or unpack it and give the folder"
+_ADVICE = "download it again, or unpack it and give the folder"
 
 
 def is_archive(path: Path) -> bool:
@@ -50,10 +50,16 @@ def unpacked(path: Path) -> Path:
             return folder
         temporary = temporary_folder_beside(folder)
         try:
-            _require_room(path, members, temporary)
             for name, info in members.items():
-                _extract(archive, info, temporary / name)
-            _move(temporary, folder)
+                target = temporary / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                # Of a member, ZipFile yields no more bytes than the archive states, which were counted above.
+                with archive.open(info) as source, target.open("xb") as file:
+                    shutil.copyfileobj(source, file, _CHUNK)
+            os.rename(temporary, folder)
+        except OSError:
+            if not folder.is_dir():  # otherwise another process was faster
+                raise
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     return folder
@@ -81,29 +87,3 @@ def _checked_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
     total = sum(info.file_size for info in found.values())
     require_at_most(path, total, min(MOST_BYTES, max(MOST_SMALL_BYTES, HIGHEST_RATIO * path.stat().st_size)), "bytes")
     return found
-
-
-def _require_room(path: Path, members: dict[str, zipfile.ZipInfo], folder: Path) -> None:
-    total = sum(info.file_size for info in members.values())
-    free = shutil.disk_usage(folder).free
-    if total > free:
-        raise DyngsError(
-            f"{path}: its files need {total / 1e6:.4g} MB in {folder.parent}, where {free / 1e6:.4g} MB are free; set "
-            "DYNGS_CACHE_DIR to a folder on another disk"
-        )
-
-
-def _extract(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> None:
-    """Write a member as a new file. Its size cannot exceed what the archive states, which ``ZipFile`` checks."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with archive.open(info) as source, path.open("xb") as target:
-        shutil.copyfileobj(source, target, _CHUNK)
-
-
-def _move(temporary: Path, folder: Path) -> None:
-    """Rename the complete folder; another process may have been faster, with the same files."""
-    try:
-        os.rename(temporary, folder)
-    except OSError:
-        if not folder.is_dir():
-            raise

@@ -27,9 +27,10 @@ def read_polycam(root: Path) -> Capture:
     for image in files_in(images, SUFFIXES):
         path = cameras / f"{image.stem}.json"
         fields = read_json_object(path)
-        own = {key: entry(path, fields, name) for key, name in _INTRINSICS.items()}
+        own: dict[str, object] = {key: entry(path, fields, name) for key, name in _INTRINSICS.items()}
+        own |= _depth_of(root / "keyframes" / "depth" / f"{image.stem}.png")
         own["transform_matrix"] = [[entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-        frames.append(_frame(image, str(path), own, root / "keyframes" / "depth" / f"{image.stem}.png"))
+        frames.append(FrameEntry(str(path), own | {"file_path": str(image)}, image=image))
     return _capture(root, "polycam", FrameFile(root / "keyframes", frames))
 
 
@@ -43,11 +44,8 @@ def _polycam_folders(root: Path) -> list[tuple[Path, Path]]:
     return found
 
 
-def _frame(image: Path, where: str, own: dict[str, object], depth: Path) -> FrameEntry:
-    own["file_path"] = str(image)
-    if depth.is_file():
-        own["depth_file_path"] = str(depth)
-    return FrameEntry(where, own, image=image)
+def _depth_of(path: Path) -> dict[str, object]:
+    return {"depth_file_path": str(path)} if path.is_file() else {}
 
 
 def _capture(root: Path, format: str, file: FrameFile) -> Capture:
@@ -85,10 +83,10 @@ def read_record3d(root: Path) -> Capture:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(poses[number, :4]).as_matrix()
         pose[:3, 3] = poses[number, 4:]
-        own: dict[str, object] = {"w": entry(path, fields, "w"), "h": entry(path, fields, "h")}
-        own.update(zip(("fl_x", "fl_y", "cx", "cy"), lenses[number].tolist(), strict=True))
-        own["transform_matrix"] = pose.tolist()
-        frames.append(_frame(image, f"{path}, pose {number}", own, images.parent / "depth" / f"{number}.exr"))
+        own = dict(zip(("fl_x", "fl_y", "cx", "cy"), lenses[number].tolist(), strict=True))
+        own |= _depth_of(images.parent / "depth" / f"{number}.exr")
+        own |= {"file_path": str(image), "transform_matrix": pose.tolist()}
+        frames.append(FrameEntry(f"{path}, pose {number}", own, fields, image))
     return _capture(root, "record3d", FrameFile(root / "metadata.json", frames, fields))
 
 

@@ -88,14 +88,14 @@ def _radial(coefficients: Sequence[float]) -> _Fields:
     return {f"k{i}": k for i, k in enumerate(coefficients, start=1)}
 
 
-def _brown(where: str, k: Sequence[float], reach: float) -> _Fields:
+def _brown(where: str, k: Sequence[float], diagonal: float) -> _Fields:
     """Return the radial distortion 1 + k1 r^2 + .. + k4 r^8 in OpenCV's terms, which have no such k4.
 
-    OpenCV's rational function is fitted to it, up to the radius ``reach`` in focal lengths.
+    OpenCV's rational function is fitted to it, up to the corners of a photo whose ``diagonal`` is in focal lengths.
     """
     if k[3] == 0:
         return _radial(k[:3])
-    radius = np.linspace(0, reach, 1000)[:, None]
+    radius = np.linspace(0, 0.6 * diagonal, 1000)[:, None]  # barrel distortion brings more in than half of it
     factor = 1 + radius ** [2, 4, 6, 8] @ np.array(k)[:, None]
     powers = radius ** [2, 4, 6]
     fitted = np.linalg.lstsq(np.hstack([powers, -factor * powers]), factor - 1, rcond=None)[0]
@@ -103,11 +103,6 @@ def _brown(where: str, k: Sequence[float], reach: float) -> _Fields:
     if not np.abs(error).max() < _LENS_ERROR:
         raise DyngsError(f"{where}: its distortion with k4={k[3]:g} cannot be expressed; export undistorted photos")
     return {**_radial(fitted[:, 0].tolist()), "camera_model": "FULL_OPENCV"}
-
-
-def _reach(width: float, height: float, focal: float) -> float:
-    """Return the radius of the corners in focal lengths, and some more that barrel distortion brings in."""
-    return 1.2 * math.hypot(width, height) / (2 * focal)
 
 
 def read_metashape(root: Path) -> Capture:
@@ -168,7 +163,7 @@ def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
     own = {"w": width, "h": height, "fl_x": f + b1, "fl_y": f, "cx": width / 2 + cx, "cy": height / 2 + cy}
     if kind == "fisheye":
         return {**own, **_radial(k), "camera_model": "OPENCV_FISHEYE"}
-    return {**own, **_brown(where, k, _reach(width, height, f)), "p1": p2, "p2": p1}
+    return {**own, **_brown(where, k, math.hypot(width, height) / f), "p1": p2, "p2": p1}
 
 
 METASHAPE_FORMAT = CaptureFormat(
@@ -218,7 +213,7 @@ def _realitycapture_camera(where: str, values: dict[str, float], width: int, hei
     pose[:3, :3] = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
     pose[:3, 3] = (values["x"], values["y"], values["alt"])
     own = {"w": width, "h": height, "fl_x": focal, "cx": width / 2 + px * side, "cy": height / 2 + py * side}
-    lens = _brown(where, k, _reach(width, height, focal))
+    lens = _brown(where, k, math.hypot(width, height) / focal)
     return {**own, **lens, "p1": t2, "p2": t1, "transform_matrix": pose.tolist()}
 
 
@@ -255,11 +250,10 @@ def read_odm(root: Path) -> Capture:
             if len(content) > 1:
                 warnings = [f"{path.name}: the largest of {len(content)} models is read, {len(model['shots'])} photos"]
             lenses, shots = model["cameras"], model["shots"]
-            listed = list(model.get("points", {}).values())
+            listed = [[*point["coordinates"], *point["color"]] for point in model.get("points", {}).values()]
             if listed:
-                xyz = numbers_of(f"{path}: points", [point["coordinates"] for point in listed], (len(listed), 3))
-                rgb = numbers_of(f"{path}: points", [point["color"] for point in listed], (len(listed), 3))
-                points = PointCloud(xyz, rgb.clip(0, 255).astype(np.uint8))
+                table = numbers_of(f"{path}: points", listed, (len(listed), 6))
+                points = PointCloud(table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8))
         else:
             lenses = json.loads(inside(root / "cameras.json").read_text(encoding="utf-8-sig"))
             shots = {feature["properties"]["filename"]: feature["properties"] for feature in content["features"]}

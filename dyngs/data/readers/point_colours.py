@@ -21,8 +21,7 @@ _PACKED = ("rgb", "rgba")
 
 def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
     """Return (P, 3) uint8 colours of ``count`` points, grey where ``columns`` (by property name) hold none."""
-    by_name = {name.lower(): np.asarray(column).reshape(-1) for name, column in columns.items()}
-    known = {name: column for name, column in by_name.items() if len(column) == count and column.dtype.kind in "iuf"}
+    known = {name.lower(): np.ravel(column) for name, column in columns.items() if np.size(column) == count}
     for names in _NAMES:
         if known.keys() >= set(names):
             return _as_bytes(np.stack([known[name] for name in names], axis=1))
@@ -55,15 +54,8 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 
 def _unpacked(packed: np.ndarray) -> np.ndarray:
     """Return the red, green and blue bytes of 0xAARRGGBB."""
-    if packed.dtype.kind == "f" and not _are_integers(packed):
+    if packed.dtype.kind == "f":
         bits = np.ascontiguousarray(packed, np.float32).view(np.uint32)
     else:
         bits = packed.astype(np.uint32)
     return np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
-
-
-def _are_integers(packed: np.ndarray) -> bool:
-    """Whether floats are colours as numbers up to 0xFFFFFF; the bits of a colour never are: they make tiny floats."""
-    if not ((packed >= 0) & (packed < 2**24)).all():
-        return False
-    return bool((packed % 1 == 0).all() and packed.max(initial=0) >= 1)

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tiny_captures import SIDE_PIXELS, edit_json, pixel_of, random_pixels, side_poses, write_image
+from program_captures import PHONE_POSES as POSES
+from program_captures import write_polycam, write_record3d
+from tiny_captures import FOCAL, SIDE_PIXELS, WIDTH, edit_json, pixel_of, write_image
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.readers.phone_apps import read_polycam, read_record3d
 from dyngs.errors import DyngsError
-
-WIDTH, HEIGHT, FOCAL = 16, 12, 20.0
-POSES = side_poses(4)
 
 
 def read(root: Path) -> Capture:
@@ -34,22 +32,6 @@ def assert_same_views(capture: Capture) -> None:
         np.testing.assert_allclose(back, pose, atol=1e-9)
     for point, expected in SIDE_PIXELS:
         np.testing.assert_allclose(pixel_of(views[0], point), expected, atol=1e-9)
-
-
-def write_polycam(root: Path, prefix: str = "corrected_", depth: bool = True) -> Path:
-    """Names are times of capture, as in the app."""
-    for i, pose in enumerate(POSES):
-        name = str(1_700_000_000 + i)
-        write_image(root / "keyframes" / f"{prefix}images" / f"{name}.jpg", random_pixels(HEIGHT, WIDTH, 3, seed=i))
-        if depth:
-            metres = np.full((3, 4, 1), 4000, np.uint16)
-            write_image(root / "keyframes" / "depth" / f"{name}.png", metres)
-        own = {f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)}
-        own |= {"fx": FOCAL, "fy": FOCAL, "cx": 8.0, "cy": 6.0, "width": WIDTH, "height": HEIGHT, "blur_score": 80.0}
-        cameras = root / "keyframes" / f"{prefix}cameras"
-        cameras.mkdir(parents=True, exist_ok=True)
-        (cameras / f"{name}.json").write_text(json.dumps(own))
-    return root
 
 
 @pytest.mark.parametrize("depth", [True, False])
@@ -98,32 +80,6 @@ def test_damaged_cameras_of_polycam_are_one_line(tmp_path: Path, change: dict[st
     file.unlink()
     with pytest.raises(DyngsError, match=r"1700000002\.json"):
         read_polycam(tmp_path)
-
-
-def quaternion(rotation: np.ndarray) -> list[float]:
-    """x, y, z, w of a rotation, from the eigenvector of Bar-Itzhack's matrix."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    matrix = np.array(
-        [
-            [a - e - i, b + d, c + g, h - f],
-            [b + d, e - a - i, f + h, c - g],
-            [c + g, f + h, i - a - e, d - b],
-            [h - f, c - g, d - b, a + e + i],
-        ]
-    )
-    return np.linalg.eigh(matrix / 3)[1][:, -1].tolist()
-
-
-def write_record3d(root: Path, metadata: str = "metadata.json", images: str = "rgb", **more: object) -> Path:
-    numbers = [0, 1, 2, 10]  # so that the order of names is not that of numbers
-    poses = [[0.0, 0, 0, 1, 0, 0, 0]] * 11
-    for number, pose in zip(numbers, POSES, strict=True):
-        write_image(root / images / f"{number}.jpg", random_pixels(HEIGHT, WIDTH, 3, seed=number))
-        poses[number] = [*quaternion(pose[:3, :3]), *pose[:3, 3].tolist()]
-    write_image(root / images / "10(1).jpg", random_pixels(HEIGHT, WIDTH, 3))
-    fields = {"w": WIDTH, "h": HEIGHT, "fps": 60, "K": [FOCAL, 0, 0, 0, FOCAL, 0, 8.0, 6.0, 1], "poses": poses, **more}
-    (root / metadata).write_text(json.dumps(fields))
-    return root
 
 
 def by_number(capture: Capture) -> Capture:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_captures import edit_json, opengl_pose, random_pixels, write_image
+from program_captures import (
+    HEADER,
+    HEIGHT,
+    METASHAPE,
+    NAMES,
+    NEWER_HEADER,
+    ODM,
+    POINTS,
+    POSES,
+    REALITY,
+    WIDTH,
+    cv_from_world,
+    write_metashape,
+    write_odm,
+    write_photos,
+    write_reality,
+    write_shots,
+)
+from tiny_captures import edit_json
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
@@ -19,28 +36,11 @@ from dyngs.data.images.lens import distort
 from dyngs.data.readers.photogrammetry import read_metashape, read_odm, read_realitycapture
 from dyngs.errors import DyngsError
 
-WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
-POINTS = np.array([[0.3, -0.2, 0.1], [-0.5, 0.4, 0.3], [0.1, 0.6, -0.4], [0.0, 0.0, 0.0]])
-TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-POSES = [opengl_pose(0.7 * i) @ np.diag([-1.0, -1, 1, 1]) if i % 2 else opengl_pose(0.7 * i) for i in range(4)]
-"""OpenGL camera-to-world poses, every second one upside down."""
-NAMES = [f"DSC_{i}.jpg" for i in range(4)]
 Project = Callable[[np.ndarray, np.ndarray], tuple[float, float]]
-
-
-def write_photos(root: Path, names: Sequence[str] = NAMES, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    for i, name in enumerate(names):
-        write_image(root / name, random_pixels(size[1], size[0], 3, seed=i))
 
 
 def read(root: Path) -> Capture:
     return read_capture(DataConfig(root=root, test_every=0))
-
-
-def cv_from_world(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation from the world to the camera: x right, y down, z forward."""
-    rotation = np.diag([1.0, -1, -1]) @ pose[:3, :3].T
-    return rotation, -rotation @ pose[:3, 3]
 
 
 def pixel(view: View, point: np.ndarray) -> np.ndarray:
@@ -50,7 +50,9 @@ def pixel(view: View, point: np.ndarray) -> np.ndarray:
     return view.intrinsics[:2, :2] @ distorted + view.intrinsics[:2, 2]
 
 
-def assert_same_views(capture: Capture, project: Project, indices: Sequence[int] = range(4), atol: float = 1e-6) -> None:
+def assert_same_views(
+    capture: Capture, project: Project, indices: Sequence[int] = range(4), atol: float = 1e-6
+) -> None:
     views = capture.splits["train"]
     assert [view.image_path.name for view in views] == [NAMES[i] for i in indices]
     for i, view in zip(indices, views, strict=True):
@@ -58,11 +60,9 @@ def assert_same_views(capture: Capture, project: Project, indices: Sequence[int]
         np.testing.assert_allclose(view.cam_from_world[:3, :3], rotation, atol=1e-8)
         np.testing.assert_allclose(view.cam_from_world[:3, 3], shift, atol=1e-8)
         for point in POINTS:
-            np.testing.assert_allclose(pixel(view, point), project(rotation @ point + shift, view.image_path), atol=atol)
-
-
-# Metashape: the camera models of the user manual, appendix D.
-METASHAPE = {"f": 40.0, "cx": 1.5, "cy": -0.75, "b1": 0.5, "k1": 0.05, "k2": -0.02, "k3": 0.004, "p1": 0.003, "p2": -0.002}
+            np.testing.assert_allclose(
+                pixel(view, point), project(rotation @ point + shift, view.image_path), atol=atol
+            )
 
 
 def metashape_frame(local: np.ndarray, own: dict[str, float], *, fisheye: bool = False) -> tuple[float, float]:
@@ -76,49 +76,6 @@ def metashape_frame(local: np.ndarray, own: dict[str, float], *, fisheye: bool =
     u = x * radial + c["p1"] * (r2 + 2 * x * x) + 2 * c["p2"] * x * y
     v = y * radial + c["p2"] * (r2 + 2 * y * y) + 2 * c["p1"] * x * y
     return WIDTH / 2 + c["cx"] + u * c["f"] + u * c["b1"], HEIGHT / 2 + c["cy"] + v * c["f"]
-
-
-def write_metashape(
-    root: Path,
-    lens: dict[str, float] = METASHAPE,
-    kind: str = "frame",
-    placement: str | None = None,
-    labels: Sequence[str] = NAMES,
-    unaligned: Sequence[int] = (),
-) -> Path:
-    """cameras.xml; the chunk is turned, three times smaller and shifted if ``placement`` says where that is written."""
-    write_photos(root / "images")
-    scale, shift = 3.0, np.array([1.0, -2, 0.5])
-    transform = (
-        f"<transform><rotation>{' '.join(map(str, TURN.ravel()))}</rotation>"
-        f"<translation>{' '.join(map(str, shift))}</translation><scale>{scale}</scale></transform>"
-    )
-    cameras = []
-    for i, (label, pose) in enumerate(zip(labels, POSES, strict=True)):
-        rotation, _ = cv_from_world(pose)
-        local = np.eye(4)
-        local[:3, :3], local[:3, 3] = rotation.T, pose[:3, 3]
-        if placement is not None:  # world = scale * turn * local + shift
-            local[:3, :3] = TURN.T @ rotation.T
-            local[:3, 3] = TURN.T @ (pose[:3, 3] - shift) / scale
-        numbers = " ".join(repr(float(x)) for x in local.ravel())
-        inner = "" if i in unaligned else f"<transform>{numbers}</transform>"
-        camera = f'<camera id="{i}" sensor_id="7" component_id="5" label="{label}">{inner}</camera>'
-        cameras.append(f'<group label="second half">{camera}</group>' if i > 1 else camera)
-    parameters = "".join(f"<{key}>{value}</{key}>" for key, value in lens.items())
-    resolution = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
-    calibrations = (
-        f'<calibration type="{kind}" class="initial">{resolution}<f>99</f></calibration>'
-        f'<calibration type="{kind}" class="adjusted">{resolution}{parameters}</calibration>'
-    )
-    (root / "cameras.xml").write_text(
-        '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0"><chunk label="Chunk 1">'
-        f'<sensors next_id="8"><sensor id="7" label="X-T4" type="{kind}">{resolution}{calibrations}</sensor></sensors>'
-        f'<components><component id="5">{transform if placement == "component" else ""}</component></components>'
-        f"<cameras>{''.join(cameras)}</cameras>{transform if placement == 'chunk' else ''}"
-        "<settings></settings></chunk></document>"
-    )
-    return root
 
 
 @pytest.mark.parametrize("labels", [NAMES, [name.removesuffix(".jpg") for name in NAMES]])
@@ -145,7 +102,7 @@ def test_k4_is_approximated(tmp_path: Path) -> None:
     lens = METASHAPE | {"k4": 0.03}
     capture = read(write_metashape(tmp_path, lens))
     assert_same_views(capture, lambda local, _: metashape_frame(local, lens), atol=4e-3)
-    at_corner = np.array([WIDTH / 2, HEIGHT / 2, FOCAL])
+    at_corner = np.array([WIDTH / 2, HEIGHT / 2, METASHAPE["f"]])
     view = capture.splits["train"][0]
     world = view.cam_from_world[:3, :3].T @ (at_corner - view.cam_from_world[:3, 3])
     np.testing.assert_allclose(pixel(view, world), metashape_frame(at_corner, lens), atol=4e-3)
@@ -165,7 +122,11 @@ def test_photos_that_metashape_did_not_align_are_left_out(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('type="frame"', 'type="spherical"', r"sensor X-T4: is of type spherical .*; only calibrated frame and fisheye"),
+        (
+            'type="frame"',
+            'type="spherical"',
+            r"sensor X-T4: is of type spherical .*; only calibrated frame and fisheye",
+        ),
         ('type="frame"', 'type="equisolid_fisheye"', "is of type equisolid_fisheye"),
         ("<f>40.0</f>", "<f>forty</f>", r"cameras\.xml: cannot be read .*forty"),
         ("</document>", "", r"cameras\.xml: cannot be read"),
@@ -183,23 +144,6 @@ def test_damaged_cameras_of_metashape_are_one_line(tmp_path: Path, old: str, new
         read_metashape(tmp_path)
 
 
-# RealityCapture: "XMP camera math" of its knowledge base, and the templates of its exports.
-HEADER = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
-NEWER_HEADER = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
-REALITY = {"f": 30.0, "px": 0.01, "py": -0.02, "k1": 0.04, "k2": -0.01, "k3": 0.002, "k4": 0.0, "t1": 0.002, "t2": -0.001}
-
-
-def angles_of(pose: np.ndarray) -> tuple[float, float, float]:
-    """Heading, pitch and roll in degrees: a camera that looks straight down, its top to the north, is rolled about its
-    own y axis (the top), pitched about x (east), then turned clockwise, as seen from above, by its heading."""
-    right, up, back = pose[:3, :3].T
-    # The rows of the product of the three turns, solved for the angles by hand.
-    pitch = math.asin(up[2])
-    heading = math.atan2(up[0], up[1])
-    roll = math.atan2(-right[2], back[2])
-    return tuple(math.degrees(angle) for angle in (heading, pitch, roll))  # type: ignore[return-value]
-
-
 def reality_pixel(local: np.ndarray, _: Path) -> tuple[float, float]:
     x, y = local[0] / local[2], local[1] / local[2]
     r2 = x * x + y * y
@@ -210,16 +154,6 @@ def reality_pixel(local: np.ndarray, _: Path) -> tuple[float, float]:
     side = max(WIDTH, HEIGHT)
     scale = REALITY["f"] / 36 * side
     return WIDTH / 2 + REALITY["px"] * side + u * scale, HEIGHT / 2 + REALITY["py"] * side + v * scale
-
-
-def write_reality(root: Path, header: str = HEADER, folder: str = "images") -> Path:
-    write_photos(root / folder)
-    lines = [header]
-    for name, pose in zip(NAMES, POSES, strict=True):
-        numbers = [*pose[:3, 3], *angles_of(pose), *REALITY.values()]
-        lines.append(",".join([name, *(repr(float(x)) for x in numbers)]))
-    (root / "registration.csv").write_text("\n".join(lines) + "\n")
-    return root
 
 
 @pytest.mark.parametrize("folder", ["images", ".", "day 1/left"])
@@ -283,23 +217,6 @@ def test_two_files_of_cameras_are_refused(tmp_path: Path) -> None:
     assert len(read(tmp_path).splits["train"]) == 4
 
 
-# ODM: OpenSfM's "camera models" and "geometric conventions".
-ODM = {
-    "projection_type": "brown",
-    "width": WIDTH,
-    "height": HEIGHT,
-    "focal_x": 0.8,
-    "focal_y": 0.82,
-    "c_x": 0.01,
-    "c_y": -0.02,
-    "k1": 0.05,
-    "k2": -0.01,
-    "k3": 0.002,
-    "p1": 0.001,
-    "p2": -0.002,
-}
-
-
 def odm_pixel(local: np.ndarray, _: Path) -> tuple[float, float]:
     c = {key: value for key, value in ODM.items() if key != "projection_type"}
     x, y = local[0] / local[2], local[1] / local[2]
@@ -309,44 +226,6 @@ def odm_pixel(local: np.ndarray, _: Path) -> tuple[float, float]:
     v = y * radial + 2 * c["p2"] * x * y + c["p1"] * (r2 + 2 * y * y)
     # Normalised coordinates: the middle of the image is zero, its longer side has length one.
     return (c["focal_x"] * u + c["c_x"]) * WIDTH + WIDTH / 2, (c["focal_y"] * v + c["c_y"]) * WIDTH + HEIGHT / 2
-
-
-def axis_angle(rotation: np.ndarray) -> list[float]:
-    """The axis and angle of a rotation, by its eigenvector of eigenvalue 1."""
-    values, vectors = np.linalg.eig(rotation)
-    axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
-    angle = math.acos(max(-1.0, min(1.0, (np.trace(rotation) - 1) / 2)))
-    turned = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    return (axis * angle * (1 if turned @ axis >= 0 else -1)).tolist()
-
-
-def write_odm(root: Path, lens: dict[str, object] = ODM) -> Path:  # type: ignore[assignment]
-    write_photos(root / "images")
-    shots = {}
-    for name, pose in zip(NAMES, POSES, strict=True):
-        rotation, shift = cv_from_world(pose)
-        shots[name] = {"rotation": axis_angle(rotation), "translation": shift.tolist(), "camera": "dji"}
-    points = {str(i): {"coordinates": point.tolist(), "color": [i, 100.0, 200.0]} for i, point in enumerate(POINTS)}
-    model = {"cameras": {"dji": lens}, "shots": shots, "points": points}
-    small = {"cameras": {"dji": lens}, "shots": {"other.jpg": shots[NAMES[0]]}, "points": {}}
-    (root / "opensfm").mkdir()
-    (root / "opensfm" / "reconstruction.json").write_text(json.dumps([small, model]))
-    (root / "cameras.json").write_text(json.dumps({"dji": lens}))
-    return root
-
-
-def write_shots(root: Path) -> Path:
-    """``odm_report/shots.geojson`` instead of the reconstruction: it has the places of cameras."""
-    write_odm(root)
-    models = json.loads((root / "opensfm" / "reconstruction.json").read_text())
-    (root / "opensfm" / "reconstruction.json").unlink()
-    features = []
-    for (name, shot), pose in zip(models[1]["shots"].items(), POSES, strict=True):
-        own = {"filename": name, "rotation": shot["rotation"], "translation": pose[:3, 3].tolist(), "width": WIDTH}
-        features.append({"type": "Feature", "properties": own, "geometry": {"type": "Point", "coordinates": [0, 0, 0]}})
-    (root / "odm_report").mkdir()
-    (root / "odm_report" / "shots.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    return root
 
 
 def test_odm_has_its_cameras_and_points(tmp_path: Path) -> None:
@@ -378,7 +257,10 @@ def test_one_focal_length_of_odm_is_for_both_axes(tmp_path: Path, kind: str, mod
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"projection_type": "spherical"}, r"DSC_0\.jpg: photos of projection 'spherical' are not read, only perspective"),
+        (
+            {"projection_type": "spherical"},
+            r"DSC_0\.jpg: photos of projection 'spherical' are not read, only perspective",
+        ),
         ({"focal_x": None}, r"reconstruction\.json: cannot be read"),
         ({"focal_x": "1"}, r"cannot be read|finite number"),
         ({"width": 0, "height": 0}, "w and h must be|cannot be read"),
