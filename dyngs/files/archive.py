@@ -23,7 +23,8 @@ MOST_SMALL_BYTES = 2**27
 HIGHEST_RATIO = 50
 """Images do not shrink in an archive; text of points and cameras does, about ten times; bombs a thousand."""
 _CHUNK = 2**20
-_JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")
+_JUNK = ("__MACOSX", ".")
+"""Beginnings of names that systems add to archives, or hide."""
 _BAD_PART = re.compile(r"\.\.|[a-z]:.*|.*[\x00-\x1f].*|(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Parts of a path that lead elsewhere, at least on Windows, or name a device there."""
 _ADVICE = "download it again, or unpack it and give the folder"
@@ -72,18 +73,17 @@ def _checked_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
     for info in archive.infolist():
         name = info.filename.replace("\\", "/")
         parts = PurePosixPath(name).parts
-        if name.endswith("/") or not parts or parts[0] == _JUNK[0] or parts[-1] in _JUNK or parts[-1].startswith("._"):
-            continue
         if name.startswith("/") or any(_BAD_PART.fullmatch(part) for part in parts):
             raise DyngsError(f"{path}: holds the file {name!r:.80}, which is no name below its folder; pack it anew")
+        if name.endswith("/") or any(part.startswith(_JUNK) for part in parts):
+            continue
         if stat.S_ISLNK(info.external_attr >> 16):
             raise DyngsError(f"{path}: holds the link {name!r:.80}; pack the file that it leads to instead")
         if info.flag_bits & 1:
             raise DyngsError(f"{path}: is encrypted; unpack it with its password and give the folder")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise DyngsError(f"{path}: is compressed by another method than deflate; unpack it and give the folder")
-        if found.setdefault(name, info) is not info:
-            raise DyngsError(f"{path}: holds {name!r:.80} twice; pack it anew")
+        found[name] = info
     total = sum(info.file_size for info in found.values())
     require_at_most(path, total, min(MOST_BYTES, max(MOST_SMALL_BYTES, HIGHEST_RATIO * path.stat().st_size)), "bytes")
     return found

@@ -208,16 +208,6 @@ def test_damaged_archives_are_one_line(
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
-def test_names_twice_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "scene.zip"
-    with zipfile.ZipFile(file, "w") as out:
-        out.writestr("a.txt", "1")
-        with pytest.warns(UserWarning, match="Duplicate"):
-            out.writestr("a.txt", "2")
-    with pytest.raises(DyngsError, match=r"holds 'a\.txt' twice"):
-        unpacked(file)
-
-
 def test_a_full_disk_leaves_nothing(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = packed(tmp_path / "scene.zip", root)
 

@@ -28,14 +28,19 @@ def read_blender(root: Path) -> Capture:
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
             warnings.append(f"{path.name}: lists no frames")
-    return capture_of(root, "blender", train, splits, warnings)
+    return _capture_of(root, "blender", train, splits, warnings)
 
 
-def capture_of(root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]) -> Capture:
-    """Return the capture of a file of frames with the points and tracks that belong to it."""
+def _capture_of(root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]) -> Capture:
     points, path, notes = find_points(file)
     tracks, lines = tracks_path_of(file), (*warnings, *notes)
     return Capture(root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines)
+
+
+def training_capture(root: Path, format: str, file: FrameFile, *more: str) -> Capture:
+    """Return the capture of a file whose frames are all for training, with ``more`` warnings."""
+    views, warnings = read_views(file)
+    return _capture_of(root, format, file, {"train": tuple(views.values())}, [*warnings, *more])
 
 
 FORMAT = CaptureFormat(
@@ -53,7 +58,7 @@ def read_nerfstudio(root: Path) -> Capture:
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
     splits, notes = _nerfstudio_splits(file, views)
-    return capture_of(root, "nerfstudio", file, splits, [*warnings, *notes])
+    return _capture_of(root, "nerfstudio", file, splits, [*warnings, *notes])
 
 
 def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from dyngs.data.capture import Capture, CaptureFormat
 from dyngs.data.images.images import SUFFIXES, files_in
-from dyngs.data.readers.blender import capture_of
-from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
+from dyngs.data.readers.blender import training_capture
+from dyngs.data.readers.transforms import FrameEntry, FrameFile
 from dyngs.errors import DyngsError
 from dyngs.files.fields import entry, numbers_of, read_json_object
 
+_POLYCAM = (
+    ("keyframes/corrected_images", "keyframes/corrected_cameras"),
+    ("keyframes/images", "keyframes/cameras"),
+)
+_RECORD3D = (
+    ("EXR_RGBD/metadata.json", "EXR_RGBD/rgb"),
+    ("metadata.json", "rgb"),
+    ("metadata", "rgbd"),  # of an unpacked .r3d
+)
 _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 """Keys of transforms files, and those of Polycam."""
 
@@ -22,7 +32,7 @@ def read_polycam(root: Path) -> Capture:
 
     Poses are OpenGL camera-to-world, y up. Corrected images have no distortion, corrected cameras closed loops.
     """
-    images, cameras = _polycam_folders(root)[0]
+    images, cameras = _existing(root, _POLYCAM)[0]
     frames: list[FrameEntry] = []
     for image in files_in(images, SUFFIXES):
         path = cameras / f"{image.stem}.json"
@@ -31,30 +41,21 @@ def read_polycam(root: Path) -> Capture:
         own |= _depth_of(root / "keyframes" / "depth" / f"{image.stem}.png")
         own["transform_matrix"] = [[entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)]
         frames.append(FrameEntry(str(path), own | {"file_path": str(image)}, image=image))
-    return _capture(root, "polycam", FrameFile(root / "keyframes", frames))
-
-
-def _polycam_folders(root: Path) -> list[tuple[Path, Path]]:
-    """Return the folders of images and of cameras, the better ones first."""
-    found: list[tuple[Path, Path]] = []
-    for prefix in ("corrected_", ""):
-        folders = root / "keyframes" / f"{prefix}images", root / "keyframes" / f"{prefix}cameras"
-        if all(folder.is_dir() for folder in folders):
-            found.append(folders)
-    return found
+    return training_capture(root, "polycam", FrameFile(root / "keyframes", frames))
 
 
 def _depth_of(path: Path) -> dict[str, object]:
     return {"depth_file_path": str(path)} if path.is_file() else {}
 
 
-def _capture(root: Path, format: str, file: FrameFile) -> Capture:
-    views, warnings = read_views(file)
-    return capture_of(root, format, file, {"train": tuple(views.values())}, warnings)
+def _existing(root: Path, files: Sequence[tuple[str, str]]) -> list[tuple[Path, Path]]:
+    """Return the pairs of files or folders that both exist, in their order."""
+    pairs = [(root / first, root / second) for first, second in files]
+    return [(first, second) for first, second in pairs if first.exists() and second.exists()]
 
 
 POLYCAM_FORMAT = CaptureFormat(
-    "polycam", "keyframes/images and keyframes/cameras", lambda root: bool(_polycam_folders(root)), read_polycam
+    "polycam", "keyframes/images and keyframes/cameras", lambda root: bool(_existing(root, _POLYCAM)), read_polycam
 )
 
 
@@ -65,7 +66,7 @@ def read_record3d(root: Path) -> Capture:
     """
     from scipy.spatial.transform import Rotation  # late: other captures do not need it
 
-    path, images = _record3d_files(root)[0]
+    path, images = _existing(root, _RECORD3D)[0]
     fields = read_json_object(path)
     poses = numbers_of(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
     fx, _, _, _, fy, _, cx, cy, _ = numbers_of(f"{path}: K", entry(path, fields, "K"), (9,))
@@ -87,22 +88,12 @@ def read_record3d(root: Path) -> Capture:
         own |= _depth_of(images.parent / "depth" / f"{number}.exr")
         own |= {"file_path": str(image), "transform_matrix": pose.tolist()}
         frames.append(FrameEntry(f"{path}, pose {number}", own, fields, image))
-    return _capture(root, "record3d", FrameFile(root / "metadata.json", frames, fields))
-
-
-def _record3d_files(root: Path) -> list[tuple[Path, Path]]:
-    """Return the metadata and the folder of images: of an export, or of an unpacked ``.r3d``."""
-    found: list[tuple[Path, Path]] = []
-    for metadata, images in (
-        ("EXR_RGBD/metadata.json", "EXR_RGBD/rgb"),
-        ("metadata.json", "rgb"),
-        ("metadata", "rgbd"),
-    ):
-        if (root / metadata).is_file() and (root / images).is_dir():
-            found.append((root / metadata, root / images))
-    return found
+    return training_capture(root, "record3d", FrameFile(root / "metadata.json", frames, fields))
 
 
 RECORD3D_FORMAT = CaptureFormat(
-    "record3d", "metadata.json and rgb, or both in EXR_RGBD", lambda root: bool(_record3d_files(root)), read_record3d
+    "record3d",
+    "metadata.json and rgb (in EXR_RGBD)",
+    lambda root: bool(_existing(root, _RECORD3D)),
+    read_record3d,
 )

@@ -15,8 +15,8 @@ import numpy as np
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, opengl_from_cam
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
-from dyngs.data.readers.blender import capture_of
-from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
+from dyngs.data.readers.blender import training_capture
+from dyngs.data.readers.transforms import FrameEntry, FrameFile
 from dyngs.errors import DyngsError, counted, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import first_few, numbers_of
@@ -60,12 +60,9 @@ def _capture(root: Path, format: str, path: Path, photos: _Photos, cameras: Sequ
         raise DyngsError(
             f"{path}: no photo in {photos.folder} has the name of a camera with a pose; put the photos there"
         )
-    file = FrameFile(root / path.name, frames)
-    views, warnings = read_views(file)
-    if left_out:
-        count = f"{len(left_out)} of {counted(len(cameras), 'camera')}"
-        warnings.append(f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}")
-    return capture_of(root, format, file, {"train": tuple(views.values())}, warnings)
+    count = f"{len(left_out)} of {counted(len(cameras), 'camera')}"
+    line = f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}"
+    return training_capture(root, format, FrameFile(root / path.name, frames), *([line] if left_out else []))
 
 
 def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:

@@ -12,9 +12,6 @@ _NAMES = (
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
     ("r", "g", "b"),
 )
-_HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
-"""Colours of a file of Gaussians: those of spherical harmonics of degree 0."""
-_SH_DEGREE_0 = 0.28209479177387814
 _PACKED = ("rgb", "rgba")
 """The Point Cloud Library packs 0xAARRGGBB into one number, an integer or the bits of a float32."""
 
@@ -25,9 +22,6 @@ def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
     for names in _NAMES:
         if known.keys() >= set(names):
             return _as_bytes(np.stack([known[name] for name in names], axis=1))
-    if known.keys() >= set(_HARMONICS):
-        harmonics = np.stack([known[name] for name in _HARMONICS], axis=1)
-        return _rounded(255 * (0.5 + _SH_DEGREE_0 * harmonics.astype(np.float64)))
     for name in _PACKED:
         if name in known:
             return _unpacked(known[name])
@@ -45,11 +39,8 @@ def _as_bytes(values: np.ndarray) -> np.ndarray:
         scale = 255.0
     elif largest > 255:
         scale = 1 / 257  # 16 bits
-    return _rounded(scale * values.astype(np.float64))
-
-
-def _rounded(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.nan_to_num(values, nan=GREY) + 0.5, 0, 255).astype(np.uint8)
+    scaled = np.nan_to_num(scale * values.astype(np.float64), nan=GREY)
+    return np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
 
 
 def _unpacked(packed: np.ndarray) -> np.ndarray:

@@ -52,7 +52,6 @@ CASES = {
     "packed integers": {"rgb": PACKED},
     "packed with alpha": {"rgba": PACKED | np.uint32(0x7F000000)},
     "packed bits of floats": {"rgb": PACKED.view(np.float32)},
-    "harmonics": three("f_dc_0 f_dc_1 f_dc_2", ((COLOURS / 255 - 0.5) / 0.28209479177387814).astype(np.float32)),
 }
 
 
