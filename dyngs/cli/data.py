@@ -87,7 +87,7 @@ def _add_inspect(verbs: args.Commands) -> None:
 def _add_sfm(verbs: args.Commands) -> None:
     about = "Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`."
     parser = args.add_command(verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about)
-    images = "folder of photos, a video file, or folder of videos that ran at once"
+    images = "folder or .zip of photos, a video file, or folder of videos that ran at once"
     parser.add_argument("images", type=args.input_path, metavar="IMAGES", help=images)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
@@ -233,8 +233,10 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     from dyngs.capture.sfm import estimate_poses
     from dyngs.capture.sfm_work import SfmOptions
     from dyngs.capture.unposed import is_several_videos
+    from dyngs.data.read import capture_folder
 
-    limits, images, out = args.data_section(arguments.overrides), arguments.images, arguments.out
+    limits, out = args.data_section(arguments.overrides), arguments.out
+    images = capture_folder(arguments.images)
     several = is_several_videos(images)
     if several:
         _require_options_of_videos(arguments)

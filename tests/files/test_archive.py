@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
+import shutil
 import stat
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,6 +95,32 @@ def test_training_says_where_it_is_unpacked_and_keeps_the_archive(tmp_path: Path
     config = with_capture(load_config("static", [f"data.root={file}"]), say=said.append)
     assert config.data.root == file
     assert said == [f"{file} is unpacked in {next(cache_folder('captures').iterdir()) / 'scene'}"]
+
+
+def test_a_run_on_an_archive_is_evaluated_without_the_cache(tmp_path: Path, root: Path) -> None:
+    file = packed(tmp_path / "scene.zip", root)
+    words = ["train.steps=2", "init.num_random=50", "init.triangulate=0", "run.threads=1"]
+    assert main(["train", "static", f"data.root={file}", f"run.dir={tmp_path / 'run'}", *words]) == 0
+    shutil.rmtree(cache_folder("captures"))
+    assert main(["eval", str(tmp_path / "run")]) == 0
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["num_views"] == 1
+
+
+def test_photos_in_an_archive_are_posed(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[Path] = []
+
+    def pose(images: Path, out: Path, *_: object) -> SimpleNamespace:
+        found.append(images)
+        out.mkdir(parents=True)
+        return SimpleNamespace(summary=lambda: "posed")
+
+    monkeypatch.setattr("dyngs.capture.unposed.estimate_poses", pose)
+    monkeypatch.setattr("dyngs.capture.sfm.estimate_poses", pose)
+    file = packed(tmp_path / "photos.zip", root / "images", "holiday/")
+    config = with_capture(load_config("static", [f"data.root={file}"]), say=lambda _: None)
+    assert cache_folder("poses") in config.data.root.parents
+    assert main(["data", "sfm", str(file), str(tmp_path / "out")]) == 0
+    assert found == [unpacked(file) / "holiday"] * 2
 
 
 def test_inspect_reads_an_archive(tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]) -> None:

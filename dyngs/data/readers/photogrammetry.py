@@ -193,7 +193,7 @@ def read_realitycapture(root: Path) -> Capture:
             fields: _Fields = {}
             if image is not None:
                 width, height = read_header(image).size
-                values = {key: float(text) for key, text in row.items()}
+                values = {key: float(text) for key, text in row.items() if text}
                 fields = _realitycapture_camera(f"{path}, {name}", values, width, height)
             cameras.append((name, fields))
     return _capture(root, "realitycapture", path, photos, cameras)
@@ -222,7 +222,7 @@ REALITYCAPTURE_FORMAT = CaptureFormat(
 )
 
 
-_ODM_FILES = ("opensfm/reconstruction.json", "odm_report/shots.geojson")
+_ODM_FILES = ("opensfm/reconstruction.json", "reconstruction.json", "odm_report/shots.geojson")
 _ODM_LENSES = {
     "perspective": "OPENCV",
     "brown": "OPENCV",
@@ -233,7 +233,7 @@ _ODM_LENSES = {
 
 
 def read_odm(root: Path) -> Capture:
-    """Read ``opensfm/reconstruction.json`` of ODM or OpenSfM, else ``odm_report/shots.geojson`` and ``cameras.json``.
+    """Read ``reconstruction.json`` of ODM or OpenSfM, else ``odm_report/shots.geojson`` and ``cameras.json``.
 
     Rotations are axis-angle, from the world to OpenCV axes. In ``shots.geojson`` the translation is the camera's place.
     """

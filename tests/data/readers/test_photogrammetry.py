@@ -238,6 +238,11 @@ def test_odm_has_its_cameras_and_points(tmp_path: Path) -> None:
     np.testing.assert_array_equal(capture.points.rgb, [[i, 100, 200] for i in range(4)])
 
 
+def test_a_project_of_opensfm_is_read(tmp_path: Path) -> None:
+    (write_odm(tmp_path) / "opensfm" / "reconstruction.json").rename(tmp_path / "reconstruction.json")
+    assert_same_views(read(tmp_path), odm_pixel)
+
+
 def test_odm_without_a_reconstruction(tmp_path: Path) -> None:
     root = write_shots(tmp_path)
     assert_same_views(read(root), odm_pixel)
