@@ -26,7 +26,7 @@ from dyngs.config import Config, HumanModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
-from dyngs.data.read import read_capture, require_folder, require_images
+from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
 from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.start import FirstGaussians
@@ -455,6 +455,11 @@ def with_capture(
     data, model = config.data, config.model
     if model.is_network:
         return config  # its folder holds a capture per person
+    root = data.root
+    folder = capture_folder(root)
+    if folder != root:
+        say(f"{root} is unpacked in {folder}")
+        data = data.model_copy(update={"root": folder})
     if not model.is_posed:
         data = with_poses(data, needs_times=model.may_move, say=say, report=report)
     else:
@@ -464,4 +469,6 @@ def with_capture(
             data = with_found_person(data, say=say, report=report)
         if isinstance(model, HumanModel):
             data = with_fitted_body(data, model, only_if_needed=not model.fit, say=say, report=report)
+    if data.root == folder:  # the archive outlives the cache
+        data = data.model_copy(update={"root": root})
     return config.model_copy(update={"data": data})

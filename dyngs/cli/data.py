@@ -76,7 +76,8 @@ def _add_inspect(verbs: args.Commands) -> None:
         "Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos without poses: "
         "size, rate, length, sound, sharpness, motion, and what to run next.",
     )
-    parser.add_argument("path", type=args.input_path, metavar="PATH", help="capture folder, video, or folder of videos")
+    path = "capture (folder or .zip), video, or folder of videos"
+    parser.add_argument("path", type=args.input_path, metavar="PATH", help=path)
     args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
     parser.add_argument("--image", type=args.output_path, metavar="FILE", help="draw cameras and points to this image")
@@ -86,7 +87,7 @@ def _add_inspect(verbs: args.Commands) -> None:
 def _add_sfm(verbs: args.Commands) -> None:
     about = "Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`."
     parser = args.add_command(verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about)
-    images = "folder of photos, a video file, or folder of videos that ran at once"
+    images = "folder or .zip of photos, a video file, or folder of videos that ran at once"
     parser.add_argument("images", type=args.input_path, metavar="IMAGES", help=images)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
@@ -193,7 +194,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, or on videos without poses."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
     from dyngs.capture.unposed import is_videos
+    from dyngs.data.read import capture_folder
 
+    arguments.path = capture_folder(arguments.path)
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
     options = args.data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
@@ -228,8 +231,10 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     from dyngs.capture.sfm import estimate_poses
     from dyngs.capture.sfm_work import SfmOptions
     from dyngs.capture.unposed import is_several_videos
+    from dyngs.data.read import capture_folder
 
-    limits, images, out = args.data_section(arguments.overrides), arguments.images, arguments.out
+    limits, out = args.data_section(arguments.overrides), arguments.out
+    images = capture_folder(arguments.images)
     several = is_several_videos(images)
     if several:
         _require_options_of_videos(arguments)

@@ -15,10 +15,21 @@ from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits,
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
-from dyngs.data.readers import blender, camera_folders, colmap, nerfies, neuman, people_snapshot, zju_mocap
+from dyngs.data.readers import (
+    blender,
+    camera_folders,
+    colmap,
+    nerfies,
+    neuman,
+    people_snapshot,
+    phone_apps,
+    photogrammetry,
+    zju_mocap,
+)
 from dyngs.data.scene_space import normalise_capture
 from dyngs.data.smaller_images import with_smaller_images
 from dyngs.errors import DyngsError, NoCaptureError, reading
+from dyngs.files.archive import is_archive, unpacked
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
 
@@ -36,6 +47,11 @@ FORMATS: tuple[CaptureFormat, ...] = (
     blender.NERFSTUDIO_FORMAT,
     colmap.FORMAT,
     nerfies.FORMAT,
+    phone_apps.POLYCAM_FORMAT,
+    phone_apps.RECORD3D_FORMAT,
+    photogrammetry.METASHAPE_FORMAT,
+    photogrammetry.REALITYCAPTURE_FORMAT,
+    photogrammetry.ODM_FORMAT,
     camera_folders.FORMAT,
     camera_folders.LLFF_FORMAT,
 )
@@ -43,7 +59,7 @@ FORMATS: tuple[CaptureFormat, ...] = (
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
-    """Read the capture in a folder; images are not decoded, only their headers are read.
+    """Read the capture in a folder or a .zip; images are not decoded, only their headers are read.
 
     Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and ``pose_frames`` those
     of a person that become the split pose. Where the format names no test views, every ``test_every``-th image is
@@ -60,7 +76,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         image.cameras, image.rgb_premultiplied  # what to render from, and what should come out
 
     Args:
-        source: the folder, or a ``dyngs.config.DataConfig``: the folder as ``root``, and options such as ``frames``.
+        source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and options such as ``frames``.
         decode_videos: write the chosen frames of videos as image files, see ``images.frame_cache``; otherwise views
             may name files that do not exist yet.
 
@@ -68,8 +84,9 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names the file.
     """
     options = source if isinstance(source, DataConfig) else DataConfig(root=Path(source))
-    root = options.root
-    require_folder(root)
+    require_folder(options.root)
+    root = capture_folder(options.root)
+    options = options.model_copy(update={"root": root})
     with reading(root, "choose another folder or change its permissions"):
         found = [format for format in FORMATS if format.recognise(root)]
     chosen = _chosen_format(options, found)
@@ -87,16 +104,37 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
 
 
 def require_folder(root: Path) -> None:
-    """Check that the folder of a capture exists. Raises NoCaptureError."""
-    if not root.is_dir():
+    """Check that the folder or the archive of a capture exists. Raises NoCaptureError."""
+    if not root.is_dir() and not is_archive(root):
         problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
         raise NoCaptureError(f"{root}: {problem}")
 
 
 def is_capture(root: Path) -> bool:
-    """Whether a folder is recognised as a capture of any format."""
-    with reading(root, "choose another folder or change its permissions"):
-        return root.is_dir() and any(format.recognise(root) for format in FORMATS)
+    """Whether a folder, or an archive, is recognised as a capture of any format."""
+    folder = capture_folder(root)
+    return folder.is_dir() and _is_recognised(folder)
+
+
+def capture_folder(root: Path) -> Path:
+    """Return the folder of a capture: ``root``, or that of an archive, unpacked.
+
+    Many archives hold a single folder, in which the capture lies.
+    """
+    if not is_archive(root):
+        return root
+    folder: Path = unpacked(root)
+    while not _is_recognised(folder):
+        inner = list(folder.iterdir())
+        if len(inner) != 1 or not inner[0].is_dir():
+            break
+        folder = inner[0]
+    return folder
+
+
+def _is_recognised(folder: Path) -> bool:
+    with reading(folder, "choose another folder or change its permissions"):
+        return any(format.recognise(folder) for format in FORMATS)
 
 
 def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFormat:

@@ -108,7 +108,7 @@ def _is_alive(pid: int) -> bool:
     return True
 
 
-def cache_folder(kind: Literal["frames", "poses", "bodies", "people"]) -> Path:
+def cache_folder(kind: Literal["frames", "poses", "bodies", "people", "captures"]) -> Path:
     """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the user's cache."""
     chosen = os.environ.get(CACHE_VARIABLE, "")
     if chosen:

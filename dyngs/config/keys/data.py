@@ -14,7 +14,7 @@ from dyngs.section import Positive, Section
 class DataConfig(Section):
     """Where the images are and how they are read."""
 
-    root: Path = Field(description="folder of the capture")
+    root: Path = Field(description="folder or .zip of the capture")
     format: Literal[
         "auto",
         "body_json",
@@ -25,6 +25,11 @@ class DataConfig(Section):
         "nerfstudio",
         "colmap",
         "nerfies",
+        "polycam",
+        "record3d",
+        "metashape",
+        "realitycapture",
+        "odm",
         "llff",
         "camera_folders",
     ] = Field(default="auto", description="layout of the capture's files (docs/formats.md); auto: detected")

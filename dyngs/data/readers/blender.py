@@ -59,6 +59,12 @@ def _capture_of(root: Path, format: str, file: FrameFile, splits: Splits, warnin
     return Capture(root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines)
 
 
+def training_capture(root: Path, format: str, file: FrameFile, *more: str) -> Capture:
+    """Return the capture of a file whose frames are all for training, with ``more`` warnings."""
+    views, warnings = read_views(file)
+    return _capture_of(root, format, file, {"train": tuple(views.values())}, [*warnings, *more])
+
+
 FORMAT = CaptureFormat(
     "blender", "transforms_train.json", lambda root: (root / "transforms_train.json").is_file(), read_blender
 )

@@ -24,6 +24,7 @@ from dyngs.data.geometry import (
     rescale_warning,
 )
 from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
+from dyngs.data.readers.point_colours import point_colours
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import is_number, matrix_of, read_json_object
@@ -333,7 +334,7 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read the points of a ``.ply`` file (through trimesh), grey where it has no colours."""
+    """Read the points of a ``.ply`` file (through trimesh), with colours as ``point_colours`` finds them."""
     import trimesh
 
     if not path.is_file():
@@ -342,9 +343,8 @@ def read_points(path: Path) -> PointCloud:
     with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
         loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
         xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        own = isinstance(loaded, trimesh.PointCloud)
-        colours = loaded.colors if own else getattr(loaded.visual, "vertex_colors", None)
-        rgb = np.full((len(xyz), 3), 128, np.uint8)
-        if colours is not None and len(colours) == len(xyz):
-            rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
+        columns = loaded.metadata["_ply_raw"]["vertex"]["data"]
+        if isinstance(columns, np.ndarray):  # of a binary file
+            columns = {name: columns[name] for name in columns.dtype.names or ()}
+        rgb = point_colours(columns, len(xyz))
     return PointCloud(xyz, rgb)
