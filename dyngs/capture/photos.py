@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dyngs.data.images.images import END_MARKERS, ImageHeader, check_image, is_lying, read_header, read_image, read_mask
-from dyngs.data.images.video import VIDEO_SUFFIXES
+from dyngs.data.images.video import DECODER_VERSION, VIDEO_SUFFIXES
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside
 from dyngs.files.write import atomic_file, write_image
@@ -53,6 +53,7 @@ def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
             digest.update(os.fsencode(path.relative_to(source.parent)))
             digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
             if path.suffix.lower() in VIDEO_SUFFIXES:
+                digest.update(DECODER_VERSION)
                 with path.open("rb") as file:
                     digest.update(file.read(_SAMPLE_BYTES))
     return digest.hexdigest()[:16]
