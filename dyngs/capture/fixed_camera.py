@@ -103,7 +103,7 @@ def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
         planned = planned_frames(source)
         if not planned.paths:
             raise DyngsError(f"{source}: the video holds no image; copy it again")
-        return planned.paths, planned.info.fps or None, colour_notes({source.name: planned.info.colours})
+        return planned.paths, planned.info.fps or None, colour_notes([planned.info])
     images = _images_of(source)
     if not images:
         raise DyngsError(f"{source}: holds no images; give a folder of the frames of a clip, or a video")

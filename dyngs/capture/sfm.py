@@ -323,7 +323,7 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
         seconds = frame_seconds(video, len(measures))
         write_seconds(capture, {name: seconds[index] for index, name in names.items()})
         blurred = [names[index] for index in choice.blurred]
-        notes = [*colour_notes({video.name: probe_video(video).colours}), choice.summary()]
+        notes = [*colour_notes([probe_video(video)]), choice.summary()]
         fields = {"names": list(names.values()), "blurred": blurred, "notes": notes}
         write_text(done, json.dumps(fields))
     stored = {key: tuple(map(str, cast("list[object]", value))) for key, value in read_json_object(done).items()}

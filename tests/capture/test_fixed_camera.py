@@ -36,7 +36,7 @@ def test_hdr_is_tone_mapped_in_the_cache_with_a_note(tmp_path: Path) -> None:
         capture = read_fixed_camera(DataConfig(root=tmp_path / "a.mp4"))
         image = read_image(capture.splits["train"][1].image_path).numpy()
         assert np.sqrt(np.mean((image - 255 * patches()) ** 2)) < 2.5
-        assert "a.mp4: HLG is tone-mapped to SDR" in capture.warnings[1]
+        assert "1 video: HLG is tone-mapped to SDR" in capture.warnings[1]
 
 
 def test_frames_are_chosen_by_number_or_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

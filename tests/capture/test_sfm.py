@@ -90,7 +90,7 @@ def test_frames_of_hdr_video_are_tone_mapped_with_a_note(tmp_path: Path) -> None
     found = _frames_of(tmp_path / "a.mp4", tmp_path / "work" / "capture", SfmOptions(), report_nothing)
     image = read_image(tmp_path / "work" / "capture" / "images" / found.photos[0].name).numpy()
     assert np.sqrt(np.mean((image - 255 * patches()) ** 2)) < 2.5
-    assert any("a.mp4: HLG is tone-mapped to SDR" in note for note in found.notes)
+    assert any("1 video: HLG is tone-mapped to SDR" in note for note in found.notes)
 
 
 def test_real_photos_register_and_repeat_bytewise(tmp_path: Path) -> None:

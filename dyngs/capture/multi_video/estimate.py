@@ -78,7 +78,7 @@ def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgre
     if options.starts is not None:
         starts = checked_starts(options.starts, [film.name for film in films], "--start")
     small = small_images(films, report)
-    lines = colour_notes({film.path.name: film.info.colours for film in films})
+    lines = colour_notes(film.info for film in films)
     lines.append(_require_fixed(source, films, small))
     films, small, found, line = _posed(work, films, small, options, report)
     lines.append(line)

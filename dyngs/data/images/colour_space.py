@@ -42,18 +42,10 @@ class ColourTags:
         )
 
     @property
-    def is_empty(self) -> bool:
-        """Whether neither primaries nor transfer curve nor matrix are specified."""
-        return {self.primaries, self.transfer, self.matrix} == {UNSPECIFIED}
-
-    @property
-    def is_hdr(self) -> bool:
-        return self.transfer in (_PQ, _HLG)
-
-    @property
     def gamut(self) -> int:
         """The primaries; those of HDR are BT.2020 unless tagged."""
-        return BT2020 if self.is_hdr and self.primaries == UNSPECIFIED else self.primaries
+        is_hdr = self.transfer in (_PQ, _HLG)
+        return BT2020 if is_hdr and self.primaries == UNSPECIFIED else self.primaries
 
     @property
     def conversion(self) -> str:
@@ -103,17 +95,15 @@ def _linear_table(transfer: int, white: int) -> np.ndarray:
 def _hlg_linear(signal: np.ndarray) -> np.ndarray:
     """Scene light by the inverse OETF of HLG, BT.2100 table 5."""
     a = 0.17883277
-    b = 1 - 4 * a
-    c = 0.5 - a * np.log(4 * a)
+    b = 0.28466892
+    c = 0.55991073
     return np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
 
 
 def _pq_linear(signal: np.ndarray) -> np.ndarray:
     """Light in 10,000 cd/m2 by the EOTF of PQ, BT.2100 table 4."""
-    c2, c3 = 2413 / 128, 2392 / 128
-    c1 = c3 - c2 + 1
-    power = signal ** (1 / (2523 / 32))
-    return (np.maximum(power - c1, 0.0) / (c2 - c3 * power)) ** (1 / (2610 / 16384))
+    power = signal ** (1 / 78.84375)
+    return (np.maximum(power - 0.8359375, 0.0) / (18.8515625 - 18.6875 * power)) ** (1 / 0.1593017578125)
 
 
 @lru_cache

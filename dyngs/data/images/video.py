@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -108,19 +109,16 @@ def probe_video(path: Path) -> VideoInfo:
     if count > MAX_FRAMES:
         raise DyngsError(f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up")
     note = tags.conversion
-    if tags.is_empty and _matrix_of(first, tags) == BT709_MATRIX:
+    is_untagged = {tags.primaries, tags.transfer, tags.matrix} == {UNSPECIFIED}
+    if is_untagged and _matrix_of(first, tags) == BT709_MATRIX:
         note = "HD without colour tags is read as BT.709"
     return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0, note)
 
 
-def colour_notes(colours: Mapping[str, str]) -> list[str]:
-    """Return a line for each ``VideoInfo.colours`` of videos by name, with the first of those videos."""
-    notes = []
-    for note in sorted(set(colours.values()) - {""}):
-        names = [name for name, own in colours.items() if own == note]
-        others = f" and {counted(len(names) - 1, 'other video')}" if len(names) > 1 else ""
-        notes.append(f"{names[0]}{others}: {note}")
-    return notes
+def colour_notes(videos: Iterable[VideoInfo]) -> list[str]:
+    """Return a line for each of the different ``VideoInfo.colours`` of the videos of a capture."""
+    counts = Counter(video.colours for video in videos if video.colours)
+    return [f"{counted(count, 'video')}: {note}" for note, count in counts.items()]
 
 
 def frame_seconds(path: Path, num_frames: int) -> list[float]:

@@ -80,7 +80,7 @@ def sequence_views(
     span = max(numbers[-1] - numbers[0], 1)
     views: dict[str, tuple[View, ...]] = {}
     warnings = _rate_warning(cameras)
-    warnings += colour_notes({x.video.source.name: x.video.info.colours for x in cameras if x.video is not None})
+    warnings += colour_notes(camera.video.info for camera in cameras if camera.video is not None)
     for index, camera in enumerate(cameras):
         own = dict(calibrations[camera.name])
         where = f"{path}, camera {camera.name}"

@@ -273,6 +273,6 @@ def test_a_matrix_that_cannot_be_converted_is_refused(tmp_path: Path) -> None:
         probe_video(path)
 
 
-def test_colour_notes_name_the_first_video_of_each_kind() -> None:
-    notes = colour_notes({"a.mp4": "PQ", "b.mp4": "", "c.mp4": "HLG", "d.mp4": "PQ", "e.mp4": "PQ"})
-    assert notes == ["c.mp4: HLG", "a.mp4 and 2 other videos: PQ"]
+def test_colour_notes_count_the_videos_of_each_kind() -> None:
+    videos = [VideoInfo(4, 4, 1, 30.0, colours) for colours in ("PQ", "", "HLG", "PQ", "PQ")]
+    assert colour_notes(videos) == ["3 videos: PQ", "1 video: HLG"]
