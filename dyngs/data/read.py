@@ -167,6 +167,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
     lacking = _missing(splits)
+    has_alpha, layers = _first_image(splits["train"])
     points, more = _finite_points(capture.points)
     warnings = [*capture.warnings, *_check_names(capture.root, splits)]
     capture = replace(
@@ -175,8 +176,8 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         points=points,
         tracks_path=tracks,
         points_file=capture.points_file if points is not None else None,
-        has_alpha=_first_has_alpha(splits["train"]),
-        warnings=(*warnings, *lacking, *notes, *copies, *more, *absent),
+        has_alpha=has_alpha,
+        warnings=(*warnings, *lacking, *layers, *notes, *copies, *more, *absent),
     )
     return normalise_capture(capture if options.body is None else with_fitted_body(capture, options.body))
 
@@ -301,15 +302,17 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
     return [f"{len(leaked)} test images are also training images, first {leaked[0]}"] if leaked else []
 
 
-def _first_has_alpha(views: tuple[View, ...]) -> bool:
+def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
+    """Return whether the first image that can be read has alpha, and a line on the layer that is read of an EXR."""
     for view in views:
         if view.silhouette is not None:
-            return True
+            return True, []
         try:
-            return read_header(view.image_path).has_alpha
+            header = read_header(view.image_path)
         except DyngsError:
             continue
-    return False
+        return header.has_alpha, [f"the layer {header.layer} of EXR images is read"] if header.layer else []
+    return False, []
 
 
 def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[str]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from tiny_captures import (
@@ -14,6 +15,7 @@ from tiny_captures import (
     write_cameras_json,
     write_colmap,
     write_folder,
+    write_frames,
     write_image,
     write_nerfies,
     write_poses_bounds,
@@ -176,6 +178,21 @@ def test_without_any_image_there_is_nothing_to_train_on(nerfstudio_root: Path) -
     edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(w=12, h=8))
     with pytest.raises(DyngsError, match="has no training views"):
         read(nerfstudio_root, skip_missing=True)
+
+
+def test_the_layer_that_is_read_of_exr_images_is_named(tmp_path: Path) -> None:
+    for i in range(4):
+        spec = oiio.ImageSpec(8, 6, 7, "half")
+        spec.channelnames = [*(f"N.{c}" for c in "RGB"), *(f"ViewLayer.Combined.{c}" for c in "RGBA")]
+        output = oiio.ImageOutput.create(str(tmp_path / f"{i}.exr"))
+        assert output.open(str(tmp_path / f"{i}.exr"), spec)
+        assert output.write_image(np.full((6, 8, 7), 0.2 * i, np.float32))
+        output.close()
+    fields = {"fl_x": 8.0, "w": 8, "h": 6}
+    write_frames(tmp_path / "transforms.json", [f"{i}.exr" for i in range(4)], fields)
+    capture = read(tmp_path)
+    assert "the layer ViewLayer.Combined of EXR images is read" in capture.warnings
+    assert capture.has_alpha
 
 
 def test_two_images_of_one_name(nerfstudio_root: Path) -> None:

@@ -25,7 +25,7 @@ from dyngs.capture.multi_video.films import (
 from dyngs.capture.multi_video.starts import Watcher, found_starts, given_starts, motion_of
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.images.video import read_numbered_frames, videos_in
+from dyngs.data.images.video import colour_notes, read_numbered_frames, videos_in
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import Taken, taken_frames, write_seconds
@@ -78,7 +78,8 @@ def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgre
     if options.starts is not None:
         starts = checked_starts(options.starts, [film.name for film in films], "--start")
     small = small_images(films, report)
-    lines = [_require_fixed(source, films, small)]
+    lines = colour_notes(film.info for film in films)
+    lines.append(_require_fixed(source, films, small))
     films, small, found, line = _posed(work, films, small, options, report)
     lines.append(line)
     watchers = [_watcher(film, grey, found.model) for film, grey in zip(films, small, strict=True)]
