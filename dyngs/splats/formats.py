@@ -72,6 +72,10 @@ FORMATS = (
 SPZ_4 = Format("spz", (".spz",), "y", 4, True, ("spz", "read_spz", "write_spz_4"), (-10.0, 5.9375))
 GLB_OF_SPZ = Format("glb", (".glb",), "y", 3, True, ("gltf", "read_gltf", "write_compressed"), (-10.0, 5.9375))
 """Other ways to write files of a suffix."""
+SOG_META, SOG_INDEX = "meta.json", "lod-meta.json"
+"""Files of a .sog as a folder, and of one in levels of detail."""
+CHECKPOINT = Format("checkpoint", (".ckpt", ".pt"), "z", 4, False, ("checkpoint", "read_checkpoint", ""))
+"""Read, never written."""
 SYSTEM_OF_UP = {"y": 4, "-y": 6, "z": 12, "-z": 14}
 """Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot state others."""
 _MOST_LOST = 0.01  # fraction of the Gaussians that may be of a size that a format does not hold, without a note
@@ -104,6 +108,33 @@ def known_format(path: Path) -> Format | None:
     return None
 
 
+def format_to_read(path: Path) -> Format | None:
+    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if it is none.
+
+    A run is none, whatever lies in its folder. Raises DyngsError as of ``sog_meta``.
+    """
+    if path.is_dir():
+        is_run = (path / "config.yaml").is_file()
+        return None if is_run or sog_meta(path) is None else format_named("sog")
+    if sog_meta(path) is not None:
+        return format_named("sog")
+    return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
+
+
+def sog_meta(path: Path) -> Path | None:
+    """Return the ``meta.json`` that is, or lies in, ``path``; None: it is something else.
+
+    Raises DyngsError: it is the index of a .sog in levels of detail.
+    """
+    if path.name == SOG_INDEX or (path / SOG_INDEX).is_file():
+        raise DyngsError(
+            f"{path}: is a .sog in levels of detail; give the {SOG_META} of one of its folders, such as 0_0"
+        )
+    if path.name == SOG_META:
+        return path
+    return path / SOG_META if (path / SOG_META).is_file() else None
+
+
 def format_named(name: str) -> Format:
     """Return the format called ``name``. Raises DyngsError if there is none."""
     for candidate in FORMATS:
@@ -126,10 +157,11 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     file.
     """
     path = Path(path)
-    own = format_of(path)
+    own = format_to_read(path) or format_of(path)
     if not path.exists():
         raise DyngsError(f"{path}: no such file")
     require_regular(path)
+    path = sog_meta(path) or path
     with reading(path):
         splat = own.reader(path)
         if splat.up is None:
