@@ -20,15 +20,20 @@ LARGEST = 1e30
 
 def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
     """Read the JSON object in ``path``, UTF-8, 16 or 32. ``what``: the error for anything else."""
-    with reading(path, "it must be a JSON file; copy or export it again"):
-        try:
-            fields = json.loads(read_limited(inside(path)))
-        except json.JSONDecodeError as error:
-            where = f"{path}, line {error.lineno} column {error.colno}"
-            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
+    fields = read_json(path)
     if not isinstance(fields, dict):
         raise DyngsError(f"{path}: {what}")
     return fields
+
+
+def read_json(path: Path) -> object:
+    """Read the JSON in ``path``: UTF-8, 16 or 32."""
+    with reading(path, "it must be a JSON file; copy or export it again"):
+        try:
+            return json.loads(read_limited(inside(path)))
+        except json.JSONDecodeError as error:
+            where = f"{path}, line {error.lineno} column {error.colno}"
+            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
 
 
 def read_text(path: Path) -> str:

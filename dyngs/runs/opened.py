@@ -29,7 +29,7 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.splats.formats import all_suffixes, known_format, read_splats
+from dyngs.splats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.splats.rotation import AXES, inverse
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import Nonfinite, drawing_options
@@ -308,7 +308,7 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    if path.is_dir() or (path.name == SCENE_FILE and path.exists()):
+    if (path.is_dir() and format_to_read(path) is None) or (path.name == SCENE_FILE and path.exists()):
         return open_run(path if path.is_dir() else path.parent, data_root=data_root)
     if not path.exists():
         raise DyngsError(f"{path}: no such file or folder; give what `dyngs train` or `dyngs export` wrote")
@@ -316,8 +316,8 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
         raise DyngsError(f"{path}: a file, not a run, so it has no capture; leave out data.root")
     if path.suffix.lower() == AVATAR_SUFFIX:
         return Opened(**vars(read_avatar(path)), name=path.name, path=path)
-    if known_format(path) is None:
-        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
+    if format_to_read(path) is None:
+        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()}, .ckpt, .pt)"
         other = command_for(path)
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path, nonfinite=nonfinite)
