@@ -31,6 +31,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture, require_folder
 from dyngs.errors import DyngsError, as_word, counted
 from dyngs.evaluate.report import evaluate_run
+from dyngs.files.lock import Held, writing
 from dyngs.gaussians.start import FirstGaussians
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.kinds import build
@@ -66,7 +67,6 @@ from dyngs.runs.folder import (
     was_only_begun,
 )
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.lock import Held, writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
 from dyngs.training.clock import SaveTimer, Stopwatch
@@ -268,7 +268,7 @@ class _Run:
             if gaussians is not None:
                 loop.subscribe(PruneStage(loop, lambda: gaussians.trainer))
             try:
-                loop.run(lambda: interrupts.requested)
+                loop.run(lambda: interrupts.requested or self._leader.processes.is_stop_requested())
             finally:
                 if isinstance(loop.trainer, Trainer):
                     loop.trainer.images.rest()
