@@ -116,7 +116,7 @@ MUTATIONS = (
     ("export/html/numbers.py", "np.roll(quats, 1, axis=1)", "np.roll(quats, 2, axis=1)", "export/html/test_numbers.py export/html/test_page.py"),
     ("runs/checkpoint.py", "[:-KEEP_CHECKPOINTS]", "[KEEP_CHECKPOINTS:]", "runs/test_checkpoint.py"),
     ("runs/checkpoint.py", "if int(s) < step}", "if int(s) != step}", "runs/test_checkpoint.py"),
-    ("runs/lock.py", "fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "runs/test_lock.py"),
+    ("files/lock.py", "fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "files/test_lock.py"),
     ("runs/folder.py", "if not same or checkpoint_paths(folder)", "if not same", "runs/test_folder.py"),
     ("runs/folder.py", "RunConfig(seed=config.run.seed)", "RunConfig()", "runs/test_folder.py"),
     ("files/limits.py", "amount > most and amount > allowed(most)", "amount > most", "files/test_limits.py"),

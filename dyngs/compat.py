@@ -14,7 +14,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE
 from dyngs.errors import DyngsError
-from dyngs.gaussians.rendering import check_focal_lengths, check_poses
+from dyngs.models.renderable import check_focal_lengths, check_poses
 from dyngs.ops.checks import LARGEST_COUNT, check_choice, check_count, check_finite, check_near_and_far, check_number
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project

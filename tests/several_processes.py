@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import signal
 import socket
 import sys
 from collections.abc import Callable
@@ -70,11 +71,17 @@ def _begin(rank: int, count: int, port: int, folder: Path, target: Callable[...,
         except DyngsError as error:
             print(f"dyngs: error: {error}")
             code = 2
+        except KeyboardInterrupt as error:
+            print(f"dyngs: interrupted: {error}")
+            code = 130
     sys.exit(code)
 
 
 def trained(configs: list[Config], fails: str = "") -> int:
-    """Train all of ``configs``; ``fails``: "step" in the last process, or "weights" of the last process go astray."""
+    """Train all of ``configs``.
+
+    ``fails``: "step" in the last process, "weights" of the last process go astray, or it dies or is told to end.
+    """
     last = int(os.environ["RANK"]) == int(os.environ["WORLD_SIZE"]) - 1
     if fails == "step" and last:
         _before_step(4, _refuse)
@@ -82,6 +89,8 @@ def trained(configs: list[Config], fails: str = "") -> int:
         _before_step(4, _nudge)
     if fails == "death" and last:
         _before_step(4, lambda _: os._exit(9))
+    if fails == "SIGTERM" and last:
+        _before_step(4, lambda _: signal.raise_signal(signal.SIGTERM))
 
     def lead(processes: Processes) -> int:
         for config in configs:

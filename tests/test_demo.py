@@ -10,7 +10,7 @@ import pytest
 
 from dyngs.cli import main
 from dyngs.demo import DemoOptions, DemoResult, claimed_folder, demo_config, run_demo
-from dyngs.runs.lock import LOCK_NAME
+from dyngs.files.lock import LOCK_NAME
 
 TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 

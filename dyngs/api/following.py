@@ -25,7 +25,7 @@ from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.loop import Interrupts, Trainable
-from dyngs.training.processes import Processes
+from dyngs.training.processes import EXIT_INTERRUPTED, Processes
 from dyngs.training.trainer import Trainer
 
 
@@ -70,8 +70,7 @@ def together(lead: Callable[[Processes], int]) -> int:
     """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``, the others follow."""
     with Processes.of_torchrun() as processes:
         if not processes.is_first:
-            follow(processes)
-            return 0
+            return EXIT_INTERRUPTED if follow(processes) else 0
         try:
             code = lead(processes)
         except KeyboardInterrupt as stopped:
@@ -82,21 +81,25 @@ def together(lead: Callable[[Processes], int]) -> int:
     return code
 
 
-def follow(processes: Processes) -> None:
-    """Do what the first process says until it says that all is done; nothing is printed."""
+def follow(processes: Processes) -> bool:
+    """Do what the first process says until it says that all is done; nothing is printed.
+
+    Returns whether a signal told this process to stop, which the first process then does after the next step.
+    """
     keep_freed_memory()
     with (
         open(os.devnull, "w", encoding="utf-8") as nowhere,
         redirect_stdout(nowhere),
         redirect_stderr(nowhere),
-        Interrupts(),  # the first process hears them, too, and says when to end
+        Interrupts() as interrupts,
     ):
         order, payload = _heard(processes)
         while order is Order.BUILD:
-            order, payload = _follow_run(processes, Config.model_validate(json.loads(payload)))
+            order, payload = _follow_run(processes, Config.model_validate(json.loads(payload)), interrupts)
+    return interrupts.requested
 
 
-def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
+def _follow_run(processes: Processes, config: Config, interrupts: Interrupts) -> tuple[Order, bytes]:
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
         trainer = build(config, restored=True)
@@ -105,6 +108,8 @@ def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
         trainer.processes = processes
         while True:
             order, payload = _heard(processes)
+            if interrupts.requested:
+                processes.request_stop()
             match order:
                 case Order.RESTORE:
                     trainer.restore(_unpacked(payload))

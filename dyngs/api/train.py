@@ -29,6 +29,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
 from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
+from dyngs.files.lock import Held, writing
 from dyngs.gaussians.start import FirstGaussians
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.kinds import build
@@ -64,7 +65,6 @@ from dyngs.runs.folder import (
     was_only_begun,
 )
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.lock import Held, writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
 from dyngs.training.clock import SaveTimer, Stopwatch
@@ -266,7 +266,7 @@ class _Run:
             if gaussians is not None:
                 loop.subscribe(PruneStage(loop, lambda: gaussians.trainer))
             try:
-                loop.run(lambda: interrupts.requested)
+                loop.run(lambda: interrupts.requested or self._leader.processes.is_stop_requested())
             finally:
                 if isinstance(loop.trainer, Trainer):
                     loop.trainer.images.rest()

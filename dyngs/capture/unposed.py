@@ -16,6 +16,7 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
 from dyngs.errors import DyngsError, as_word, counted, reading, show
+from dyngs.files.lock import make_once
 from dyngs.files.outputs import note_sources
 from dyngs.files.temporary import cache_folder
 from dyngs.files.wrong_place import command_for
@@ -60,15 +61,16 @@ def with_poses(
     masks = beside if source != data.root and beside.is_dir() else None
     digest = digest_of(source, files) + ("" if masks is None else digest_of(masks))
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
-    if folder.is_dir():
-        say(f"{source} has no poses; those of before are in {folder}")
-    else:
+
+    def estimate() -> None:
         say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
         options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         if videos:
             say(poses_of_videos(source, folder, options, report))
         else:
             say(estimate_poses(source, folder, options, report).summary())
+
+    make_once(folder, estimate, say, f"{source} has no poses; those of before are in {folder}")
     note_sources(folder, data.root)
     return data.model_copy(update={"root": folder})
 

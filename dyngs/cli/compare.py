@@ -86,8 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.compare.bench import compare, is_finished, require_same_comparison
     from dyngs.compare.plan import planned
     from dyngs.compare.report import about, table_cells, table_rows, write_report
+    from dyngs.files.lock import writing
     from dyngs.runs.inputs import inputs_of
-    from dyngs.runs.lock import writing
     from dyngs.study.plots import MISSING, can_plot
 
     bench = _bench(arguments)

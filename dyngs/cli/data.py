@@ -150,7 +150,7 @@ def _add_motion(verbs: args.Commands) -> None:
         "file", type=args.input_path, metavar="FILE", help="AMASS, SMPL-X .npz, .bvh, .glb, .gltf, .vrma"
     )
     parser.add_argument("out", type=args.output_path, metavar="OUT.npz", help="a new file")
-    parser.add_argument("--fps", type=float, metavar="F", help="resample to F frames per second (default: as in FILE)")
+    parser.add_argument("--fps", type=float, metavar="F", help="resample to this rate; that of an .npz without one")
     parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")
     parser.add_argument("--clip", metavar="NAME", help="name of the animation if a glTF file has several")
     parser.add_argument("--body", type=args.input_path, metavar="BODY", help="body template (default: that of dyngs)")
@@ -345,6 +345,7 @@ def run_motion(arguments: argparse.Namespace) -> int:
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
     write_amass(motion, out)
     print(f"written: {out}\n         {_summary(motion)}")
+    args.print_notes(motion.notes)
     return 0
 
 

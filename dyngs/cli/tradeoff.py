@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure, print and write the tables, and choose a run; the folder is locked against other commands."""
     from contextlib import nullcontext
 
-    from dyngs.runs.lock import writing
+    from dyngs.files.lock import writing
 
     target = Path(arguments.target)
     out: Path | None = arguments.out or (target / "tradeoff" if target.is_dir() else None)

@@ -13,13 +13,12 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.fields.field import Field
 from dyngs.fields.space import rays_of
-from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
+from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep, composited, fixed_cameras
 from dyngs.ops.rays import Space
 from dyngs.state import Role, State, StateTensor, prefixed
 from dyngs.tensor_checks import require_moments, require_tensor
 
 CHUNK = 1 << 13  # Rays drawn together
-_TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -69,17 +68,14 @@ class FieldScene(Renderable):
         options = self.options if options is None else options
         behind = self.background if background is None else background
         now = time if isinstance(time, TimeStep) else self.time_step(time)
+        cameras = fixed_cameras(cameras, behind, next(iter(self.field.parameters.values())))
         views = [self._view(cameras.select(i), now.time or 0.0, options) for i in range(len(cameras))]
         rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
-        if behind is not None:
-            rgb = rgb + through[..., None] * behind.to(rgb)
-        if options.depth == "expected":
-            depth = depth / (1 - through).clamp_min(_TINY)
-        return Rendering(rgb, through, None if options.depth == "none" else depth)
+        return composited(rgb, through, depth, options, behind)
 
     def _view(self, camera: Cameras, time: float, options: DrawOptions) -> tuple[Tensor, Tensor, Tensor]:
         """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z (H, W)."""
-        rays, z = rays_of(camera.to(device=self.device))
+        rays, z = rays_of(camera)
         parts = []
         for begin in range(0, len(rays), CHUNK):
             chosen = slice(begin, begin + CHUNK)

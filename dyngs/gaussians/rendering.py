@@ -4,26 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.models.renderable import DrawOptions, Rendering
+from dyngs.models.renderable import DrawOptions, Rendering, check_background, check_views
 from dyngs.ops.checks import check_choice, check_count, check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import Blended, BlendOptions, Tally, blend_and_tally, rasterize, tally
-
-FOCAL_LENGTHS = (1e-6, 1e12)  # Smallest and largest allowed, px; beyond them gradients leave the range of float32
-ROTATION_TOLERANCE = 0.01
-"""Largest entry of ``R^T R - I`` of a pose that is drawn; half precision rounds by a tenth of that."""
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
 """Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour models other than
@@ -65,8 +59,8 @@ class RenderOptions(DrawOptions):
     nonfinite: Literal["error", "skip", "trust"] = "error"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_choice("mode", self.mode, [mode.value for mode in RasterizeMode])
-        check_choice("depth", self.depth, ("none", "accumulated", "expected"))
         check_choice("nonfinite", self.nonfinite, ("error", "skip", "trust"))
         if self.sh_degree is not None:
             check_count("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
@@ -259,56 +253,15 @@ def _checked(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
 ) -> tuple[Gaussians, Cameras]:
     """Return both in one dtype, with NaN and infinity dealt with as ``options`` say."""
-    if background is not None and tuple(background.shape) not in ((3,), (len(cameras), 3)):
-        raise DyngsError(f"background must be (3,) or ({len(cameras)}, 3), got {tuple(background.shape)}")
+    check_background(background, len(cameras))
     if cameras.cam_from_world.device != gaussians.means.device:
         devices = f"the cameras are on {cameras.cam_from_world.device}, the Gaussians on {gaussians.means.device}"
         raise DyngsError(f"{devices}; move one of them with .to(device=...)")
     gaussians, cameras = _one_dtype(gaussians, cameras)
     if options.nonfinite != "trust":
-        _check_views(cameras, background)
+        check_views(cameras, background)
         gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
     return gaussians, cameras
-
-
-def _check_views(cameras: Cameras, background: Tensor | None) -> None:
-    check_poses(cameras.cam_from_world)
-    few = {"intrinsics": cameras.intrinsics.detach().cpu()}
-    if background is not None:
-        few["background"] = background.detach().cpu().to(few["intrinsics"].dtype)
-    check_finite(few)
-    check_focal_lengths(few["intrinsics"])
-
-
-def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
-    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``."""
-    focal, (shortest, longest) = _numbers(intrinsics)[:, (0, 1), (0, 1)], FOCAL_LENGTHS
-    bad = np.flatnonzero(~((focal >= shortest) & (focal <= longest)).all(1))
-    if len(bad):
-        fx, fy = focal[bad[0]]
-        wanted = f"{name}: focal lengths must be positive, from {shortest:g} to {longest:g} px"
-        raise DyngsError(f"{wanted}, but camera {bad[0]} has {fx:g} and {fy:g}")
-
-
-def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
-    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``."""
-    poses: NDArray[np.float64] = _numbers(cam_from_world).astype(np.float64)
-    rotations = poses[:, :3, :3]
-    with np.errstate(all="ignore"):  # NaN and infinity are what is looked for
-        error: NDArray[np.float64] = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max((1, 2))
-        is_mirrored = np.linalg.det(rotations) < 0
-    bad = np.flatnonzero(~((error <= ROTATION_TOLERANCE) & ~is_mirrored & np.isfinite(poses).all((1, 2))))
-    if not len(bad):
-        return
-    check_finite({name: cam_from_world})
-    row = bad[0]
-    fault = "is mirrored" if is_mirrored[row] else f"differs from a rotation by {error[row]:.2g} (R^T R - I)"
-    raise DyngsError(f"{name}: the matrix of camera {row} {fault}; only the position may be scaled: export it again")
-
-
-def _numbers(x: Tensor) -> NDArray[Any]:
-    """Return a few numbers for NumPy, whose operators take a seventh of the time of torch's on the CPU."""
-    return x.detach().cpu().numpy()
 
 
 def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:

@@ -22,13 +22,12 @@ from dyngs.human_fields.people import MULTIPLE, Body, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
-from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
+from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep, composited, fixed_cameras
 from dyngs.models.views import evaluation_background
 from dyngs.state import Role, State, prefixed, with_role
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 SECTIONS: dict[str, type[FieldPredictorModel]] = {"keypoint_nerf": KeypointNerfModel, "eg_human_nerf": EgHumanNerfModel}
-_TINY = 1e-9
 _MOST_VIEWS, _MOST_PIXELS = 1024, 1 << 26  # Of stored images
 
 
@@ -84,7 +83,6 @@ class PredictedField(Renderable):
         tensors["numbers"] = torch.tensor(numbers, dtype=torch.float64, device="cpu")
         return prefixed("field", with_role(tensors, Role.SHARED))
 
-    @torch.no_grad()
     def render(
         self,
         cameras: Cameras,
@@ -94,18 +92,15 @@ class PredictedField(Renderable):
         background: Tensor | None = None,
     ) -> Rendering:
         options = self.options if options is None else options
+        behind = self.background if background is None else background
+        cameras = fixed_cameras(cameras, behind, self.sources.rgba)
         views = [self._view(cameras.select(i)) for i in range(len(cameras))]
         rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
-        behind = self.background if background is None else background
-        if behind is not None:
-            rgb = rgb + through[..., None] * behind.to(rgb)
-        if options.depth == "expected":
-            depth = depth / (1 - through).clamp_min(_TINY)
-        return Rendering(rgb, through, None if options.depth == "none" else depth)
+        return composited(rgb, through, depth, options, behind)
 
+    @torch.no_grad()
     def _view(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
         """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z (H, W)."""
-        camera = camera.to(device=self.device)
         shape, like = (camera.height, camera.width), self.sources.rgba
         colour, depth, through = like.new_zeros(*shape, 3), like.new_zeros(shape), like.new_ones(shape)
         part = around_in(metric(camera, self.scale), self._around)

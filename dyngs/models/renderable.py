@@ -9,11 +9,14 @@ from copy import copy
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
+from dyngs.ops.checks import check_choice, check_finite, check_number
 from dyngs.state import Role, State, fields_moved_to
 
 R = TypeVar("R", bound="Renderable")
@@ -32,13 +35,23 @@ def near_plane(extent: float) -> float:
     return NEAR_FRACTION * extent
 
 
+FOCAL_LENGTHS = (1e-6, 1e12)  # Smallest and largest allowed, px; beyond them gradients leave the range of float32
+_TINY = 1e-9
+ROTATION_TOLERANCE = 0.01
+"""Largest entry of ``R^T R - I`` of a pose that is drawn; half precision rounds by a tenth of that."""
+
+
 @dataclass(frozen=True)
 class DrawOptions:
-    """How any scene is drawn."""
+    """How any scene is drawn. Raises DyngsError: a number beyond its range, or a choice that does not exist."""
 
     near: float = 0.2  # what is nearer to the camera is not drawn, in the unit of the scene (3DGS: 0.2)
     # none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha)
     depth: Literal["none", "accumulated", "expected"] = "none"
+
+    def __post_init__(self) -> None:
+        check_number("near", self.near, 0)
+        check_choice("depth", self.depth, ("none", "accumulated", "expected"))
 
 
 @dataclass(frozen=True)
@@ -138,6 +151,9 @@ class Renderable(ABC):
         Args:
             cameras: V cameras, on any device.
             time: in [0, 1], or what ``time_step`` returned; None is the first.
+
+        Raises:
+            DyngsError: as ``check_views``; or gradients by cameras, of a scene that is not made of Gaussians.
         """
 
     def time_step(self, time: float | None) -> TimeStep:
@@ -161,6 +177,90 @@ class Renderable(ABC):
     def to(self: R, device: torch.device | str) -> R:
         """Return it with its tensors on ``device``."""
         return fields_moved_to(self, device)
+
+
+def single_views(cameras: Cameras, background: Tensor | None) -> list[tuple[Cameras, Tensor | None]]:
+    """Return each camera with its own background. Raises DyngsError: as ``check_views``."""
+    check_views(cameras, background)
+    each = [background] * len(cameras) if background is None or background.ndim == 1 else list(background)
+    return [(cameras.select(i), behind) for i, behind in enumerate(each)]
+
+
+def check_views(cameras: Cameras, background: Tensor | None) -> None:
+    """Check what any scene is rendered from, and before which colour.
+
+    Raises DyngsError: no cameras, poses that are not rigid, focal lengths that are not positive, NaN or infinity, or a
+    background of another shape than (3,) or (V, 3).
+    """
+    if not len(cameras):
+        raise DyngsError("cameras: there is none to render from; give at least one")
+    check_background(background, len(cameras))
+    check_poses(cameras.cam_from_world)
+    few = {"intrinsics": cameras.intrinsics.detach().cpu()}
+    if background is not None:
+        few["background"] = background.detach().cpu().to(few["intrinsics"].dtype)
+    check_finite(few)
+    check_focal_lengths(few["intrinsics"])
+
+
+def fixed_cameras(cameras: Cameras, background: Tensor | None, like: Tensor) -> Cameras:
+    """Return the cameras of a scene without gradients by them, on the device and in the dtype of ``like``.
+
+    Raises DyngsError: as ``check_views``; or the poses or intrinsics require gradients.
+    """
+    cameras = cameras.to(device=like.device, dtype=like.dtype)
+    check_views(cameras, background)
+    if torch.is_grad_enabled() and (cameras.cam_from_world.requires_grad or cameras.intrinsics.requires_grad):
+        raise DyngsError("cameras: only scenes of Gaussians have gradients by poses and intrinsics; detach these")
+    return cameras
+
+
+def composited(
+    rgb: Tensor, transmittance: Tensor, depth: Tensor | None, options: DrawOptions, background: Tensor | None
+) -> Rendering:
+    """Return images (V, H, W, 3) before a background, of colours before black and the sums of weight times depth."""
+    if background is not None:
+        rgb = rgb + transmittance[..., None] * background.to(rgb).view(-1, 1, 1, 3)
+    if depth is not None and options.depth == "expected":
+        depth = depth / (1 - transmittance).clamp_min(_TINY)
+    return Rendering(rgb, transmittance, None if options.depth == "none" else depth)
+
+
+def check_background(background: Tensor | None, views: int) -> None:
+    """Check the shape of a background: (3,) or (V, 3)."""
+    if background is not None and tuple(background.shape) not in ((3,), (views, 3)):
+        raise DyngsError(f"background must be (3,) or ({views}, 3), got {tuple(background.shape)}")
+
+
+def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
+    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``."""
+    focal, (shortest, longest) = _numbers(intrinsics)[:, (0, 1), (0, 1)], FOCAL_LENGTHS
+    bad = np.flatnonzero(~((focal >= shortest) & (focal <= longest)).all(1))
+    if len(bad):
+        fx, fy = focal[bad[0]]
+        wanted = f"{name}: focal lengths must be positive, from {shortest:g} to {longest:g} px"
+        raise DyngsError(f"{wanted}, but camera {bad[0]} has {fx:g} and {fy:g}")
+
+
+def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
+    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``."""
+    poses: NDArray[np.float64] = _numbers(cam_from_world).astype(np.float64)
+    rotations = poses[:, :3, :3]
+    with np.errstate(all="ignore"):  # NaN and infinity are what is looked for
+        error: NDArray[np.float64] = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max((1, 2))
+        is_mirrored = np.linalg.det(rotations) < 0
+    bad = np.flatnonzero(~((error <= ROTATION_TOLERANCE) & ~is_mirrored & np.isfinite(poses).all((1, 2))))
+    if not len(bad):
+        return
+    check_finite({name: cam_from_world})
+    row = bad[0]
+    fault = "is mirrored" if is_mirrored[row] else f"differs from a rotation by {error[row]:.2g} (R^T R - I)"
+    raise DyngsError(f"{name}: the matrix of camera {row} {fault}; only the position may be scaled: export it again")
+
+
+def _numbers(x: Tensor) -> NDArray[Any]:
+    """Return a few numbers for NumPy, whose operators take a seventh of the time of torch's on the CPU."""
+    return x.detach().cpu().numpy()
 
 
 def clamped_time(time: float | None) -> float:

@@ -11,12 +11,12 @@ from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, as_word
+from dyngs.files.lock import LOCK_NAME, writing
 from dyngs.files.outputs import new_folder
 from dyngs.files.temporary import remove_leftovers
 from dyngs.runs.capture_record import RECORD_NAME, changed_files
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
-from dyngs.runs.lock import LOCK_NAME, writing
 from dyngs.runs.log import LOG_NAME
 
 EXPORT_FOLDER = "export"

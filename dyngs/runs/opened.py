@@ -245,7 +245,7 @@ class Opened(LoadedRun):
         clip = motion_clip(motion)
         if not is_fit:
             clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-        playing, notes = scene.playing(clip), self.notes
+        playing, notes = scene.playing(clip), (*self.notes, *motion.notes)
         if keep_feet:
             from dyngs.human.motion.feet import feet_kept, sole_points  # late: scipy, as above
             from dyngs.human.motion.placement import up_direction as up_of_body

@@ -12,7 +12,7 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.gaussians.levels import Levels, levels_of
 from dyngs.gaussians.scene import require_gaussians
-from dyngs.models.renderable import Renderable, Rendering, TimeStep, joined_renderings
+from dyngs.models.renderable import Renderable, Rendering, TimeStep, joined_renderings, single_views
 from dyngs.state import State
 from dyngs.static.scene import StaticScene
 
@@ -73,10 +73,9 @@ class LevelScene(Renderable):
     ) -> Rendering:
         """Return images as ``Renderable.render``, each of the cut that its camera needs; not differentiable."""
         images = []
-        for i in range(len(cameras)):
-            one = cameras.select(i)
+        for one, behind in single_views(cameras, self.background if background is None else background):
             seen = self.scene.with_gaussians(self.levels.seen_by(one, self.most).to(device=self.device))
-            images.append(seen.render(one, options=options, background=background))
+            images.append(seen.render(one, options=options, background=behind))
         return joined_renderings([Rendering(x.rgb, x.transmittance, x.depth) for x in images])
 
     def state(self) -> State:

@@ -13,7 +13,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
-from dyngs.models.renderable import TimeStep, clamped_time, joined_renderings
+from dyngs.models.renderable import TimeStep, clamped_time, joined_renderings, single_views
 from dyngs.state import State
 from dyngs.static.sides import Sides
 
@@ -68,12 +68,13 @@ class StaticScene(GaussianScene):
         if self.sides is None:
             return super().render(cameras, time, options=options, background=background, probe=probe)
         now = time if isinstance(time, GaussianTimeStep) else self.time_step(None)
-        cameras, found = cameras.to(device=self.device), []
-        for i in range(len(cameras)):
-            own = GaussianTimeStep(self.sides.seen_by(cameras.select(i), now.gaussians), now.time)
-            behind = background if background is None or background.ndim == 1 else background[i]
+        cameras, found = cameras.to(device=self.device, dtype=now.gaussians.means.dtype), []
+        for i, (camera, behind) in enumerate(
+            single_views(cameras, self.background if background is None else background)
+        ):
+            own = GaussianTimeStep(self.sides.seen_by(camera, now.gaussians), now.time)
             signal = None if probe is None else probe[i : i + 1]
-            found.append(super().render(cameras.select(i), own, options=options, background=behind, probe=signal))
+            found.append(super().render(camera, own, options=options, background=behind, probe=signal))
         return joined_renderings(found)
 
     def edited(self, edit: TopologyEdit) -> StaticScene:

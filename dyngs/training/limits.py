@@ -28,6 +28,8 @@ def require_possible(config: Config) -> None:
     if config.model.is_posed and config.camera.refine == "always":
         raise DyngsError("camera.refine: cameras of people are not refined, their poses are; leave it out")
     _require_whole_images(config)
+    if config.camera.refine == "always" and not config.model.made_of_gaussians:
+        raise DyngsError(f"camera.refine=always: model.kind={config.model.kind} refines no cameras; leave it out")
     _require_batch(config)
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from types import TracebackType
 
@@ -23,6 +23,8 @@ from dyngs.errors import DyngsError
 TIMEOUT = timedelta(days=30)  # The others wait while the first one reads, evaluates, or tries settings in small runs
 CHUNK = 2**22  # Most values that are summed at once: the memory that a sum takes for a while, twice
 FAILED = "dyngs/failed"  # Key of the store that counts the processes that have said why they end
+STOP = "dyngs/stop"  # Key of the store that counts the processes that were told to stop
+EXIT_INTERRUPTED = 130  # Exit code of a process that was told to stop, as after Ctrl-C
 EXIT_FAILED = 2  # Exit code of a process that ends because another one has failed, which has said why
 _NAMES = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
 
@@ -129,6 +131,16 @@ class Processes:
             x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
         self.sum_([x.grad for x in used if x.grad is not None])
 
+    def request_stop(self) -> None:
+        """Let the first process know that this one was told to stop."""
+        with suppress(RuntimeError):  # who kept the store has ended
+            if self._store is not None:
+                self._store.add(STOP, 1)
+
+    def is_stop_requested(self) -> bool:
+        """Return whether any process was told to stop, as far as it has said so."""
+        return self._count(STOP) > 0
+
     def send_(self, values: Tensor) -> None:
         """Replace the values of a tensor by those of the first process."""
         if self.size > 1:
@@ -169,7 +181,7 @@ class Processes:
         try:
             yield
         except RuntimeError:
-            if self._said() > 0:
+            if self._count(FAILED) > 0:
                 raise SystemExit(EXIT_FAILED) from None
             raise DyngsError(
                 f"process {self.rank} of {self.size} has lost the others: one has ended without a word (too little "
@@ -186,10 +198,10 @@ class Processes:
         except RuntimeError:
             return False
 
-    def _said(self) -> int:
-        """Return how many processes have said why they end."""
+    def _count(self, key: str) -> int:
+        """Return how often the processes have counted up a key of the store."""
         try:
-            return 0 if self._store is None else self._store.add(FAILED, 0)
+            return 0 if self._store is None else self._store.add(key, 0)
         except RuntimeError:  # who kept the store has ended
             return 0
 

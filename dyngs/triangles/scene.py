@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
+from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep, composited, fixed_cameras
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.patches import (
     SEGMENTS,
@@ -29,7 +29,6 @@ from dyngs.tensor_checks import require_positive, require_tensor
 from dyngs.triangles.keys import BgTriangleModel
 from dyngs.triangles.patches import CORNERS, Patches
 
-_TINY = 1e-9
 _ABOVE = 2.0  # Added to harmonics so that the kernel's clamp at 0 does not cut them
 
 
@@ -89,8 +88,9 @@ class TriangleScene(Renderable):
         background: Tensor | None = None,
     ) -> Rendering:
         options = self.options if options is None else options
-        views = [self.view(cameras.select(i), options) for i in range(len(cameras))]
         behind = self.background if background is None else background
+        cameras = fixed_cameras(cameras, behind, self.patches.points)
+        views = [self.view(cameras.select(i), options) for i in range(len(cameras))]
         return rendering_of(views, behind, options)
 
     def view(self, camera: Cameras, options: TriangleOptions) -> View:
@@ -125,16 +125,11 @@ class TriangleScene(Renderable):
 
 
 def rendering_of(views: list[View], background: Tensor | None, options: TriangleOptions) -> Rendering:
-    """Return the images of ``views`` before ``background`` (3,); None is black."""
+    """Return the images of ``views`` before ``background``; None is black."""
     rgb = torch.stack([view.colour for view in views])
     through = torch.stack([view.transmittance for view in views])
-    if background is not None:
-        rgb = rgb + through[..., None] * background.to(rgb)
     found = [view.depth for view in views if view.depth is not None]
-    depth = torch.stack(found) if found else None
-    if depth is not None and options.depth == "expected":
-        depth = depth / (1 - through).clamp_min(_TINY)
-    return Rendering(rgb, through, depth)
+    return composited(rgb, through, torch.stack(found) if found else None, options, background)
 
 
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:

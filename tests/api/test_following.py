@@ -146,6 +146,17 @@ def test_where_one_fails_all_end_with_one_line(fails: str, line: str, still: Pat
     assert line in errors[0]
 
 
+def test_a_signal_to_any_process_ends_the_run_which_can_go_on(still: Path, tmp_path: Path) -> None:
+    """The last process is told to end during step 4, and the first saves what it has."""
+    run = tmp_path / "run"
+    codes, said = run_in(2, do.trained, tmp_path, [_still(still, run, steps=400)], "SIGTERM")
+    assert codes == [130, 130], said
+    assert said[1] == ""
+    step = latest_checkpoint(run).info.step
+    assert 4 <= step < 400
+    assert f"dyngs: interrupted: stopped after step {step}; go on with: dyngs train --resume" in said[0]
+
+
 def test_what_needs_one_process_says_so(still: Path, tmp_path: Path) -> None:
     two = Processes(0, 2)
     with pytest.raises(DyngsError, match="minutes=1: is measured with one process; leave it out, or start without"):

@@ -42,10 +42,10 @@ from dyngs.data.decoding import Decoded
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.deform.schedule import motion_begins_after
+from dyngs.files.lock import Held
 from dyngs.kinds import assemble, prepared
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
-from dyngs.runs.lock import Held
 from dyngs.training.clock import Forecast, Stopwatch, with_steps
 from dyngs.training.events import StepReport
 from dyngs.training.loop import Loop

@@ -9,8 +9,8 @@ from moving_scene import write_moving_run
 from refused import error_line
 
 from dyngs.cli import main
+from dyngs.files.lock import LOCK_NAME, writing
 from dyngs.runs.checkpoint import load_run
-from dyngs.runs.lock import LOCK_NAME, writing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

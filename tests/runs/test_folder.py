@@ -21,10 +21,10 @@ from dyngs.demo import is_unused
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.export.splat_files import write_run_sequence
+from dyngs.files.lock import LOCK_NAME, InUseError, writing
 from dyngs.files.outputs import new_folder, require_new_folder
 from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
 from dyngs.runs.folder import default_folder, require_empty, tidy
-from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.opened import open_run
 

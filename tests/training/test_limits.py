@@ -156,3 +156,11 @@ def test_cameras_of_people_are_not_refined(preset: str) -> None:
     config = load_config(packaged_preset(preset), ["data.root=capture", "camera.refine=always"])
     with pytest.raises(DyngsError, match=r"camera\.refine: cameras of people are not refined"):
         require_possible(config)
+
+
+@pytest.mark.parametrize("preset", ["bg_triangle", "ngp", "nerf", "gps"])
+def test_cameras_are_refined_by_gaussians_alone(preset: str) -> None:
+    """The gradients of others by cameras miss a part, or all."""
+    config = load_config(packaged_preset(preset), ["data.root=capture", "camera.refine=always"])
+    with pytest.raises(DyngsError, match=rf"camera\.refine=always: model\.kind={preset} "):
+        require_possible(config)

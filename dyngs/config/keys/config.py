@@ -28,7 +28,7 @@ class CameraConfig(Section):
     refine: Literal["never", "auto", "always"] = Field(
         default="never",
         description="correct poses, focal lengths and principal points of the training views while the scene is "
-        "trained; not of people; auto: where two small runs beforehand say that it pays",
+        "trained; of Gaussians alone, not of people; auto: where two small runs beforehand say that it pays",
     )
 
 

@@ -24,6 +24,7 @@ from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError, counted, show
+from dyngs.files.lock import make_once
 from dyngs.files.outputs import note_sources, require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import write_image, write_text
@@ -188,11 +189,12 @@ def with_found_person(
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.stem)[:40]
     chosen = hashlib.sha256(repr(data.frames).encode()).hexdigest()[:8]
     folder = cache_folder("people") / f"{name}.{digest_of(data.root)}{chosen}"
-    if folder.is_dir():
-        say(f"person:  found before, in {folder}")
-    else:
+
+    def find() -> None:
         detector = MediaPipe()
         say(f"person:  found first, as by `dyngs data people`, into {folder}")
         say(write_found_person(data, folder, detector, report, say).summary())
+
+    make_once(folder, find, say, f"person:  found before, in {folder}")
     note_sources(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})

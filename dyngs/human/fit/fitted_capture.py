@@ -27,8 +27,9 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted, reading, show
-from dyngs.files.outputs import require_new_folder
-from dyngs.files.temporary import cache_folder, temporary_folder_beside
+from dyngs.files.lock import make_once
+from dyngs.files.outputs import new_folder
+from dyngs.files.temporary import cache_folder
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, NewClip, fit_capture, fitted_clips, placed_clip
@@ -264,16 +265,14 @@ def write_fitted_capture(
     ``body_pose.npz`` for another clip, ``fit_report.json``, and ``fit_overlays.png`` to look at. Raises DyngsError: see
     ``fit_capture``; ``out`` is not empty; a template that cannot be read or has no texture coordinates.
     """
-    require_new_folder(out)
     if given.person is not None and given.template.body is None:
         given = replace(given, template=template_of_run(given.person))
     body = load_template(given.template)
     _require_texels(given.template, body)
     name = _called(given.template, body)
     person = None if given.person is None else known_shape(given.person, body)
-    folder = temporary_folder_beside(out)
-    masks = folder / _MASKS
-    try:
+    with new_folder(out) as folder:
+        masks = folder / _MASKS
         capture = read_person(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
         points = {} if given.keypoints is None else read_keypoints(given.keypoints, capture.splits["train"])
@@ -309,9 +308,6 @@ def write_fitted_capture(
         said |= _report(found, new_poses, tuple(by_avatar.values()))
         write_text(folder / REPORT_NAME, json.dumps(said, indent=1) + "\n")
         shutil.rmtree(masks, ignore_errors=True)
-        folder.replace(out)  # also where ``out`` is an empty folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
     return FittedCapture(out, found, given.template, name, new_poses, tuple(by_avatar.values()))
 
 
@@ -426,13 +422,14 @@ def with_fitted_body(
         _require_texels(model, body)
         own, what = f".{body.fingerprint}", f"{_called(model, body)} is fitted"
     folder = cache_folder("bodies") / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}{own}"
-    if folder.is_dir():
-        say(f"body:    the fit of before, in {folder}")
-    else:
+
+    def fit() -> None:
         say(f"body:    {what} to the silhouettes first, as by `dyngs data fit`, into {folder}")
         points = data.root / KEYPOINTS
         inputs = FitInputs(points if points.is_dir() else None, template=model)
         say(write_fitted_capture(data, folder, report, inputs, with_images=False).summary())
+
+    make_once(folder, fit, say, f"body:    the fit of before, in {folder}")
     return data.model_copy(update={"body": folder})
 
 

@@ -5,6 +5,7 @@ Local letter: B shape parameters.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,27 +21,33 @@ from dyngs.human.motion.placement import place_on_floor
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import SMPLX_ROWS
 
-_MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
-_PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
-"""Keys and widths of the parts of 165 numbers, in order; all after the second may be missing."""
-_NAMED = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3} | {
-    "left_hand_pose": 45,
-    "right_hand_pose": 45,
+_MODELS = {24: "smpl", 52: "smplh", 55: "smplx", 22: "the body of all three"}
+"""Names of the models by their number of joints."""
+_PARTS = {"root_orient": 1, "pose_body": 21, "pose_jaw": 1, "pose_eye": 2, "pose_hand": 30}
+"""Keys and joints of the parts of 55 joints, in order; all after the second may be missing."""
+_NAMED = {"global_orient": 1, "body_pose": 21, "jaw_pose": 1, "leye_pose": 1, "reye_pose": 1} | {
+    "left_hand_pose": 15,
+    "right_hand_pose": 15,
 }
 """The same as the package smplx names its arguments."""
+_ALIASES = {"smpl_thetas": "poses", "smpl_betas": "betas", "transl": "trans", "cam_trans": "trans"}
+"""Names of the package smplx, and of ROMP, by those of AMASS."""
 _RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate")
-_ANY_AXES = "any axes"  # marks arrays of a file with the names of smplx: nobody says which way is up
+_ANY_AXES = "any axes"  # marks arrays of a file with the names of smplx or ROMP: nobody says which way is up
+_MAX_ANGLE = 4 * np.pi  # rad; no program writes a joint that is rotated by more than two turns
+_MAX_SPEED = 20.0  # m/s, of the root; a sprinter reaches 12
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
+def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto", fps: float | None = None) -> Motion:
     """Read a motion of 55 joints, y up; joints that the file lacks do not rotate.
 
     Tensors are float32, but ``trans`` of a fit, a file with ``scale``, is float64 where the file has it so.
 
-    Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
-    ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,); ``scale`` (one or F) and ``up_axis`` in files of dyngs
-    or a fit. Or the names of the package smplx: ``global_orient``, ``body_pose`` and the like, ``transl``, ``fps``.
+    Keys: ``poses``, or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3); ``mocap_framerate`` or
+    ``mocap_frame_rate``, else ``fps`` frames per second; ``betas`` (B,) or (F, B); ``scale`` (one or F) and
+    ``up_axis`` in files of dyngs or a fit. Or the names of the package smplx: ``global_orient``, ``body_pose`` and the
+    like, ``transl``, ``fps``; or those of ROMP. Poses are axis-angles or rotation matrices of 22, 24, 52 or 55 joints.
 
     AMASS files are z up: unless ``up`` or ``up_axis`` says otherwise, a file is z up if it has no ``scale``; with the
     names of smplx the axis nearest to the mean up direction of the pelvis is up. The rotation T to y up moves every
@@ -49,7 +56,7 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
     the lowest vertex to y = 0. Raises DyngsError: names the file and what is missing or wrong.
     """
     with reading(path):
-        return _motion(path, _arrays(path), body, up)
+        return _motion(path, _arrays(path), body, up, fps)
 
 
 def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") -> None:
@@ -76,21 +83,23 @@ def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") ->
         )
 
 
-def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis) -> Motion:
-    poses, width = _poses(path, arrays)
+def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis, fps: float | None) -> Motion:
+    poses, model = _poses(path, arrays)
     frames = len(poses)
     trans = _numbers(path, arrays, "trans")
-    if trans.shape != (frames, 3):
+    if trans.shape[-1:] != (3,) or _without_ones(trans.shape[:-1]) != _without_ones((frames,)):
         raise DyngsError(f"{path}: 'trans' must be {frames} x 3 numbers as 'poses' has {frames} frames, {_got(trans)}")
-    betas = np.atleast_1d(_numbers(path, arrays, "betas").squeeze()) if "betas" in arrays else np.zeros(10)
-    if betas.ndim != 1:
-        raise DyngsError(f"{path}: 'betas' must be one row of numbers, {_got(betas)}")
+    trans = trans.reshape(frames, 3)
     scale = _scale(path, arrays, frames)
     is_own = "scale" in arrays or "up_axis" in arrays
-    is_other_model = not is_own and body.name != _MODELS[width]
+    is_other_model = not is_own and body.name != model
+    betas, notes = _betas(path, arrays, frames)
     if not is_own:
         betas = np.zeros_like(betas) if is_other_model else betas[: body.num_shapes]
-    turn = _y_up_from_file(path, arrays, up, poses[:, 0])
+    if notes and is_other_model:
+        notes = [f"{notes[0]}, but dropped as the template is '{body.name}'"]
+    rate = _fps(path, arrays, fps)
+    turn, assumed = _y_up_from_file(path, arrays, up, poses[:, 0])
     if turn is not None:
         pelvis = scale[:, None] * _pelvis(body, betas)
         poses[:, 0] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
@@ -99,70 +108,122 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: U
     # A fit may lie so far from the origin that float32 is too coarse.
     is_fine = "scale" in arrays and arrays["trans"].dtype == np.float64
     place = torch.from_numpy(trans if is_fine else trans.astype(np.float32))
-    motion = Motion(tensors[0], place, tensors[1], _fps(path, arrays), tensors[2])
+    notes += [*assumed, *([] if "scale" in arrays else _about_speed(trans, rate))]
+    motion = Motion(tensors[0], place, tensors[1], rate, tensors[2], tuple(f"{path}: {note}" for note in notes))
     return place_on_floor(motion, body) if is_other_model else motion
 
 
+def _about_speed(trans: np.ndarray, fps: float) -> list[str]:
+    """Return a warning if the root moves so fast that its positions (F, 3) can hardly be metres."""
+    speeds = np.linalg.norm(np.diff(trans, axis=0), axis=1) * fps
+    speed = float(np.quantile(speeds, 0.9)) if len(speeds) else 0.0
+    if speed <= _MAX_SPEED:
+        return []
+    return [f"the root moves at {speed:.0f} m/s; 'trans' must be metres: divide it by 1000 if it is millimetres"]
+
+
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays that are needed; others, which may hold objects, are not read."""
-    keys = ("poses", *_PARTS, *_NAMED, "trans", "transl", "betas", "scale", "up_axis", *_RATES)
+    """Return the arrays that are needed by AMASS's names; others, which may hold objects, are not read."""
+    keys = ("poses", *_PARTS, *_NAMED, "trans", "betas", *_ALIASES, "scale", "up_axis", *_RATES)
     if not path.is_file():
         raise DyngsError(f"{path}: no such file")
     found = read_arrays(path, lambda names: [key for key in keys if key in names])
-    if "poses" not in found and "root_orient" not in found and "global_orient" in found:
-        return _renamed(path, found)
+    renamed = [alias for alias, key in _ALIASES.items() if alias in found and key not in found]
+    for alias in renamed:
+        found[_ALIASES[alias]] = found.pop(alias)
+    if renamed or ("poses" not in found and "root_orient" not in found and "global_orient" in found):
+        found[_ANY_AXES] = np.ones(1)
     return found
 
 
-def _renamed(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arrays of a file with the names of the package smplx under those of AMASS, with poses of 165."""
-    rest = {key: x for key, x in arrays.items() if key not in _NAMED} | {_ANY_AXES: np.ones(1)}
-    rest["poses"] = _joined(path, arrays, _NAMED)
-    betas = rest.get("betas")
-    if betas is not None and betas.ndim == 2 and len(betas) == len(rest["poses"]):
-        rest["betas"] = _numbers(path, arrays, "betas").mean(axis=0)  # of one person, fitted to each frame anew
-    if "transl" in rest:
-        rest["trans"] = rest.pop("transl")
-    return rest
-
-
-def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
-    """Return axis-angle poses (F, 55, 3), and how many numbers a frame has in the file."""
+def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+    """Return axis-angles (F, 55, 3), and the name of the model that the file is for."""
     if "poses" in arrays:
-        flat = _numbers(path, arrays, "poses")
-        if flat.ndim != 2 or flat.shape[1] not in _MODELS:
-            raise DyngsError(f"{path}: 'poses' must have 72, 156 or 165 numbers per frame, {_got(flat)}")
+        given = _axis_angles(path, arrays, "poses", tuple(_MODELS))
+        model = _MODELS[given.shape[1]]
     else:
-        flat = _joined(path, arrays, _PARTS)
-    if not len(flat):
+        given, model = _joined(path, arrays)
+    if not len(given):
         raise DyngsError(f"{path}: has no frames")
-    require_frame_count(path, len(flat), 55)
-    rows = list(SMPLX_ROWS[flat.shape[1] // 3])
-    poses = np.zeros((len(flat), 55, 3))
-    poses[:, rows] = flat.reshape(len(flat), -1, 3)[:, : len(rows)]
-    return poses, flat.shape[1]
+    require_frame_count(path, len(given), 55)
+    rows = list(SMPLX_ROWS.get(given.shape[1], range(22)))
+    poses = np.zeros((len(given), 55, 3))
+    poses[:, rows] = given[:, : len(rows)]
+    largest = np.linalg.norm(poses, axis=-1).max()
+    if largest > _MAX_ANGLE:
+        raise DyngsError(f"{path}: a joint is rotated by {largest:.0f} rad, more than two turns; convert degrees first")
+    return poses, model
 
 
-def _joined(path: Path, arrays: dict[str, np.ndarray], widths: dict[str, int]) -> np.ndarray:
-    """Return poses (F, 165) of parts by their widths; zero for those that lack, but for root and body."""
-    root, body = list(widths)[:2]
-    missing = [key for key in (root, body) if key not in arrays]
-    if missing and widths is _PARTS:
+def _joined(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+    """Return axis-angles (F, 55, 3) of parts, zero for those that lack but for root and body; and the model's name."""
+    parts = _NAMED if "root_orient" not in arrays and "global_orient" in arrays else _PARTS
+    root, body, *others = parts
+    if parts is _PARTS and not (root in arrays and body in arrays):
+        missing = body if root in arrays else root
         raise DyngsError(
-            f"{path}: has neither 'poses' nor '{missing[0]}' nor 'global_orient'; give an AMASS file of a motion"
+            f"{path}: has neither 'poses' nor '{missing}' nor 'global_orient'; give an AMASS file of a motion"
         )
-    frames = len(np.atleast_1d(arrays[root]))
-    parts = []
-    for key, width in widths.items():
-        part = _numbers(path, arrays, key) if key in arrays or key == body else np.zeros((frames, width))
-        if widths is _NAMED and part.ndim:
-            part = part.reshape(len(part), -1)
-            part = part[:, :63] if key == body and part.shape[1] == 69 else part  # SMPL's last two joints: the hands
-        if part.shape != (frames, width):
-            advice = "; save axis-angles, hands with use_pca=False" if widths is _NAMED and part.ndim == 2 else ""
-            raise DyngsError(f"{path}: '{key}' must be {frames} x {width} numbers, {_got(part)}{advice}")
-        parts.append(part)
-    return np.concatenate(parts, axis=1)
+    found = [_axis_angles(path, arrays, root, (1,)), _axis_angles(path, arrays, body, (21, 23))]
+    model = "smplx" if found[1].shape[1] == 21 else "smpl"
+    found[1] = found[1][:, :21]  # SMPL's last two joints are the hands
+    frames = len(found[0])
+    for key in others:
+        found.append(
+            _axis_angles(path, arrays, key, (parts[key],)) if key in arrays else np.zeros((frames, parts[key], 3))
+        )
+    for key, part in zip(parts, found, strict=True):
+        if len(part) != frames:
+            raise DyngsError(f"{path}: '{key}' must have {frames} frames as '{root}' has, {_got(arrays[key])}")
+    return np.concatenate(found, axis=1), model
+
+
+def _axis_angles(path: Path, arrays: dict[str, np.ndarray], key: str, counts: tuple[int, ...]) -> np.ndarray:
+    """Return the axis-angles (F, J, 3) of a key, J one of ``counts``, with or without a batch dimension of 1."""
+    value = _numbers(path, arrays, key)
+    is_batch = value.ndim > 2 and len(value) == 1
+    for clip in (value, value[0]) if is_batch else (value,):
+        for count in counts:
+            found = _rotations(clip, count)
+            if found is not None:
+                return found
+    joints = " or ".join(map(str, sorted(counts)))
+    raise DyngsError(
+        f"{path}: '{key}' must hold axis-angles or rotation matrices of {joints} joints per frame, {_got(value)}; "
+        "convert quaternions and 6D rotations, save hands with use_pca=False"
+    )
+
+
+def _rotations(clip: np.ndarray, count: int) -> np.ndarray | None:
+    """Return the axis-angles (F, J, 3) of J = ``count`` joints or of their rotation matrices, None of others."""
+    rest = _without_ones(clip.shape[1:])
+    if rest in ((3 * count,), (count, 3)):
+        return clip.reshape(len(clip), count, 3)
+    if rest not in ((9 * count,), _without_ones((count, 3, 3))):
+        return None
+    matrices = clip.reshape(-1, 3, 3)
+    errors = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3))
+    # Half precision errs by a tenth of that.
+    if errors.max(initial=0) > 0.01 or (np.linalg.det(matrices) < 0).any():
+        return None
+    return Rotation.from_matrix(matrices).as_rotvec().reshape(len(clip), count, 3)
+
+
+def _without_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(size for size in shape if size != 1)
+
+
+def _betas(path: Path, arrays: dict[str, np.ndarray], frames: int) -> tuple[np.ndarray, list[str]]:
+    """Return the shape parameters (B,), the mean if each frame has its own; and a note that says so."""
+    if "betas" not in arrays:
+        return np.zeros(10), []
+    betas = np.atleast_2d(_numbers(path, arrays, "betas").squeeze())
+    if betas.ndim != 2 or len(betas) not in (1, frames):
+        raise DyngsError(f"{path}: 'betas' must be one row of numbers or one for each frame, {_got(arrays['betas'])}")
+    span = np.ptp(betas, axis=0).max(initial=0)
+    if not span:
+        return betas[0], []
+    return betas.mean(axis=0), [f"'betas' differ between frames by up to {span:.2g}: the mean is taken"]
 
 
 def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
@@ -178,12 +239,21 @@ def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
     return value
 
 
-def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
-    key = next((key for key in _RATES if key in arrays), "fps" if _ANY_AXES in arrays else _RATES[1])
-    rate = _numbers(path, arrays, key)
-    if rate.size != 1 or not rate.item() > 0:
+def _fps(path: Path, arrays: dict[str, np.ndarray], fps: float | None) -> float:
+    """Return the frame rate of a file; ``fps`` if it has none."""
+    key = next((key for key in _RATES if key in arrays), None)
+    if key is None:
+        if fps is not None:
+            return require_frame_rate(path, fps)
+        raise DyngsError(
+            f"{path}: has no frame rate; write a file that has one: dyngs data motion FILE OUT.npz --fps 30"
+        )
+    with suppress(ValueError):  # text that is no number is refused below
+        arrays = arrays | {key: arrays[key].astype(np.float64)}
+    rates = np.unique(_numbers(path, arrays, key))
+    if rates.size != 1 or not rates.item() > 0:
         raise DyngsError(f"{path}: '{key}' must be one positive number")
-    return require_frame_rate(path, rate.item())
+    return require_frame_rate(path, rates.item())
 
 
 def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray:
@@ -194,12 +264,15 @@ def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray
     return np.broadcast_to(scale, frames).copy()
 
 
-def _y_up_from_file(path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray) -> np.ndarray | None:
-    """Return the rotation (3, 3) to y up, None if there is nothing to turn.
+def _y_up_from_file(
+    path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray
+) -> tuple[np.ndarray | None, list[str]]:
+    """Return the rotation (3, 3) to y up, None if there is nothing to turn; and a note if up had to be assumed.
 
     By ``up``, the key ``up_axis``, as AMASS files are, or by rotations (F, 3) of the root: the signed axis nearest to
     the mean up direction becomes y, by half a turn about x for -y.
     """
+    notes = []
     if up == "auto" and "up_axis" in arrays:
         up = "z" if str(arrays["up_axis"]) == "z" else "y"
         if str(arrays["up_axis"]) not in ("y", "z"):
@@ -207,12 +280,19 @@ def _y_up_from_file(path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots
     elif up == "auto" and _ANY_AXES in arrays:
         mean = Rotation.from_rotvec(roots).as_matrix()[:, :, 1].mean(axis=0)
         axis = int(np.abs(mean).argmax())
+        sign = 1.0 if mean[axis] >= 0 else -1.0
+        notes = [
+            f"the file does not say what is up; {'-' * (sign < 0)}{'xyz'[axis]} is taken, as the pelvis is upright so"
+        ]
         if axis == 1:
-            return None if mean[1] >= 0 else np.diag([1.0, -1.0, -1.0])
-        across = np.cross(np.eye(3)[axis] * (1.0 if mean[axis] >= 0 else -1.0), [0.0, 1.0, 0.0])
-        return Rotation.from_rotvec(np.pi / 2 * across).as_matrix()
-    is_z_up = up == "z" or (up == "auto" and "scale" not in arrays)
-    return _Y_UP_FROM_Z_UP if is_z_up else None
+            return (None if sign > 0 else np.diag([1.0, -1.0, -1.0])), notes
+        across = np.cross(np.eye(3)[axis] * sign, [0.0, 1.0, 0.0])
+        return Rotation.from_rotvec(np.pi / 2 * across).as_matrix(), notes
+    elif up == "auto" and "scale" not in arrays:
+        up = "z"
+        if not any(key in arrays for key in _RATES):
+            notes = ["the file does not say what is up; z is taken, as in files of AMASS; --up y takes y"]
+    return (_Y_UP_FROM_Z_UP if up == "z" else None), notes
 
 
 def _pelvis(body: BodyTemplate, betas: np.ndarray) -> np.ndarray:

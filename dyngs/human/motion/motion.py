@@ -40,6 +40,7 @@ class Motion:
     betas: Tensor  # (B,) shape parameters
     fps: float  # frames per second
     scale: Tensor  # (F,) uniform scale of the template
+    notes: tuple[str, ...] = ()  # assumptions that the reader of the file made
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -69,7 +70,7 @@ class Motion:
             return self
         parts = [self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))]
         tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
-        return replace(parts[0], **tensors)
+        return replace(parts[0], **tensors, notes=self.notes)
 
     def _interpolated(self, times: np.ndarray, fps: float) -> Motion:
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))

@@ -287,8 +287,8 @@ def read_motion(
     """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``, ``.gltf`` or ``.vrma``.
 
     Other skeletons are retargeted to ``body`` (None: the default template), with the lowest vertex at y = 0. Without
-    ``fps`` it has the frame rate of the file, 30 for glTF. ``up``: see ``read_amass``; ``clip`` names the animation of
-    a glTF file. Raises DyngsError: names the file and what is wrong with it.
+    ``fps`` it has the frame rate of the file, 30 for glTF; an ``.npz`` without a rate needs ``fps``. ``up``: see
+    ``read_amass``; ``clip`` names the animation of a glTF file. Raises DyngsError: names the file and what is wrong.
     """
     path, suffix = Path(path), Path(path).suffix.lower()
     if suffix not in _KINDS:
@@ -301,7 +301,7 @@ def read_motion(
     body = default_template() if body is None else body
     with reading(path):
         if suffix == ".npz":
-            motion = read_amass(path, body, up)
+            motion = read_amass(path, body, up, fps)
         elif suffix == ".bvh":
             motion = retarget(read_bvh(path), body)
         else:

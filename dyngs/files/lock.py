@@ -1,4 +1,4 @@
-"""A lock for one writer at a time in a run folder, released by the system when its process ends, however it ends."""
+"""A lock for one writer at a time in a folder, released by the system when its process ends, however it ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import platform
 import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -27,6 +27,7 @@ LOCK_NAME = "run.lock"
 
 _HELD = (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK)
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+_WAIT = 1.0  # seconds between two looks at a folder that another process makes
 _FAR = 2**30
 """Offset of the locked byte on Windows, past the end of the file: a locked byte cannot be read by others."""
 
@@ -74,7 +75,7 @@ def writing(folder: Path) -> Iterator[Held]:
         raise DyngsError(f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it")
     made = _made(folder)
     try:
-        file, locks = _locked(folder)
+        file, locks = _locked(folder / LOCK_NAME)
         held = Held(folder, alone=locks)
         try:
             yield held
@@ -85,6 +86,36 @@ def writing(folder: Path) -> Iterator[Held]:
         for path in made:
             with suppress(OSError):
                 path.rmdir()  # only succeeds if nothing came of it
+
+
+def make_once(folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str) -> None:
+    """Call ``make``, which makes a folder of the cache in one piece; say ``found`` instead if it exists.
+
+    Of several processes one makes it, the others wait and then use it; where the file system has no locks all make it,
+    and the first that is done counts. Raises DyngsError: as ``make`` does; the cache cannot be written.
+    """
+    path = folder.with_name(f".{folder.name}.lock")
+    _made(folder.parent)
+    is_told = False
+    while not folder.is_dir():
+        try:
+            file, _ = _locked(path)
+        except InUseError:
+            if not is_told:
+                say(f"{folder}: {_owner(path)}; its result is waited for")
+            is_told = True
+            time.sleep(_WAIT)
+            continue
+        try:
+            if not folder.is_dir():
+                make()
+                return
+        except DyngsError:
+            if not folder.is_dir():
+                raise
+        finally:
+            _freed(path, file)
+    say(found)
 
 
 def _made(folder: Path) -> list[Path]:
@@ -99,9 +130,9 @@ def _made(folder: Path) -> list[Path]:
     return missing
 
 
-def _locked(folder: Path) -> tuple[int, bool]:
-    """Return the open lock file of a folder, and whether it is locked."""
-    path = folder / LOCK_NAME
+def _locked(path: Path) -> tuple[int, bool]:
+    """Return the lock file ``path``, open, and whether it is locked."""
+    folder = path.parent
     while True:
         file = _opened(path)
         try:

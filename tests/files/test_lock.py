@@ -8,8 +8,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,12 +19,13 @@ import pytest
 from dyngs.cli import main
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.runs import lock as run_lock
+from dyngs.files import lock as run_lock
+from dyngs.files.lock import LOCK_NAME, InUseError, make_once, writing
+from dyngs.files.outputs import new_folder
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-HOLD = "import sys, time; from pathlib import Path; from dyngs.runs.lock import writing\n"
+HOLD = "import sys, time; from pathlib import Path; from dyngs.files.lock import writing\n"
 HOLD += "with writing(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
 
 
@@ -187,3 +189,94 @@ def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) ->
     (run / name).symlink_to(run / "own")
     with writing(run):
         pass
+
+
+# --- folders of the cache ---------------------------------------------------------------------------------------------
+
+
+def _made_by(count: int, folder: Path, make: Callable[[], None]) -> tuple[list[str], list[Exception]]:
+    """Let so many threads make the folder at once; return what they said, and the errors."""
+    said: list[str] = []
+    errors: list[Exception] = []
+
+    def work() -> None:
+        try:
+            make_once(folder, make, said.append, "found")
+        except DyngsError as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+        assert not thread.is_alive()
+    return said, errors
+
+
+def _publish(folder: Path, content: str) -> None:
+    """Make the folder in one piece."""
+    with new_folder(folder) as started:
+        time.sleep(0.2)
+        (started / "x.txt").write_text(content)
+
+
+@pytest.fixture
+def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_lock, "_WAIT", 0.02)
+
+
+@pytest.mark.usefixtures("short_wait")
+def test_of_three_one_makes_the_folder_and_the_others_use_it(tmp_path: Path) -> None:
+    folder, calls = tmp_path / "cache" / "a", list[int]()
+
+    def make() -> None:
+        calls.append(1)
+        _publish(folder, "whole")
+
+    said, errors = _made_by(3, folder, make)
+    assert errors == []
+    assert calls == [1]
+    assert [line for line in said if line == "found"] == ["found", "found"]
+    waits = [line for line in said if line != "found"]
+    assert len(waits) == 2
+    assert all(f"process {os.getpid()} on " in line and str(folder) in line for line in waits)
+    assert [path.name for path in (tmp_path / "cache").iterdir()] == ["a"]
+    assert (folder / "x.txt").read_text() == "whole"
+
+
+@pytest.mark.usefixtures("short_wait")
+def test_where_the_first_fails_the_next_tries(tmp_path: Path) -> None:
+    folder, calls = tmp_path / "a", list[int]()
+
+    def make() -> None:
+        calls.append(1)
+        time.sleep(0.2)
+        if len(calls) == 1:
+            raise DyngsError("too dark")
+        _publish(folder, "second")
+
+    said, errors = _made_by(3, folder, make)
+    assert [str(error) for error in errors] == ["too dark"]
+    assert len(calls) == 2
+    assert said.count("found") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_without_locks_the_first_that_is_done_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(_: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(run_lock, "_lock", no_locks)
+    folder, said = tmp_path / "a", list[str]()
+
+    def make() -> None:
+        with new_folder(folder) as started:
+            (started / "ours").touch()
+            folder.mkdir()  # by another process, which ends first
+            (folder / "theirs").touch()
+
+    make_once(folder, make, said.append, "found")
+    assert said == ["found"]
+    assert [path.name for path in folder.iterdir()] == ["theirs"]
+    assert [path for path in tmp_path.iterdir() if path.suffix != ".lock"] == [folder]
