@@ -98,7 +98,7 @@ def zoomed(view: View, factor: float, distance: float) -> View:
 
 
 def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
-    """Return the image files of the frames of a clip, in order, and of a video the frame rate and a line on colours."""
+    """Return the image files of a clip, in order, and of a video its frame rate and a line on colours."""
     if source.is_file():
         planned = planned_frames(source)
         if not planned.paths:

@@ -166,7 +166,7 @@ def _checked(photo: Path) -> ImageHeader | None:
 
 
 def _is_heif(photo: Path) -> bool:
-    """Whether a photo is HEIC, whatever its name says; JPEG that is named ``.heic`` is not."""
+    """Whether the content of a photo is HEIC; JPEG may be named ``.heic``."""
     with reading(photo), inside(photo).open("rb") as file:
         begin = file.read(8)
     is_jpeg = begin.startswith(b"\xff\xd8")
@@ -215,7 +215,8 @@ def _convert_heif(photo: Path, target: Path) -> str:
         check_size(photo, *image.size)
         rgb, exif = image.convert("RGB"), image.info.get("exif")
         profile = image.info.get("nclx_profile") or {}
-    tags = ColourTags(profile.get("color_primaries", UNSPECIFIED), profile.get("transfer_characteristics", UNSPECIFIED))
+    primaries = profile.get("color_primaries", UNSPECIFIED)
+    tags = ColourTags(primaries, profile.get("transfer_characteristics", UNSPECIFIED))
     if tags.conversion:
         rgb = Image.fromarray(to_srgb(np.asarray(rgb) * np.uint16(257), tags))
     with atomic_file(target) as temporary:

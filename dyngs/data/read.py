@@ -303,7 +303,7 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
 
 
 def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
-    """Return whether the first image that can be read has alpha, and a line on the layer that is read of an EXR."""
+    """Return whether the first readable image has alpha, and a line on the layer of EXR images."""
     for view in views:
         if view.silhouette is not None:
             return True, []

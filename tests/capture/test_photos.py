@@ -93,7 +93,7 @@ def test_hdr_heic_is_tone_mapped_with_a_note(tmp_path: Path) -> None:
         full_range_flag=1,
     )
     names, notes = _gather(tmp_path)
-    assert notes == ("HEIC photos: PQ is tone-mapped to SDR (white is 203 cd/m2; brighter is clipped)",)
+    assert notes == ("HEIC photos: PQ is tone-mapped to SDR (white: 203 cd/m2; brighter is clipped)",)
     stored = read_image(tmp_path / "images" / names["a.HIF"]).numpy()
     assert np.sqrt(np.mean((stored - 255 * patches()) ** 2)) < 4
 

@@ -1,4 +1,4 @@
-"""Writers of short clips in HDR and wide gamuts, by formulas of their own (the directions opposite to dyngs's)."""
+"""Writers of short clips in HDR and wide gamuts; they encode what dyngs decodes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def patches() -> np.ndarray:
 
 
 def encoded(rgb: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
-    """The signal of an sRGB image in other primaries and another transfer curve; SDR keeps the curve of sRGB."""
+    """The signal of an sRGB image in other primaries and another curve; SDR has that of sRGB."""
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     linear = (linear @ (np.linalg.inv(_to_xyz(primaries)) @ _to_xyz(BT709)).T).clip(0, 1)
     if transfer == HLG:
@@ -53,11 +53,12 @@ def write_clip(
     codec: str = "libx264",
     count: int = 2,
 ) -> None:
-    """A clip of a still RGB ``signal`` (H, W, 3), stored by ``matrix``, with ``tags`` (primaries, transfer, matrix)."""
+    """A clip of an RGB ``signal`` (H, W, 3), stored by ``matrix``, tagged (primaries, transfer, matrix)."""
     red, blue = _LUMA[matrix]
     luma = signal @ [red, 1 - red - blue, blue]
     planes = [luma, (signal[..., 2] - luma) / (2 - 2 * blue), (signal[..., 0] - luma) / (2 - 2 * red)]
-    step, most = 2 ** (bits - 8), 2**bits - 1
+    step = 2 ** (bits - 8)
+    most = 2**bits - 1
     scales = [(most, 0), (most, 128 * step)] if is_full_range else [(219 * step, 16 * step), (224 * step, 128 * step)]
     numbers = []
     for index, plane in enumerate(planes):
@@ -67,14 +68,17 @@ def write_clip(
     pixel_format = "yuv420p10le" if bits == 10 else "yuv420p"
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=30)
-        stream.width, stream.height, stream.pix_fmt = signal.shape[1], signal.shape[0], pixel_format
+        stream.height, stream.width = signal.shape[:2]
+        stream.pix_fmt = pixel_format
         stream.options = {"crf": "4", "threads": "1", "x265-params": "log-level=none"}
         context = stream.codec_context
         context.color_primaries, context.color_trc, context.colorspace = tags
         context.color_range = 2 if is_full_range else 1
         for number in range(count):
             frame = av.VideoFrame(stream.width, stream.height, pixel_format)
-            frame.pts, frame.color_range, frame.colorspace = number, context.color_range, tags[2]
+            frame.pts = number
+            frame.color_range = context.color_range
+            frame.colorspace = tags[2]
             for plane, values in zip(frame.planes, numbers, strict=True):
                 kind = np.uint16 if bits == 10 else np.uint8
                 stored = np.zeros((plane.height, plane.line_size // np.dtype(kind).itemsize), kind)
@@ -86,7 +90,10 @@ def write_clip(
 
 def add_colour_box(path: Path, primaries: int, transfer: int, matrix: int, is_full_range: bool = False) -> None:
     """Give the first track of an MP4, whose index comes last, the box ``colr`` of a container's tags."""
-    data, begin, end, opened = bytearray(path.read_bytes()), 0, path.stat().st_size, []
+    data = bytearray(path.read_bytes())
+    begin = 0
+    end = len(data)
+    opened = []
     for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", None):
         size, kind = struct.unpack_from(">I4s", data, begin)
         while name is not None and kind != name:

@@ -1,4 +1,4 @@
-"""Conversion of HDR (HLG and PQ of BT.2100) and wide-gamut images to 8-bit sRGB, by lookup tables."""
+"""Conversion of HDR (HLG, PQ) and wide-gamut images to 8-bit sRGB, by lookup tables."""
 
 from __future__ import annotations
 
@@ -12,20 +12,28 @@ BT2020, _DISPLAY_P3 = 9, 12
 _PQ, _HLG = 16, 18
 
 _TO_BT709 = {
-    BT2020: ((1.660491, -0.587641, -0.072850), (-0.124550, 1.132900, -0.008349), (-0.018151, -0.100579, 1.118730)),
-    _DISPLAY_P3: ((1.224940, -0.224940, 0.0), (-0.042057, 1.042057, 0.0), (-0.019638, -0.078636, 1.098274)),
-}  # fmt: skip
+    BT2020: (
+        (1.660491, -0.587641, -0.072850),
+        (-0.124550, 1.132900, -0.008349),
+        (-0.018151, -0.100579, 1.118730),
+    ),
+    _DISPLAY_P3: (
+        (1.224940, -0.224940, 0.0),
+        (-0.042057, 1.042057, 0.0),
+        (-0.019638, -0.078636, 1.098274),
+    ),
+}
 """Linear RGB of BT.709 from that of other primaries with the same white."""
 
 _REFERENCE_WHITE = 203.0  # cd/m2 of diffuse white in PQ, by BT.2408
 _HLG_WHITE = 0.75  # signal of diffuse white in HLG, by BT.2408
 _LEVELS = 65535
-_ROWS = 64  # rows that are converted at a time: they fit into caches
+_ROWS = 32  # rows that are converted at a time: they fit into caches
 
 
 @dataclass(frozen=True)
 class ColourTags:
-    """Code points of ITU-T H.273 for the colours of a video or an image, and whether its range is full."""
+    """Code points of ITU-T H.273 for the colours of an image, and whether its range is full."""
 
     primaries: int = UNSPECIFIED
     transfer: int = UNSPECIFIED
@@ -51,26 +59,25 @@ class ColourTags:
     def conversion(self) -> str:
         """A line on how ``to_srgb`` converts these colours; "" if they are sRGB already."""
         if self.transfer == _HLG:
-            return f"HLG is tone-mapped to SDR (white is {_HLG_WHITE:.0%} of the signal; brighter is clipped)"
+            return f"HLG is tone-mapped to SDR (white: {_HLG_WHITE:.0%} of the signal; brighter is clipped)"
         if self.transfer == _PQ:
-            return f"PQ is tone-mapped to SDR (white is {_REFERENCE_WHITE:g} cd/m2; brighter is clipped)"
+            return f"PQ is tone-mapped to SDR (white: {_REFERENCE_WHITE:g} cd/m2; brighter is clipped)"
         name = {BT2020: "BT.2020", _DISPLAY_P3: "Display P3"}.get(self.primaries)
         return f"colours are converted from {name} to BT.709" if name else ""
 
 
 def to_srgb(pixels: np.ndarray, tags: ColourTags, white: int = _LEVELS) -> np.ndarray:
-    """Return (H, W, 3) uint8 sRGB of (H, W, 3) uint16 RGB, 0 to ``white``; brighter than diffuse white is clipped.
+    """Return (H, W, 3) uint8 sRGB of (H, W, 3) uint16 RGB, whose levels are 0 to ``white``.
 
-    The system gamma of HLG is left out, as in BT.2408's mapping of scene light, so that SDR in HLG comes back.
+    Light above diffuse white is clipped. The system gamma of HLG is left out, as in the mapping of
+    scene light of BT.2408: SDR images that were encoded as HLG are restored.
     """
-    linear_of = _linear_table(tags.transfer, white)
-    matrix = np.array(_TO_BT709.get(tags.gamut, np.eye(3)), np.float32).T
+    matrix = _LEVELS * np.array(_TO_BT709.get(tags.gamut, np.eye(3)), np.float32).T
     encoded = np.empty(pixels.shape, np.uint8)
     for begin in range(0, len(pixels), _ROWS):
-        linear = linear_of[pixels[begin : begin + _ROWS]] @ matrix
-        np.clip(linear, 0.0, 1.0, out=linear)
-        linear *= _LEVELS
-        encoded[begin : begin + _ROWS] = _srgb_table()[linear.astype(np.uint16)]
+        rows = slice(begin, begin + _ROWS)
+        linear = _linear_table(tags.transfer, white).take(pixels[rows]) @ matrix
+        _srgb_table().take(linear.astype(np.int32), out=encoded[rows], mode="clip")
     return encoded
 
 

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 BEAUTY_NAMES = (
-    "", "rgba", "rgb", "combined", "c", "ci", "beauty", "main", "image", "final", "color", "colour", "composite",
+    "", "rgba", "rgb", "combined", "c", "ci", "beauty", "main", "image", "final", "color", "colour",
+    "composite",
 )  # fmt: skip
-"""Last words of a layer's name that mean the image itself, best first; "" are channels without a layer."""
+"""Last words of a layer's name that mean the beauty pass, best first; "": channels without a layer."""
 _SHORT = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 
 
@@ -22,7 +23,7 @@ class Layer:
 
     @property
     def colours(self) -> tuple[int, ...]:
-        """Indices of red, green and blue, or of luminance (Y without X); empty if there are neither."""
+        """Indices of red, green and blue, or of luminance (Y without X); empty without them."""
         names = "y" if "y" in self.channels and "x" not in self.channels else "rgb"
         found = tuple(self.channels[name] for name in names if name in self.channels)
         return found if len(found) == len(names) else ()
@@ -33,7 +34,7 @@ class Layer:
 
 
 def layers_of(parts: Sequence[tuple[str, Sequence[str]]]) -> list[Layer]:
-    """Return the layers of a file with these parts, (name, names of channels): ``layer.R``, or the part's name."""
+    """Return the layers of a file by its parts, (name, names of channels such as ``layer.R``)."""
     layers: dict[tuple[int, str], Layer] = {}
     for number, (part, names) in enumerate(parts):
         for index, name in enumerate(names):
@@ -45,7 +46,7 @@ def layers_of(parts: Sequence[tuple[str, Sequence[str]]]) -> list[Layer]:
 
 
 def beauty_pass(layers: Sequence[Layer]) -> Layer | None:
-    """Return the layer that is the image itself; None if no name, or more than one, says so.
+    """Return the beauty pass; None if no layer has such a name, or several have.
 
     Blender's compositor writes ``Composite.Combined`` beside the ``Combined`` of each view layer.
     """

@@ -110,11 +110,11 @@ END_MARKERS = {"png": _PNG_END, "jpeg": b"\xff\xd9"}
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of an image file: pixels and number of channels as stored, whether one is alpha, the camera's tags.
+    """Header of an image file: size and channels as stored, whether one is alpha, the camera's tags.
 
     Attributes:
-        format_name: of the content, whatever the suffix says, as OpenImageIO names it.
-        layer: name of the beauty pass that was chosen among other layers of an OpenEXR file, else "".
+        format_name: OpenImageIO's name of the format of the content.
+        layer: name of the beauty pass that was chosen among the layers of an EXR, else "".
     """
 
     width: int
@@ -182,9 +182,10 @@ def header_if_readable(path: Path) -> ImageHeader | None:
 def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
     """Read an image as (H, W, 3) or, with alpha, (H, W, 4) uint8: sRGB, straight alpha.
 
-    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear: they are clamped
-    to [0, 1] and encoded as sRGB. Premultiplied colours (EXR, TIFF with associated alpha) are divided by alpha. Grey
-    becomes RGB. Of an EXR with several layers, the beauty pass is read, in its display window.
+    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear:
+    they are clamped to [0, 1] and encoded as sRGB. Premultiplied colours (EXR, TIFF with associated
+    alpha) are divided by alpha. Grey becomes RGB. Of an EXR with several layers, the beauty pass is
+    read, in its display window.
 
     Args:
         size: (width, height) of its camera; an image that has this shape only when it is rotated as its EXIF tag says
@@ -287,7 +288,7 @@ def straight_uint8(pixels: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Source:
-    """An opened image at the part that is read, with the indices of its three colour channels and of alpha."""
+    """An opened image at the part that is read, with the indices of its colours (three) and alpha."""
 
     reader: OpenImageIO.ImageInput
     spec: OpenImageIO.ImageSpec
@@ -357,7 +358,7 @@ def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> Layer | None:
 
 
 def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeDesc) -> np.ndarray:
-    """Return the pixels (H, W, D) of a part; those of an EXR in its display window, 0 where there is no data."""
+    """Return the pixels (H, W, D) of a part, of an EXR in its display window: 0 outside the data."""
     import OpenImageIO as oiio
 
     spec = reader.spec()

@@ -40,7 +40,7 @@ KNOWN_MATRICES = (0, BT709_MATRIX, UNSPECIFIED, 4, BT601_MATRIX, 6, 7, BT2020_MA
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Size of a video's images, rotated as its tag says, how many there should be, and mean rate, 0 if not said.
+    """Size of a video's frames, upright, their number, and their mean rate, 0 if unknown.
 
     ``colours`` is a line on how its colours are converted or assumed, "" if they are as tagged.
     """
@@ -230,7 +230,7 @@ def _tags_of(context: VideoCodecContext) -> ColourTags:
 
 
 def _matrix_of(frame: av.VideoFrame, tags: ColourTags) -> int:
-    """Return the matrix of a frame; without a tag it is that of the primaries, else of the size, as in players."""
+    """Return the matrix of a frame; without a tag that of the primaries, else of the size."""
     if tags.matrix != UNSPECIFIED or frame.format.is_rgb:
         return tags.matrix
     if tags.gamut == BT2020:
@@ -243,10 +243,11 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
     matrix = _matrix_of(frame, tags)
     if matrix not in KNOWN_MATRICES:  # as that of Dolby Vision without a base layer
         raise DyngsError(
-            f"{path}: its colours are stored by matrix {matrix} of ITU-T H.273, which dyngs cannot convert; export "
-            "the video as SDR, HLG or HDR10"
+            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which dyngs cannot convert; "
+            "export the video as SDR, HLG or HDR10"
         )
-    # The nearest sample of chroma, as swscale takes it for 8 bits: filters mix colours at edges, which HDR amplifies.
+    # The nearest sample of chroma, as swscale takes it for 8 bits: filters mix colours at edges,
+    # which the curves of HDR amplify.
     convert = partial(
         frame.to_ndarray,
         src_colorspace=matrix,

@@ -64,6 +64,6 @@ def test_missing_tags_are_filled_and_present_ones_kept() -> None:
 
 def test_what_is_done_is_said() -> None:
     assert "HLG is tone-mapped" in ColourTags(BT2020, HLG).conversion
-    assert "PQ is tone-mapped to SDR (white is 203 cd/m2" in ColourTags(transfer=PQ).conversion
+    assert "PQ is tone-mapped to SDR (white: 203 cd/m2" in ColourTags(transfer=PQ).conversion
     assert ColourTags(DISPLAY_P3, BT709).conversion == "colours are converted from Display P3 to BT.709"
     assert ColourTags(BT709, BT709, BT709).conversion == ""

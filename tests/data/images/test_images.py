@@ -234,7 +234,8 @@ def test_alpha_of_tiff_is_as_the_file_says(
     alpha = np.linspace(0.25, 1, 16)[None, :, None].repeat(3, 0)
     colour = np.broadcast_to([0.8, 0.4, 0.2][: len(names) - 1], (3, 16, len(names) - 1))
     spec = oiio.ImageSpec(16, 3, len(names), kind)
-    spec.channelnames, spec.alpha_channel = names, len(names) - 1
+    spec.channelnames = names
+    spec.alpha_channel = len(names) - 1
     spec["oiio:UnassociatedAlpha"] = int(not is_associated)
     output = oiio.ImageOutput.create(str(tmp_path / "a.tif"))
     assert output.open(str(tmp_path / "a.tif"), spec)

@@ -206,8 +206,10 @@ def levels_off(path: Path, rgb: np.ndarray) -> float:
     ],
 )
 def test_colours_come_back(tmp_path: Path, primaries: int, transfer: int, matrix: int, is_full_range: bool) -> None:
-    path, rgb = tmp_path / "a.mp4", patches()
-    signal, tags = encoded(rgb, primaries, transfer), (primaries, transfer, matrix)
+    path = tmp_path / "a.mp4"
+    rgb = patches()
+    signal = encoded(rgb, primaries, transfer)
+    tags = (primaries, transfer, matrix)
     write_clip(path, signal, tags, matrix=matrix, is_full_range=is_full_range)
     assert levels_off(path, rgb) < 2.5
     kinds = {HLG: "HLG is tone-mapped", PQ: "PQ is tone-mapped"}
@@ -219,7 +221,8 @@ def test_colours_come_back(tmp_path: Path, primaries: int, transfer: int, matrix
 @pytest.mark.parametrize("is_full_range", [False, True])
 def test_tags_of_the_container_alone(tmp_path: Path, codec: str, is_full_range: bool) -> None:
     """FFmpeg's decoder of HEVC overwrites them by "unspecified"."""
-    path, rgb = tmp_path / "a.mp4", patches()
+    path = tmp_path / "a.mp4"
+    rgb = patches()
     untagged = (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED)
     signal = encoded(rgb, BT2020, HLG)
     write_clip(path, signal, untagged, codec=codec, is_full_range=is_full_range)
@@ -230,15 +233,18 @@ def test_tags_of_the_container_alone(tmp_path: Path, codec: str, is_full_range: 
 
 
 def test_hdr_in_8_bits_without_primaries_and_matrix(tmp_path: Path) -> None:
-    path, rgb = tmp_path / "a.mp4", patches()
+    path = tmp_path / "a.mp4"
+    rgb = patches()
     write_clip(path, encoded(rgb, BT2020, HLG), (UNSPECIFIED, HLG, UNSPECIFIED), bits=8)
     assert levels_off(path, rgb) < 3
 
 
 def test_brighter_than_white_is_clipped(tmp_path: Path) -> None:
     """Black, diffuse white, the brightest signal of HLG."""
-    path, signal = tmp_path / "a.mp4", np.zeros((48, 64, 3))
-    signal[:, 32:48], signal[:, 48:] = 0.75, 1.0
+    path = tmp_path / "a.mp4"
+    signal = np.zeros((48, 64, 3))
+    signal[:, 32:48] = 0.75
+    signal[:, 48:] = 1.0
     write_clip(path, signal, (BT2020, HLG, BT2020))
     (frame, _) = read_frames(path)
     assert frame[:, :30].max() <= 1
@@ -267,9 +273,10 @@ def test_tagged_hd_follows_its_tags(tmp_path: Path) -> None:
 
 
 def test_a_matrix_that_cannot_be_converted_is_refused(tmp_path: Path) -> None:
-    path, ictcp = tmp_path / "a.mp4", 14
+    path = tmp_path / "a.mp4"
+    ictcp = 14
     write_clip(path, patches(), (BT2020, PQ, ictcp))
-    with pytest.raises(DyngsError, match=r"a\.mp4: its colours are stored by matrix 14 .* export .*HDR10"):
+    with pytest.raises(DyngsError, match=r"a\.mp4: its colours have the matrix 14 .* export .*HDR10"):
         probe_video(path)
 
 
