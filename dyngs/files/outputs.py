@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from dyngs.errors import DyngsError
+from dyngs.files.limits import read_limited
 from dyngs.files.temporary import remove_quietly, temporary_folder_beside
 from dyngs.files.write import write_text
 
@@ -140,13 +141,10 @@ def _sources(paths: Iterable[Path]) -> list[Path]:
 
 
 def _read_sources(capture: Path) -> list[str]:
-    path = capture / SOURCES_NAME
     try:
-        if not path.is_file() or path.stat().st_size > _MAX_SOURCES_BYTES:
-            return []
-        names = json.loads(path.read_text(encoding="utf-8"))["sources"]
+        names = json.loads(read_limited(capture / SOURCES_NAME, _MAX_SOURCES_BYTES))["sources"]
         return [name for name in names if isinstance(name, str) and "\0" not in name]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # costs no more than this protection
+    except (DyngsError, OSError, ValueError, KeyError, TypeError, RecursionError):  # costs no more than this protection
         return []
 
 
