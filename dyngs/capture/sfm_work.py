@@ -8,21 +8,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal
+from typing import TYPE_CHECKING, Literal
 
 from dyngs.capture.photos import Photo
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
 from dyngs.files.containment import MAX_MEGAPIXELS
+from dyngs.files.lock import LOCK_NAME, writing
 from dyngs.files.write import write_text
 
 if TYPE_CHECKING:
     import pycolmap
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 LENS = "SIMPLE_RADIAL"
 """COLMAP's name of the lens model that is fitted."""
@@ -155,7 +151,7 @@ def quiet_colmap() -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-_KEY, _LOCK = "task.txt", "lock"
+_KEY = "task.txt"
 
 
 @contextmanager
@@ -169,16 +165,10 @@ def working(out: Path, task: str) -> Iterator[Path]:
     work = out.parent / f".{out.name}.sfm"
     if work.is_symlink():
         raise DyngsError(f"{work}: is a link; remove it")
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-        work.chmod(0o700)
-        lock = (work / _LOCK).open("ab")
-    except OSError as error:
-        raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
-    with lock:
-        _take(lock, out)
+    with writing(work):
         key = work / _KEY
         try:
+            work.chmod(0o700)
             if not key.is_file() or key.read_text(encoding="utf-8") != task:
                 _empty(work)
                 write_text(key, task)
@@ -189,20 +179,9 @@ def working(out: Path, task: str) -> Iterator[Path]:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _take(lock: BinaryIO, out: Path) -> None:
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise DyngsError(f"another process estimates poses for {out}; wait for it, or name another folder") from None
-    except OSError:  # a file system without locks
-        return
-
-
 def _empty(work: Path) -> None:
     for entry in os.scandir(work):
-        if entry.name == _LOCK:
+        if entry.name == LOCK_NAME:
             continue
         if entry.is_dir(follow_symlinks=False):
             shutil.rmtree(entry.path)

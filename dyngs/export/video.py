@@ -13,6 +13,7 @@ import numpy as np
 
 from dyngs.errors import DyngsError
 from dyngs.files.temporary import temporary_beside
+from dyngs.files.write import require_replaceable
 
 
 class VideoWriter:
@@ -76,6 +77,7 @@ class VideoWriter:
         from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
         rate = Fraction(self.fps).limit_denominator(1001)
+        require_replaceable(self.path)
         try:
             self._temporary = temporary_beside(self.path)
             self._container = av.open(str(self._temporary), "w")

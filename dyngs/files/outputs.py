@@ -12,7 +12,7 @@ from pathlib import Path
 from dyngs.errors import DyngsError
 from dyngs.files.limits import read_limited
 from dyngs.files.temporary import remove_quietly, temporary_folder_beside
-from dyngs.files.write import write_text
+from dyngs.files.write import require_replaceable, write_text
 
 SOURCES_NAME = "sources.json"
 """In a capture made of photos or videos: where these lie."""
@@ -39,10 +39,12 @@ class Inputs:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
         Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is
-        read; it is a folder that holds a link to an input; or a link leads it out of its run folder. A run folder in a
-        capture, an empty folder, and a folder around a capture may be written to.
+        read; it is a folder that holds a link to an input; a link leads it out of its run folder; or it is a device,
+        a pipe or the like. A run folder in a capture, an empty folder, and a folder around a capture may be written
+        to.
         """
         require_within_run(out)
+        require_replaceable(out)
         if not os.path.lexists(out):
             return
         for folder in self._folders:

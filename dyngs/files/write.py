@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +22,7 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     The folder is created if missing; the temporary name keeps the suffix, by which writers choose the format.
     ``durable``: wait until it is on disk, so that a power cut leaves the old file or the new one, complete.
     """
+    require_replaceable(path)
     try:
         temporary = temporary_beside(path)
     except OSError as error:
@@ -37,6 +39,20 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
         raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_replaceable(path: Path) -> None:
+    """Check that a file may be written in the place of ``path``: there is nothing, a file or a folder.
+
+    Raises DyngsError: a device, a pipe or the like; or a place in /dev or /proc, such as /dev/stdout.
+    """
+    parent = os.path.realpath(path.parent)
+    is_file = parent != "/dev" and not parent.startswith("/proc/")
+    with suppress(OSError):
+        mode = os.stat(path).st_mode
+        is_file = is_file and (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+    if not is_file:
+        raise DyngsError(f"cannot write {path}: it is a device, a pipe or the like; give the name of a file")
 
 
 def _flush(path: Path, flags: int) -> None:

@@ -40,4 +40,4 @@ def write_antimatter(path: Path, splat: SplatFile) -> None:
     colours = torch.cat([gaussians.base_rgb, gaussians.opacities[:, None]], dim=1)
     rows["rgba"] = (colours.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     rows["quats"] = (gaussians.quats * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy()
-    rows.tofile(path)
+    path.write_bytes(rows.tobytes())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -83,8 +84,10 @@ def write_usd(path: Path, splat: SplatFile) -> None:
     reach = 3 * gaussians.scales.amax(1, keepdim=True)
     corners = [(gaussians.means - reach).amin(0).tolist(), (gaussians.means + reach).amax(0).tolist()]
     prim.CreateExtentAttr(corners)
-    if not layer.Export(str(path)):
-        raise DyngsError("the USD library could not write it")
+    with suppress(RuntimeError):  # its own, of many lines
+        if layer.Export(str(path)):
+            return
+    raise OSError("the USD library could not write it; the disk may be full")
 
 
 def _packages(path: Path) -> tuple[Any, Any, Any, Any]:

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import os
+import shutil
 import stat
+import sys
+import tempfile
+from contextlib import redirect_stderr
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from splat_scenes import cloud
 
 from dyngs.cli import main
 from dyngs.data.images.images import read_image
 from dyngs.errors import DyngsError
-from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
+from dyngs.export.video import VideoWriter
+from dyngs.files.outputs import Inputs
+from dyngs.files.write import atomic_file, require_replaceable, to_uint8, write_image, write_text
+from dyngs.splats.formats import write_splats
+from dyngs.splats.splat_file import SplatFile
 
 
 def test_png_keeps_straight_alpha_exactly(tmp_path: Path) -> None:
@@ -66,6 +76,68 @@ def test_full_disk_is_one_line(tmp_path: Path) -> None:
         pytest.skip("this system has no /dev/full")
     with pytest.raises(DyngsError, match="No space left"), atomic_file(tmp_path / "a.txt"):
         full.write_text("x")
+
+
+def _video(path: Path) -> None:
+    with VideoWriter(path, 10.0) as video:
+        video.add(np.zeros((16, 16, 3), np.uint8))
+
+
+def _by_command(path: Path) -> None:
+    """A .ply as a user converts it; the error becomes an exit code and a line."""
+    source = Path(tempfile.mkdtemp()) / "source.ply"
+    write_splats(source, SplatFile(cloud(20)))
+    printed = io.StringIO()
+    with redirect_stderr(printed):
+        assert main(["convert", str(source), str(path)]) == 2
+    shutil.rmtree(source.parent)
+    raise DyngsError(printed.getvalue().removeprefix("dyngs: error: "))
+
+
+WAYS = {
+    "text": lambda path: write_text(path, "x"),
+    "image": lambda path: write_image(path, np.zeros((2, 2, 3))),
+    "video": _video,
+    "check": lambda path: Inputs([]).require_output(path),
+    "command": _by_command,
+}
+"""Whatever writes to a path."""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes have no names in folders there")
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("kind", ["pipe", "link to a pipe", "device", "link to a device"])
+def test_devices_and_pipes_are_refused_and_stay(kind: str, way: str, tmp_path: Path) -> None:
+    path = tmp_path / "out.ply"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link to a pipe":
+        os.mkfifo(tmp_path / "pipe")
+        path.symlink_to(tmp_path / "pipe")
+    elif kind == "link to a device":
+        path.symlink_to("/dev/null")
+    elif os.getuid():
+        path = Path("/dev/null")
+    else:  # whom nothing keeps from replacing /dev/null
+        try:
+            os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+        except OSError:
+            pytest.skip("devices cannot be made here")
+    before = path.lstat()
+    with pytest.raises(DyngsError, match=r"cannot write .*: it is a device, a pipe or the like; give the name of"):
+        WAYS[way](path)
+    after = path.lstat()
+    assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
+    assert not [entry for entry in tmp_path.iterdir() if ".dyngs" in entry.name]
+
+
+@pytest.mark.parametrize("name", ["/dev/stdout", "/dev/fd/1", "/dev/new.txt", "/proc/self/fd/1"])
+def test_stdout_is_no_file_even_where_it_is_redirected_to_one(name: str) -> None:
+    """The link in /dev would be replaced; the check writes nothing."""
+    if not Path("/proc/self").exists():
+        pytest.skip("not Linux")
+    with pytest.raises(DyngsError, match=f"cannot write {name}: it is a device, a pipe or the like"):
+        require_replaceable(Path(name))
 
 
 def test_whole_numbers_of_16_bits_stay_as_they_are(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import sys
 import zipfile
 from dataclasses import replace
 from importlib.util import find_spec
@@ -60,6 +61,29 @@ def test_a_file_shows_what_was_written(kind: Format, tmp_path: Path) -> None:
     assert len(back.gaussians) == len(scene)
     assert back.gaussians.sh_degree == degree
     assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
+@pytest.mark.parametrize(
+    "suffix", [pytest.param(x, marks=without_usd if f.name == "usd" else ()) for f in FORMATS for x in f.suffixes]
+)
+def test_a_full_disk_is_one_line_and_leaves_the_former_file(suffix: str, tmp_path: Path) -> None:
+    """No file may take more than 2 KB, of which the first scene needs less in every format."""
+    import resource
+
+    path, usual = tmp_path / f"a{suffix}", resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.write_bytes(b"former")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, usual[1]))
+    try:
+        with pytest.raises(DyngsError) as caught:
+            write_splats(path, SplatFile(cloud(2000)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    told = str(caught.value)
+    assert told.startswith(f"cannot write {path}: ")
+    assert "File too large" in told or "the disk may be full" in told
+    assert len(told) < 200 + len(str(path))
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"former"]
 
 
 @every
