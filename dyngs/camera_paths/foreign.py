@@ -49,8 +49,8 @@ def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     """Return the document of a camera_path.json; its fields of view are vertical, in degrees."""
     _require_flat(found, str(file), "camera_type")
     height = found.get("render_height")
-    if not is_number(height):
-        raise DyngsError(f"{file}: 'render_height' is missing; export the path again")
+    if not is_number(height) or not 1 <= height <= 65536:
+        raise DyngsError(f"{file}: 'render_height' must be a number from 1 to 65536; export the path again")
     frames = []
     for i, view in enumerate(_listed(found["camera_path"], file)):
         where = f"{file}: camera_path[{i}]"
