@@ -171,7 +171,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
             if line.startswith("#"):
                 found = re.match(r"#\s*Number of \w+:\s*(\d{1,18})\b", line)
                 announced = int(found[1]) if found else announced
-            elif may_skip and (not line or _POINTS_2D.fullmatch(line)):
+            elif may_skip and _POINTS_2D.fullmatch(line):
                 may_skip = False
             elif line:
                 try:

@@ -145,10 +145,11 @@ def lines_of(*seconds: str | None) -> list[str]:
         lambda text: text.encode(),
         lambda text: text.replace("\n", "\r\n").encode(),
         lambda text: text.encode("utf-8-sig") + b"\n\n\n",
+        lambda text: text.replace("\n", "\r\r\n").encode(),
         lambda text: text.encode("utf-16"),
         lambda text: text.encode("utf-16-le"),
     ],
-    ids=["plain", "crlf", "mark_and_blank_lines", "utf16", "utf16_without_mark"],
+    ids=["plain", "crlf", "mark_and_blank_lines", "blank_lines_between", "utf16", "utf16_without_mark"],
 )
 def test_second_lines_of_images_may_be_missing(
     tmp_path: Path, seconds: tuple[str | None, ...], header: str, encode: Callable[[str], bytes]
