@@ -115,17 +115,23 @@ def read_metashape(root: Path) -> Capture:
             raise DyngsError(f"{path}: defines entities, which no export of cameras needs; {_ADVICE}")
         chunk = next(ElementTree.fromstring(content).iter("chunk"))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
-        components = {part.get("id"): part for part in chunk.iterfind("components/component")}
+        placements: dict[str | None, ElementTree.Element | None] = {}
+        for component in chunk.iterfind("components/component"):
+            placements[component.get("id")] = component.find("transform")
         for camera in chunk.iterfind("cameras//camera"):
             fields: _Fields = {}
             pose = camera.findtext("transform")
             if pose is not None:
                 fields = _metashape_lens(path, sensors[camera.get("sensor_id")])
-                parent = components.get(camera.get("component_id"), chunk)
-                placed = _placed(parent.find("transform"), np.array(pose.split(), np.float64).reshape(4, 4))
+                placement = placements.get(camera.get("component_id"))
+                if placement is None:
+                    placement = chunk.find("transform")
+                placed = _placed(placement, np.array(pose.split(), np.float64).reshape(4, 4))
                 fields["transform_matrix"] = (placed @ OPENGL_FROM_OPENCV).tolist()
             cameras.append((camera.attrib["label"], fields))
-    return _capture(root, "metashape", path, _Photos(root), cameras)
+        ignored = [line for sensor in sensors.values() for line in _ignored_terms(sensor)]
+    capture = _capture(root, "metashape", path, _Photos(root), cameras)
+    return capture.replace(warnings=(*ignored, *capture.warnings))
 
 
 def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarray:
@@ -138,6 +144,13 @@ def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarr
     placed[:3, :3] = rotation @ pose[:3, :3]
     placed[:3, 3] = float(transform.findtext("scale", "1")) * rotation @ pose[:3, 3] + shift
     return placed
+
+
+def _ignored_terms(sensor: ElementTree.Element) -> list[str]:
+    """Return a line where a sensor has terms that no lens of ours has: skew, and tangential ones of fisheye lenses."""
+    keys = ("b2", "p1", "p2") if sensor.get("type") == "fisheye" else ("b2",)
+    found = [key for key in keys if any(float(term.text or 0) for term in sensor.iter(key))]
+    return [f"sensor {sensor.get('label')}: {', '.join(found)} are ignored"] if found else []
 
 
 def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:

@@ -86,10 +86,18 @@ def test_metashape_has_its_cameras(tmp_path: Path, placement: str | None, labels
     assert (capture.format, capture.warnings) == ("metashape", ())
 
 
-def test_a_chunk_of_an_older_metashape_is_placed_as_it_says(tmp_path: Path) -> None:
+@pytest.mark.parametrize("old", [True, False])
+def test_a_chunk_is_placed_where_its_component_is_not(tmp_path: Path, old: bool) -> None:
     file = write_metashape(tmp_path, placement="chunk") / "cameras.xml"
-    file.write_text(file.read_text().replace('<components><component id="5"></component></components>', ""))
+    if old:
+        file.write_text(file.read_text().replace('<components><component id="5"></component></components>', ""))
     assert_same_views(read(tmp_path), lambda local, _: metashape_frame(local, METASHAPE))
+
+
+@pytest.mark.parametrize(("kind", "terms"), [("frame", "b2"), ("fisheye", "b2, p1")])
+def test_terms_that_are_ignored_are_named(tmp_path: Path, kind: str, terms: str) -> None:
+    capture = read(write_metashape(tmp_path, {"f": 40.0, "p1": 0.01, "b2": -0.3, "p2": 0.0}, kind))
+    assert capture.warnings == (f"sensor X-T4: {terms} are ignored",)
 
 
 def test_fisheye_lenses_of_metashape(tmp_path: Path) -> None:
