@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shlex
 import stat
+import string
+import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 
@@ -87,7 +89,20 @@ def reason(error: BaseException) -> str:
 def as_word(path: str | os.PathLike[str]) -> str:
     """Return a path as a word of a command that can be copied to a shell, whatever characters it holds."""
     text = os.fspath(path)
-    return shlex.quote(f"./{text}" if text.startswith("-") else text)
+    return quoted(f"./{text}" if text.startswith("-") else text)
+
+
+def quoted(text: str) -> str:
+    """Return ``text`` as a word for a shell; with escapes ($'...') where it does not show on one line of stdout."""
+    encoding = getattr(sys.stdout, "encoding", None) or "ascii"
+    if printable(text) == text and text == text.encode(encoding, "replace").decode(encoding, "replace"):
+        return shlex.quote(text)
+    try:
+        name = os.fsencode(text)
+    except UnicodeEncodeError:  # the system's encoding is ASCII
+        name = text.encode("utf-8", "replace")
+    plain = frozenset(string.ascii_letters + string.digits + "/._-=+,@%")
+    return "$'" + "".join(chr(byte) if chr(byte) in plain else f"\\x{byte:02x}" for byte in name) + "'"
 
 
 def counted(number: int, noun: str) -> str:
@@ -97,6 +112,20 @@ def counted(number: int, noun: str) -> str:
 
 def printable(text: str, length: int | None = None) -> str:
     """``text`` on one line, what a terminal would obey or cannot show as escapes, with ``...`` beyond ``length``."""
-    line = " ".join(text.split())
-    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    shown = escaped(" ".join(text.split()))
     return shown if length is None or len(shown) <= length else f"{shown[: length - 3]}..."
+
+
+def show(text: str) -> None:
+    """Print lines that may quote names of others, without anything that a terminal would obey."""
+    print("\n".join(map(escaped, text.split("\n"))), flush=True)
+
+
+def warn(text: str) -> None:
+    """Print a warning of one line to stderr."""
+    print(f"dyngs: warning: {printable(text)}", file=sys.stderr, flush=True)
+
+
+def escaped(line: str) -> str:
+    """Return a line with escapes for all that a terminal would obey or cannot show."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import torch
@@ -13,10 +12,10 @@ from dyngs.config import Config, ModelSection, PointsInit, RandomInit
 from dyngs.data.capture import Capture
 from dyngs.data.decoding import usual_threads
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import read_capture
+from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, reading, warn
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
@@ -156,7 +155,7 @@ def prepared(config: Config) -> Capture:
 
     What is suspicious about the capture, and where the points are from, is printed to stderr.
     """
-    return with_points(read_capture(config.data), config)
+    return with_points(require_images(read_capture(config.data)), config)
 
 
 def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
@@ -171,7 +170,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
             why = outside_of_cube(views, cube_half_side(init.half_extent, views, capture.world_scale))
             lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]
     for line in [] if quiet else [*lines, *before_training(capture)]:
-        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
+        warn(line)
     return capture
 
 

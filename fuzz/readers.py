@@ -8,6 +8,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from program_captures import write_metashape, write_odm, write_polycam, write_reality, write_record3d, write_shots
+
 from fuzz import seed_files as files
 from fuzz.seeds import (
     Seed,
@@ -343,6 +345,11 @@ CAPTURES: dict[str, dict[str, Seed]] = {
     "nerfstudio": {"moving": write_nerfstudio},
     "colmap": {"binary": write_colmap_binary, "text": write_colmap_text},
     "nerfies": {"nerfies": write_small_nerfies},
+    "polycam": {"raw": write_polycam},
+    "record3d": {"exported": write_record3d},
+    "metashape": {"placed": partial(write_metashape, placement="component")},
+    "realitycapture": {"registration": write_reality},
+    "odm": {"reconstruction": write_odm, "shots": write_shots},
     "llff": {"still": write_llff, "videos": write_llff_videos},
     "camera_folders": {"mixed": write_camera_folders},
     "zju_mocap": {"annotated": write_zju, "single": write_zju_single},

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from dyngs.errors import DyngsError, counted, printable, reading, reason, require_regular
+import dyngs
+from dyngs.cli.arguments import print_notes
+from dyngs.errors import DyngsError, as_word, counted, printable, reading, reason, require_regular, show, warn
 from dyngs.files.fields import read_json_object
 from dyngs.files.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
@@ -112,3 +118,68 @@ def test_pipes_in_captures_and_runs_stop_nobody(tmp_path: Path) -> None:
 
 def test_what_is_counted() -> None:
     assert [counted(n, "image") for n in (0, 1, 2, 1200)] == ["0 images", "1 image", "2 images", "1,200 images"]
+
+
+ODD_NAMES = (
+    "läufer",
+    "two  blanks",
+    "tab\t",
+    "line\nbreak",
+    "esc\x1b[2Jape",
+    "\udce9t\udce9",
+    "it's",
+    "a\\b",
+    "-x",
+    "\u202eback",
+)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash here")
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+@pytest.mark.parametrize("name", ODD_NAMES)
+def test_names_in_commands_can_be_copied(name: str, encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What shows on the terminal, also within an error, is the name again for a shell."""
+    stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace")
+    monkeypatch.setattr(sys, "stdout", stream)
+    print(DyngsError(f"run `{as_word(name)}`"), end="")
+    stream.flush()
+    shown = stream.buffer.getvalue().decode(encoding)
+    monkeypatch.undo()
+    assert shown.isprintable()
+    word = shown.removeprefix("run `").removesuffix("`")
+    copied = subprocess.run(["bash", "-c", f"printf %s {word}"], capture_output=True, check=True).stdout
+    assert copied == os.fsencode(f"./{name}" if name.startswith("-") else name)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locales of POSIX")
+def test_names_can_be_copied_in_the_locale_c(tmp_path: Path) -> None:
+    (tmp_path / "läufer").mkdir()
+    code = "import sys; from dyngs.errors import as_word; print('next: cd ' + as_word(sys.argv[1]))"
+    locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, "läufer"], env=os.environ | locale, capture_output=True, check=True, text=True
+    )
+    command = done.stdout.removeprefix("next: ").strip()
+    assert command.isascii()
+    assert subprocess.run(["bash", "-c", command], cwd=tmp_path, check=False).returncode == 0
+
+
+def test_lines_and_warnings_cannot_steer_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    show("two lines:\n  of \x1b]0;title\x07.png\r")
+    warn("a\x1b[2J.png\nhas changed")
+    print_notes(("\x9b2J",), ("\x08",))
+    output = capsys.readouterr()
+    assert output.out == "two lines:\n  of \\x1b]0;title\\x07.png\\r\nnote: \\x9b2J\n"
+    assert output.err == "dyngs: warning: a\\x1b[2J.png has changed\ndyngs: warning: \\x08\n"
+
+
+def test_warnings_of_the_package_are_escaped() -> None:
+    """No other place prints one, nor passes ``print`` on for lines that may quote names."""
+    package = Path(dyngs.__file__).parent
+    found = [
+        f"{file.name}: {line.strip()}"
+        for file in package.rglob("*.py")
+        for line in file.read_text(encoding="utf-8").splitlines()
+        if re.search(r"dyngs: warning|= print\b|, print\)|lambda line: print", line)
+    ]
+    assert found == ['errors.py: print(f"dyngs: warning: {printable(text)}", file=sys.stderr, flush=True)']

@@ -286,3 +286,15 @@ def test_the_conda_recipe_needs_what_pip_does() -> None:
     names = {"torch": "pytorch", "OpenImageIO": "py-openimageio"}
     assert recipe["requirements"]["run"][1:] == [f"{names.get(name, name)} {versions}" for name, versions in wanted]
     assert f'version = "{recipe["context"]["version"]}"' in project
+
+
+def test_newer_versions_of_torch_are_allowed() -> None:
+    """Pip must not downgrade the torch of an environment; constraints.txt names the version of the tests."""
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    allowed = re.search(r'"torch([^"]*)"', project)
+    pinned = re.search(r"^torch==([\d.]+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    assert allowed is not None
+    assert "<" not in allowed[1]
+    assert pinned is not None
+    oldest = tuple(int(x) for x in allowed[1].removeprefix(">=").split("."))
+    assert tuple(int(x) for x in pinned[1].split(".")) >= oldest

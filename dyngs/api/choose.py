@@ -35,8 +35,8 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Capture, View
-from dyngs.data.images.images import target_size
 from dyngs.data.loader import ImageLoader
+from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.schedule import motion_begins_after
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
@@ -327,14 +327,14 @@ def _trained(trainer: GaussianTrainer, steps: int, deadline: float = math.inf) -
 
 
 def _work_of_step(config: Config, view: View) -> float:
-    width, height = target_size(view.width, view.height, config.data.downscale, config.data.longest_side)
+    width, height = view_size(view, config.data)
     times = range(0, config.train.steps, max(1, config.train.steps // 50))
     drawn = fmean(image_divisor(config.train, step) ** -2 for step in times)
     return STEP_COST + width * height * drawn + GAUSSIAN_COST * min(config.strategy.growth_limit, width * height)
 
 
 def _longest_side(config: Config, view: View) -> int:
-    return max(target_size(view.width, view.height, config.data.downscale, config.data.longest_side))
+    return max(view_size(view, config.data))
 
 
 def _trial_config(config: Config) -> Config:

@@ -6,7 +6,7 @@ import torch
 
 from dyngs.config import AutoColour, Config, FixedStrategy, SceneInit, ShColour, StaticModel
 from dyngs.data.capture import Capture
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 from dyngs.gaussians.start import FirstGaussians
 from dyngs.runs.opened import open_scene
 from dyngs.splats.similarity import UNMOVED, Similarity
@@ -63,10 +63,7 @@ def first_of(config: Config, capture: Capture) -> FirstGaussians | None:
         if bool(frozen.all()):
             raise DyngsError(f"init.box: none of {counted(len(scene), 'Gaussian')} of {init.scene} lie in it")
     if scene.options.mode is not config.model.rasterize_mode:
-        print(
-            f"{init.scene}: was trained with model.rasterize_mode={scene.options.mode.value}, which is not this run's",
-            flush=True,
-        )
+        show(f"{init.scene}: was trained with model.rasterize_mode={scene.options.mode.value}, which is not this run's")
     held = "" if frozen is None else f", of which {int(frozen.sum()):,} stay as they are"
-    print(f"begins with {counted(len(gaussians), 'Gaussian')} of {init.scene}{held}", flush=True)
+    show(f"begins with {counted(len(gaussians), 'Gaussian')} of {init.scene}{held}")
     return FirstGaussians(gaussians, frozen)

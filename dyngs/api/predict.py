@@ -10,7 +10,7 @@ from pathlib import Path
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, show
 from dyngs.files.outputs import new_folder
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import assemble
@@ -43,7 +43,7 @@ def predict(
     views: int | tuple[str, ...] | None = None,
     *,
     steps: int | None = None,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = show,
     report: ReportProgress = report_nothing,
 ) -> Prediction:
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train --resume`` refines it.

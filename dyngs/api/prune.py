@@ -14,7 +14,7 @@ from dyngs.config.io import load_resolved
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import require_folder
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, show
 from dyngs.export.scene_file import write_scene_file
 from dyngs.files.outputs import new_folder
 from dyngs.kinds import GaussianTrainer, assemble
@@ -66,7 +66,7 @@ def file_of(folder: Path) -> Path:
 
 
 def prune_within(
-    run_dir: Path, out: Path, max_loss: float, overrides: Sequence[str], tell: Callable[[str], None] = print
+    run_dir: Path, out: Path, max_loss: float, overrides: Sequence[str], tell: Callable[[str], None] = show
 ) -> Promise:
     """Take as much from the run in ``run_dir`` as ``max_loss`` allows, and write the rest to ``out``: a run and a file.
 

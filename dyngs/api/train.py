@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -21,15 +20,14 @@ from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
-from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, fit_to_time
 from dyngs.capture.unposed import is_unposed, with_poses
 from dyngs.config import Config, HumanModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
-from dyngs.data.read import read_capture, require_folder
-from dyngs.errors import DyngsError, as_word, counted
+from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
+from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
 from dyngs.files.lock import Held, writing
 from dyngs.gaussians.start import FirstGaussians
@@ -78,7 +76,7 @@ from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
-_COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"  # Names of the limits' states in a checkpoint
+_COUNT, _TIME = "budget.count", "budget.time"  # Names of the limits' states in a checkpoint
 
 
 @contextmanager
@@ -175,7 +173,7 @@ def train(
         folder = run.folder
         note_asked(folder, asked)
         for line in lines:
-            print(line, flush=True)
+            show(line)
     return folder
 
 
@@ -185,7 +183,7 @@ def _chosen(config: Config, resumed: Checkpoint | None) -> tuple[Config, list[Ch
         return config, [], None  # it has several captures
     if resumed is not None:
         return config, [], read_capture_of(config.data, resumed.info)
-    return choose(config, read_capture(config.data))
+    return choose(config, require_images(read_capture(config.data)))
 
 
 def _told_again(config: Config, folder: Path) -> str:
@@ -282,27 +280,16 @@ class _Run:
         return list(self._reached())
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None, first: FirstGaussians | None) -> None:
-        budget, speed = run.config.budget, None
-        if budget.min_fps is not None:
-            speed = SpeedLimit(run, budget.min_fps)
-            if resumed is not None:
-                speed.restore(resumed.part(_SPEED))
-            speed.begin()
         minutes = run.config.train.minutes
         if minutes is not None:
             run.given = 60 * minutes
             wanted = run.config.train.steps
             refit_seconds = 0.0
             if resumed is None:
-                refit_seconds = fit_to_time(run, first, lambda line: print(line, flush=True))
+                refit_seconds = fit_to_time(run, first, show)
                 self.loop.total = run.config.total_steps
             self.limits[_TIME] = Deadline(
-                run,
-                wanted,
-                fits=resumed is None,
-                refit_seconds=refit_seconds,
-                save=self._save,
-                on_refit=(lambda: None) if speed is None else speed.hold,
+                run, wanted, fits=resumed is None, refit_seconds=refit_seconds, save=self._save
             )
             self._meter = CostMeter(run, wanted) if resumed is None and self._gaussians is not None else None
         count = count_limit(run)
@@ -310,8 +297,6 @@ class _Run:
             self.limits[_COUNT] = count
             if resumed is not None:
                 count.restore(resumed.part(_COUNT))
-        if speed is not None:
-            self.limits[_SPEED] = speed
 
     def _save_and_evaluate(self, event: Event) -> None:
         match event:
@@ -378,8 +363,6 @@ class _Run:
             yield f"{cost}; {self._how_to_go_on(cost.steps)}"
         if self.limited is not None and self.config.budget.max_mb is not None:
             yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
-        if _SPEED in self.limits:
-            yield self.limits[_SPEED].reached()
 
 
 def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None) -> None:
@@ -388,7 +371,7 @@ def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None
     if changed:
         views = counted(len(changed), "training view")
         line = f"files of {views} have changed since the run began: {named(changed)}"
-        print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
+        warn(line)
 
 
 def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
@@ -398,7 +381,7 @@ def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
         forecast.require_possible()
         warning = forecast.warning()
         if warning is not None:
-            print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)
+            warn(warning)
 
 
 def _free(folder: Path) -> Path:
@@ -466,12 +449,17 @@ def num_cores() -> int:
 
 
 def with_capture(
-    config: Config, *, say: Callable[[str], None] = print, report: ReportProgress = report_nothing
+    config: Config, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> Config:
     """Return the configuration with a capture that can be trained on; what is found for it is kept for other runs."""
     data, model = config.data, config.model
     if model.is_network:
         return config  # its folder holds a capture per person
+    root = data.root
+    folder = capture_folder(root)
+    if folder != root:
+        say(f"{root} is unpacked in {folder}")
+        data = data.model_copy(update={"root": folder})
     if not model.is_posed:
         data = with_poses(data, needs_times=model.may_move, say=say, report=report)
     else:
@@ -481,4 +469,6 @@ def with_capture(
             data = with_found_person(data, say=say, report=report)
         if isinstance(model, HumanModel):
             data = with_fitted_body(data, model, only_if_needed=not model.fit, say=say, report=report)
+    if data.root == folder:  # the archive outlives the cache
+        data = data.model_copy(update={"root": root})
     return config.model_copy(update={"data": data})

@@ -1,1 +1,1 @@
-"""Limits on the result: number of Gaussians, file size, frames per second, minutes."""
+"""Limits on the result: number of Gaussians, file size, minutes."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ class LimitedRun:
     Attributes:
         config: as it is saved in ``folder``; that of the trainer has its limits applied.
         given: seconds that it has.
-        reserve: seconds that its limits need before the end.
     """
 
     folder: Path
@@ -36,7 +34,6 @@ class LimitedRun:
     loop: Loop
     trainer: Trainer[Any]
     given: float = math.inf
-    reserve: float = 0.0
 
     @property
     def used(self) -> float:
@@ -74,9 +71,3 @@ def stage(config: Config, step: int, fraction: float = 0.0) -> int:
     if total > steps:
         return 0
     return sum(max(step / steps, fraction) >= x for x in STAGES) + (step == steps)
-
-
-def two_digits(x: float, rounded: Callable[[float], int]) -> float:
-    """Return ``x``, positive, ``rounded`` to two digits: by ``math.floor`` or ``math.ceil``."""
-    unit = 10.0 ** (math.floor(math.log10(x)) - 1)
-    return rounded(x / unit) * unit

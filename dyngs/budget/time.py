@@ -48,7 +48,6 @@ class Deadline:
         fits: the number of steps may change; otherwise only the end of the time ends the run.
         refit_seconds: what preparing the run anew took last; ``save_seconds``: what saving took.
         save: writes a checkpoint.
-        on_refit: called after the run goes on with a new trainer.
     """
 
     def __init__(
@@ -59,11 +58,10 @@ class Deadline:
         fits: bool,
         refit_seconds: float,
         save: Callable[[], None],
-        on_refit: Callable[[], None],
     ) -> None:
         self.run, self.most_steps, self.fits = run, most_steps, fits
         self.refit_seconds, self.save_seconds = refit_seconds, 0.0
-        self._save, self._on_refit = save, on_refit
+        self._save = save
         self._since: tuple[int, float] | None = None
         self._forecast = Forecast(0, 0.0)
 
@@ -84,7 +82,8 @@ class Deadline:
 
     def steps(self, config: Config, done: int, now: float) -> int:
         """Return how many steps a run of ``config`` should have, after ``done`` in ``now`` seconds."""
-        total, given, reserve = config.train.steps, self.run.given, self.run.reserve
+        total = config.train.steps
+        given = self.run.given
         if self._since is None:
             self._begin(done, now)
             return total
@@ -92,11 +91,11 @@ class Deadline:
             self._begin(done, now)
         since, then = self._since
         pace = (now - then) / max(done - since, 1)
-        if now + 2 * pace + self.save_seconds + reserve > given:
+        if now + 2 * pace + self.save_seconds > given:
             return done
         if not self.fits or done - since < max(total // FITS, 10) or done >= total:
             return total
-        left = AIM * given - now - self.refit_seconds - reserve
+        left = AIM * given - now - self.refit_seconds
         found = fitting_steps(self._forecast, config, done, left, self.most_steps)
         self._begin(done, now)
         worth_it = left > 0 and abs(found - total) > SMALLEST_CHANGE * total
@@ -124,7 +123,6 @@ class Deadline:
         if steps > done:
             start = run.used
             run.exchange(refitted(run.trainer, run.config))
-            self._on_refit()
             prepared = run.used
             self._save()  # a resumed run goes on from here with the new schedules
             now = run.used
@@ -142,7 +140,7 @@ def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[st
     Where fewer than ``FEWEST_STEPS`` fit, the images are halved until they do, or are small.
     """
     fewest = min(FEWEST_STEPS, run.config.train.steps)
-    fitted, most = first_fit(run.config, run.trainer, run.used + run.reserve)
+    fitted, most = first_fit(run.config, run.trainer, run.used)
     side = max(map(max, run.trainer.images.sizes))
     whole = f"at most {counted(most, 'step')} would fit at {side} px"
     is_shrunk = False
@@ -154,7 +152,7 @@ def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[st
         run.config = run.config.model_copy(update={"data": data})
         run.trainer.images.rest()
         run.exchange(assemble(run.config, run.trainer.capture, first=first))
-        fitted, most = first_fit(run.config, run.trainer, run.used + run.reserve)
+        fitted, most = first_fit(run.config, run.trainer, run.used)
         is_shrunk = True
     if is_shrunk:
         minutes = fitted.train.minutes

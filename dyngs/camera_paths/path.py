@@ -13,14 +13,17 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
+from dyngs.camera_paths.foreign import as_document, flat_pose
 from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
 from dyngs.data.geometry import cam_from_opengl, checked_pose
 from dyngs.errors import DyngsError, printable
-from dyngs.files.fields import read_json_object
+from dyngs.files.fields import read_json
+from dyngs.files.limits import require_at_most
 from dyngs.files.write import write_text
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
+_MOST_BYTES = 1 << 26  # of the JSON of a path
 PLACED_PATHS = ("orbit", "spiral", "along")
 
 
@@ -122,19 +125,24 @@ def world_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
     return moved
 
 
-def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
+def read_path(file: Path, world_offset: np.ndarray | None = None, size: tuple[int, int] | None = None) -> CameraPath:
     """Read a camera path from a JSON file (docs/camera_paths.md); cameras are float32 on the CPU.
 
     The file is in the coordinates of the capture, the returned cameras are in the world rebased by ``world_offset``
-    (3,), ``Capture.world_offset``.
+    (3,), ``Capture.world_offset``. ``size``: of the images, for files without one.
 
     Raises:
         DyngsError: names the file, the frame and the key that is missing or wrong.
     """
-    document: dict[str, Any] = read_json_object(file, "a camera path is a JSON object; see docs/camera_paths.md")
+    if file.is_file():
+        require_at_most(file, file.stat().st_size, _MOST_BYTES, "bytes")
+    document, notes = as_document(read_json(file), file)
+    if size is not None and "width" not in document and "height" not in document:
+        document |= {"width": size[0], "height": size[1]}
     given = [name for name in ("frames", "keyframes") if name in document]
     if len(given) != 1 or not isinstance(document[given[0]], list) or not document[given[0]]:
         raise DyngsError(f"{file}: a camera path needs one non-empty list, 'frames' or 'keyframes'; see docs")
+    require_at_most(file, len(document[given[0]]), _MAX_FRAMES, "cameras")
     width, height = (int(_number(document, key, str(file), low=1, high=65536)) for key in ("width", "height"))
     fps = _number(document, "fps", str(file), low=1e-3, high=1000, default=30.0)
     poses, intrinsics, times = _read_cameras(document, given[0], (width, height), file)
@@ -145,7 +153,7 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
         made = interpolate_keyframes(keys, np.arange(num_frames) / fps)
         poses, intrinsics, times = made.cam_from_world, made.intrinsics, made.times
     cameras = Cameras(torch.from_numpy(poses).float(), torch.from_numpy(intrinsics).float(), width, height)
-    path = CameraPath(cameras, fps)
+    path = CameraPath(cameras, fps, notes=notes)
     if times is None:
         return path
     clamped, warnings = _clamped(times.tolist(), str(file))
@@ -241,7 +249,7 @@ def _read_pose(frame: dict[str, Any], where: str) -> np.ndarray:
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
     try:
-        matrix = np.array(frame[given[0]], np.float64)
+        matrix = flat_pose(np.array(frame[given[0]], np.float64))
     except (TypeError, ValueError, OverflowError):
         raise DyngsError(f"{where}: '{given[0]}' must be a 4x4 or 3x4 matrix of numbers") from None
     pose, _ = checked_pose(matrix, f"{where}: '{given[0]}'")

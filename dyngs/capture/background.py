@@ -18,7 +18,7 @@ from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, show
 from dyngs.files.write import write_image
 
 NOISE = 1.5  # least standard deviation of the background that is expected, grey levels
@@ -225,7 +225,7 @@ class _Camera:
 
 
 def with_background_masks(
-    capture: Capture, folder: Path, empty: Path | None = None, say: Callable[[str], None] = print
+    capture: Capture, folder: Path, empty: Path | None = None, say: Callable[[str], None] = show
 ) -> Capture:
     """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is made.
 

@@ -11,6 +11,7 @@ from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
+from dyngs.data.images.video import colour_notes
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
 from dyngs.errors import DyngsError, reading
@@ -46,7 +47,7 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     """
     source = options.root
     with staying_within(source if source.is_dir() else source.parent, options.follow_links), reading(source):
-        paths, fps = _frames_of(source)
+        paths, fps, notes = _frames_of(source)
     numbers = _chosen(options, len(paths))
     videos = {paths[i]: VideoFrame(source, i) for i in numbers} if source.is_file() else {}
     with images_up_to(options.max_megapixels), reading(source):
@@ -82,7 +83,7 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     has_alpha = masks is not None or first.has_alpha
     note = f"{len(numbers)} of {len(paths)} frames, focal length {focal:.0f} px "
     note += "by the EXIF tags" if first.tags.focal_px else "guessed"
-    return Capture(source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note,))
+    return Capture(source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note, *notes))
 
 
 def zoomed(view: View, factor: float, distance: float) -> View:
@@ -96,17 +97,17 @@ def zoomed(view: View, factor: float, distance: float) -> View:
     return replace(view, intrinsics=intrinsics, cam_from_world=pose)
 
 
-def _frames_of(source: Path) -> tuple[Sequence[Path], float | None]:
-    """Return the image files of the frames of a clip, in order, and the frame rate of a video."""
+def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
+    """Return the image files of a clip, in order, and of a video its frame rate and a line on colours."""
     if source.is_file():
         planned = planned_frames(source)
         if not planned.paths:
             raise DyngsError(f"{source}: the video holds no image; copy it again")
-        return planned.paths, planned.info.fps or None
+        return planned.paths, planned.info.fps or None, colour_notes([planned.info])
     images = _images_of(source)
     if not images:
         raise DyngsError(f"{source}: holds no images; give a folder of the frames of a clip, or a video")
-    return [inside(path) for path in images], None
+    return [inside(path) for path in images], None, []
 
 
 def _images_of(folder: Path) -> list[Path]:

@@ -14,8 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.data.images.images import END_MARKERS, ImageHeader, check_image, is_lying, read_header, read_image, read_mask
-from dyngs.data.images.video import VIDEO_SUFFIXES
+from dyngs.data.images.colour_space import UNSPECIFIED, ColourTags, to_srgb
+from dyngs.data.images.images import (
+    END_MARKERS,
+    SUFFIXES,
+    ImageHeader,
+    check_image,
+    is_lying,
+    read_header,
+    read_image,
+    read_mask,
+)
+from dyngs.data.images.video import DECODER_VERSION, VIDEO_SUFFIXES
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside
 from dyngs.files.write import atomic_file, write_image
@@ -23,7 +33,8 @@ from dyngs.files.wrong_place import PHOTO_SUFFIXES
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 """What phones write; read by pillow-heif."""
-_FOR_COLMAP = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+_FOR_COLMAP = {"jpeg": ".jpg", "png": ".png", "tiff": ".tif", "bmp": ".bmp"}
+"""Suffixes of the formats that COLMAP reads, by ``ImageHeader.format_name``."""
 _SAMPLE_BYTES = 2**20
 
 
@@ -53,6 +64,7 @@ def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
             digest.update(os.fsencode(path.relative_to(source.parent)))
             digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
             if path.suffix.lower() in VIDEO_SUFFIXES:
+                digest.update(DECODER_VERSION)
                 with path.open("rb") as file:
                     digest.update(file.read(_SAMPLE_BYTES))
     return digest.hexdigest()[:16]
@@ -70,19 +82,20 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
     result = out.resolve()
     files = [file for file in _files_below(source) if result not in file.resolve().parents]
     taken = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
-    _require_heif([file for file in taken if file.suffix.lower() in HEIF_SUFFIXES], source)
+    _require_heif([file for file in taken if _is_heif(file)], source)
     headers = {photo: _checked(photo) for photo in taken}
     names = _stored_names({photo.relative_to(source): _is_converted(photo, headers[photo]) for photo in taken})
     photos = []
+    conversions = set()
     for photo, header in headers.items():
         relative = photo.relative_to(source)
         target = images / names[relative]
         if not target.exists():
-            _store(photo, target, header)
+            conversions.add(_store(photo, target, header))
         stored = header if header is not None and target.suffix == photo.suffix else read_header(target)
         photos.append(Photo(names[relative].as_posix(), stored, relative.as_posix()))
     left_out = Counter(file.suffix.lower() or "without a suffix" for file in files if file not in headers)
-    notes = []
+    notes = [f"HEIC photos: {conversion}" for conversion in sorted(conversions - {""})]
     if left_out:
         what = ", ".join(f"{count} {suffix}" for suffix, count in sorted(left_out.items()))
         known = ", ".join(sorted(PHOTO_SUFFIXES))
@@ -109,8 +122,8 @@ def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str,
     for index, photo in enumerate(photos):
         stored = stored_in / photo.name
         lies = is_lying(photo.header.tags.orientation) and photo.header.upright_size != photo.header.size
-        is_written = lies or stored.suffix.lower() not in _FOR_COLMAP
-        name = f"{index:06d}" + (".png" if is_written else stored.suffix.lower())
+        is_written = lies or photo.header.format_name not in _FOR_COLMAP
+        name = f"{index:06d}" + (".png" if is_written else _FOR_COLMAP[photo.header.format_name])
         names.append(name)
         if not (images / name).exists():
             if is_written:
@@ -144,16 +157,24 @@ def _require_heif(photos: Sequence[Path], source: Path) -> None:
 
 def _checked(photo: Path) -> ImageHeader | None:
     """Return the header of a photo that is complete; None for HEIC, which is checked when it is converted."""
-    if inside(photo).suffix.lower() in HEIF_SUFFIXES:
+    if _is_heif(photo):
         return None
     header = check_image(photo)
-    if photo.suffix.lower() not in END_MARKERS:
+    if header.format_name not in END_MARKERS:
         read_image(photo)
     return header
 
 
+def _is_heif(photo: Path) -> bool:
+    """Whether the content of a photo is HEIC; JPEG may be named ``.heic``."""
+    with reading(photo), inside(photo).open("rb") as file:
+        begin = file.read(8)
+    is_jpeg = begin.startswith(b"\xff\xd8")
+    return begin[4:] == b"ftyp" or (photo.suffix.lower() in HEIF_SUFFIXES and not is_jpeg)
+
+
 def _is_converted(photo: Path, header: ImageHeader | None) -> bool:
-    if header is None or photo.suffix.lower() == ".gif":
+    if header is None or photo.suffix.lower() not in SUFFIXES:
         return True
     return header.tags.orientation != 1 and header.upright_size == header.size
 
@@ -172,23 +193,32 @@ def _stored_names(converted: dict[Path, bool]) -> dict[Path, Path]:
     return names
 
 
-def _store(photo: Path, target: Path, header: ImageHeader | None) -> None:
+def _store(photo: Path, target: Path, header: ImageHeader | None) -> str:
+    """Store a photo so that readers of ours show it upright; return how its colours were converted, else ""."""
     if header is None:
-        _convert_heif(photo, target)
-    elif not _is_converted(photo, header):
+        return _convert_heif(photo, target)
+    if not _is_converted(photo, header):
         copied(photo.resolve(), target)
     else:
         pixels = read_image(photo, upright=True).numpy()
         is_opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
         write_image(target, pixels[..., :3] if is_opaque else pixels)
+    return ""
 
 
-def _convert_heif(photo: Path, target: Path) -> None:
+def _convert_heif(photo: Path, target: Path) -> str:
     import pillow_heif
+    from PIL import Image
 
     heif: Any = pillow_heif
     with reading(photo, "the image is damaged; copy or convert it again"), heif.HeifImageFile(str(photo)) as image:
         check_size(photo, *image.size)
         rgb, exif = image.convert("RGB"), image.info.get("exif")
+        profile = image.info.get("nclx_profile") or {}
+    primaries = profile.get("color_primaries", UNSPECIFIED)
+    tags = ColourTags(primaries, profile.get("transfer_characteristics", UNSPECIFIED))
+    if tags.conversion:
+        rgb = Image.fromarray(to_srgb(np.asarray(rgb) * np.uint16(257), tags))
     with atomic_file(target) as temporary:
         rgb.save(temporary, exif=exif or b"", compress_level=1)
+    return tags.conversion

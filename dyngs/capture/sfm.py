@@ -22,7 +22,7 @@ from dyngs.capture.sfm_matches import Parallax, angles_deg, matched_pairs, paral
 from dyngs.capture.sfm_work import SfmOptions, SfmTask, quiet_colmap, working
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.images import read_header
-from dyngs.data.images.video import frame_seconds, read_frames, read_numbered_frames
+from dyngs.data.images.video import colour_notes, frame_seconds, probe_video, read_frames, read_numbered_frames
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import write_seconds
 from dyngs.errors import DyngsError, counted
@@ -323,7 +323,8 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
         seconds = frame_seconds(video, len(measures))
         write_seconds(capture, {name: seconds[index] for index, name in names.items()})
         blurred = [names[index] for index in choice.blurred]
-        fields = {"names": list(names.values()), "blurred": blurred, "notes": [choice.summary()]}
+        notes = [*colour_notes([probe_video(video)]), choice.summary()]
+        fields = {"names": list(names.values()), "blurred": blurred, "notes": notes}
         write_text(done, json.dumps(fields))
     stored = {key: tuple(map(str, cast("list[object]", value))) for key, value in read_json_object(done).items()}
     photos = [Photo(name, read_header(images / name), name) for name in stored["names"]]

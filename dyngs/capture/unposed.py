@@ -15,7 +15,7 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
-from dyngs.errors import DyngsError, as_word, counted, reading
+from dyngs.errors import DyngsError, as_word, counted, reading, show
 from dyngs.files.lock import make_once
 from dyngs.files.outputs import note_sources
 from dyngs.files.temporary import cache_folder
@@ -28,7 +28,7 @@ def with_poses(
     data: DataConfig,
     *,
     needs_times: bool = False,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = show,
     report: ReportProgress = report_nothing,
 ) -> DataConfig:
     """Return the options with a capture that has poses as their folder: the same one, unless it has none.

@@ -14,7 +14,6 @@ import errno
 import io
 import os
 import re
-import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -42,8 +41,9 @@ from dyngs.cli import (
     train,
     view,
 )
-from dyngs.cli.arguments import require_outputs_apart
-from dyngs.errors import DyngsError, NoCaptureError, printable, require_name
+from dyngs.cli.arguments import follows_links, require_outputs_apart
+from dyngs.errors import DyngsError, NoCaptureError, printable, quoted, require_name
+from dyngs.files.containment import following_links_of_runs
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -154,13 +154,14 @@ def _dispatch(arguments: list[str]) -> int:
     if "run" not in parsed:
         parser.print_help()
         return 0
-    require_outputs_apart(parsed.parser, parsed)
     try:
-        return parsed.run(parsed)
+        with following_links_of_runs(follows_links(getattr(parsed, "overrides", ()))):
+            require_outputs_apart(parsed.parser, parsed)
+            return parsed.run(parsed)
     except NoCaptureError as error:
         if not (getattr(parsed, "takes_root", False) or getattr(parsed, "resume", None)) or _names_root(parsed):
             raise
-        again = shlex.join(["dyngs", *arguments, "data.root=FOLDER"])
+        again = " ".join(map(quoted, ["dyngs", *arguments, "data.root=FOLDER"]))
         raise DyngsError(f"{error}; if it was moved: `{again}`") from error
 
 

@@ -7,12 +7,12 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, show, warn
 
 if TYPE_CHECKING:
     import torch
@@ -161,8 +161,9 @@ def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> 
 
 
 def add_data_root(parser: argparse.ArgumentParser) -> None:
-    """Add ``data.root=FOLDER`` to a command that reads the capture of a run."""
-    add_overrides(parser, "data.root=FOLDER", "where the capture of the run lies by now")
+    """Add ``data.root=FOLDER`` and ``data.follow_links=true`` to a command that reads the capture of a run."""
+    about = "where the capture of the run lies by now; data.follow_links=true: its files may lie elsewhere"
+    add_overrides(parser, "data.root=FOLDER", about)
     parser.set_defaults(takes_root=True)
 
 
@@ -171,13 +172,23 @@ def data_root(arguments: argparse.Namespace) -> Path | None:
     found = None
     for word in arguments.overrides:
         key, equals, value = word.partition("=")
+        if word in ("data.follow_links=true", "data.follow_links=false"):
+            continue
         if key.strip() != "data.root" or not equals or not value.strip():
             raise DyngsError(
                 f"{word!r}: the run keeps its own configuration; only data.root=FOLDER, where its capture was moved "
-                "to, may be given"
+                "to, and data.follow_links=true may be given"
             )
         found = Path(value.strip())
     return found
+
+
+def follows_links(overrides: Sequence[str]) -> bool:
+    """Return whether overrides say that files of captures may lie outside their folders."""
+    from dyngs.config.yaml_reader import read_override
+
+    leaves = [leaf for word in overrides if word.startswith("data") and "=" in word for leaf in read_override(word)]
+    return any(leaf.keys == ("data", "follow_links") and leaf.value is True for leaf in leaves)
 
 
 def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
@@ -244,13 +255,17 @@ def is_avatar_file(path: Path) -> bool:
 
 
 def run_of_scene_file(path: Path) -> Path:
-    """Return the run folder of a ``scene.dyngs``, and any other path as it is.
+    """Return the run folder of a ``scene.dyngs``, the ``meta.json`` of an unpacked .sog, and any other path as it is.
 
     A run with checkpoints is drawn from those, which a note says.
 
     Raises:
         DyngsError: the file has another name.
     """
+    if path.is_dir():
+        from dyngs.splats.formats import format_to_read, sog_meta
+
+        return path if format_to_read(path) is None else sog_meta(path) or path
     if path.suffix.lower() != ".dyngs" or not path.is_file():
         return path
     from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
@@ -265,9 +280,9 @@ def run_of_scene_file(path: Path) -> Path:
 def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
     """Print notes to stdout and warnings to stderr."""
     for note in notes:
-        print(f"note: {note}")
+        show(f"note: {note}")
     for warning in warnings:
-        print(f"dyngs: warning: {warning}", file=sys.stderr)
+        warn(warning)
 
 
 def print_written(*paths: Path) -> None:

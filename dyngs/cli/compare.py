@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.tables import numbers_table, print_tables
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 
 if TYPE_CHECKING:
     from dyngs.compare.plan import Bench
@@ -100,13 +100,13 @@ def run(arguments: argparse.Namespace) -> int:
         require_same_comparison(bench, plan)
         was_finished = is_finished(bench, plan)
         try:
-            results, left_out = compare(bench, plan, lambda line: print(line, flush=True), arguments.ray)
+            results, left_out = compare(bench, plan, show, arguments.ray)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("finished models are kept; the same command continues") from None
         files = write_report(bench, results, left_out)
     print_tables(numbers_table(about(bench, results), *table_cells(table_rows(results))))
     for name, problem in left_out.items():
-        print(f"left out: {name}: {problem}")
+        show(f"left out: {name}: {problem}")
     if was_finished:
         print(f"{arguments.out or bench.out}: holds just this comparison, finished: nothing was trained")
     print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")

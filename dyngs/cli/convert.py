@@ -32,16 +32,17 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from dyngs.export.redrawn import compare_splats
-    from dyngs.splats.formats import format_of, read_splats, upright, write_splats
+    from dyngs.splats.formats import chosen_variant, format_of, read_splats, upright, write_splats
 
-    format_of(arguments.target)  # before a large file is read
+    # before a large file is read
+    own = chosen_variant(format_of(arguments.target), arguments.spz_version, arguments.compress)
     splat = read_splats(arguments.source, nonfinite="skip")
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
     rotated = upright(splat, arguments.up, arguments.target)
     said = f"up is {rotated.up} in the file" + (f", it was {splat.up}" if rotated.up != splat.up else ", as it was")
     print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
-    written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
+    written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree, own=own)
     print_redrawn(written.notes, [compare_splats(splat, written)])
     print_written(written.path)
     return 0

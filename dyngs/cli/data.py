@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError, as_word, counted
+from dyngs.errors import DyngsError, as_word, counted, show
 
 if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
@@ -76,7 +76,8 @@ def _add_inspect(verbs: args.Commands) -> None:
         "Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos without poses: "
         "size, rate, length, sound, sharpness, motion, and what to run next.",
     )
-    parser.add_argument("path", type=args.input_path, metavar="PATH", help="capture folder, video, or folder of videos")
+    path = "capture (folder or .zip), video, or folder of videos"
+    parser.add_argument("path", type=args.input_path, metavar="PATH", help=path)
     args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
     parser.add_argument("--image", type=args.output_path, metavar="FILE", help="draw cameras and points to this image")
@@ -86,7 +87,7 @@ def _add_inspect(verbs: args.Commands) -> None:
 def _add_sfm(verbs: args.Commands) -> None:
     about = "Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`."
     parser = args.add_command(verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about)
-    images = "folder of photos, a video file, or folder of videos that ran at once"
+    images = "folder or .zip of photos, a video file, or folder of videos that ran at once"
     parser.add_argument("images", type=args.input_path, metavar="IMAGES", help=images)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
@@ -124,8 +125,8 @@ def _add_people(verbs: args.Commands) -> None:
         run_people,
         "find a person in a video and fit the body to them",
         "Find a person in every frame, their silhouette and key points, follow them through the clip, and fit the body "
-        "as `data fit` does. OUT is a capture for `dyngs train human`. MediaPipe does it in an environment of its own, "
-        "or torchvision's R-CNN with weights of yours (docs/person.md).",
+        "as `data fit` does. OUT is a capture for `dyngs train human`. MediaPipe detects the person, in an environment "
+        "of its own (docs/person.md).",
     )
     about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
@@ -133,8 +134,6 @@ def _add_people(verbs: args.Commands) -> None:
     parser.add_argument("--person", type=int, default=1, metavar="N", help="which of several people (1: the largest)")
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
-    about = "weights of torchvision's Keypoint R-CNN, and once more of its Mask R-CNN, instead of MediaPipe"
-    parser.add_argument("--weights", type=args.input_path, action="append", default=[], metavar="FILE", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
 
 
@@ -195,16 +194,18 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, or on videos without poses."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
     from dyngs.capture.unposed import is_videos
+    from dyngs.data.read import capture_folder
 
+    arguments.path = capture_folder(arguments.path)
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
     options = args.data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
-            print(f"also: {problem}")
+            show(f"also: {problem}")
         raise DyngsError(report.problems[0])
-    print(format_report(report))
+    show(format_report(report))
     if arguments.image is not None:
         from dyngs.capture.inspection.report import draw_cameras
 
@@ -220,7 +221,7 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
     if arguments.image is not None:
         raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
     with images_up_to(args.data_section(arguments.overrides).max_megapixels):
-        print(video_report(arguments.path))
+        show(video_report(arguments.path))
     return 0
 
 
@@ -230,8 +231,10 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     from dyngs.capture.sfm import estimate_poses
     from dyngs.capture.sfm_work import SfmOptions
     from dyngs.capture.unposed import is_several_videos
+    from dyngs.data.read import capture_folder
 
-    limits, images, out = args.data_section(arguments.overrides), arguments.images, arguments.out
+    limits, out = args.data_section(arguments.overrides), arguments.out
+    images = capture_folder(arguments.images)
     several = is_several_videos(images)
     if several:
         _require_options_of_videos(arguments)
@@ -252,7 +255,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
             said = poses_of_videos(images, out, options, report)
         else:
             said = estimate_poses(images, out, options, report).summary()
-    print(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
+    show(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
     print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
     return 0
 
@@ -295,20 +298,20 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
+    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
     return 0
 
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
-    from dyngs.human.detection.detector import chosen_detector
     from dyngs.human.detection.find_person import write_found_person
+    from dyngs.human.detection.mediapipe import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
-    detector = chosen_detector(arguments.weights, arguments.mediapipe)
+    detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_found_person(options, arguments.out, detector, report, number=arguments.person)
-    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
 

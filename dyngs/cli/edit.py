@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.errors import DyngsError, as_word
+from dyngs.errors import DyngsError, as_word, show
 
 if TYPE_CHECKING:
     from dyngs.edit.scene_file import Edits
@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _note(text: str) -> None:
-    print(f"note: {text}", flush=True)
+    show(f"note: {text}")
 
 
 def _edits(arguments: argparse.Namespace) -> Edits:

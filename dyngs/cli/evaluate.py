@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.errors import counted
+from dyngs.errors import counted, escaped
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -78,12 +78,12 @@ def report_table(report: EvalReport) -> Table:
         table.add_row(f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB")
     table.add_row("SSIM", f"{report.ssim:.4f}")
     for label, value in (*_rows_of_person(report), *_rows_of_regions(report)):
-        table.add_row(label, escape(value))
+        table.add_row(label, escape(escaped(value)))
     for label, name, value in (("FLIP", "flip", report.flip), (f"LPIPS ({report.lpips_net})", "lpips", report.lpips)):
         reason = escape(report.reasons.get(name, "not measured"))
         table.add_row(label, reason if value is None else f"{value:.4f}")
     for label, value in _rows_over_time(report):
-        table.add_row(label, escape(value))
+        table.add_row(label, escape(escaped(value)))
     field = f", {report.field_mb:.1f} of them the field" if report.num_moving else ""
     deforming = f", {report.deform_fraction:.0%} of the time deforming" if report.num_moving else ""
     table.add_row("image size", f"{report.width}x{report.height} on {report.background}")

@@ -32,20 +32,20 @@ _UNFIT: dict[str, dict[str, str]] = {
         "up": "the page turns with the scene; --from-up names its axis",
         "sh_degree": "the page has the colours of the run",
     },
-    "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up"),
+    "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES, "compress"), "the file has the rest pose, y up"),
     "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface at its time"),
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
     "network": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
     "tracks": _FOR_SPLATS | {"static": "Gaussians that never move have none"},
     "bodies": dict.fromkeys(
-        ("times", "motion", "joints", "folder", "sh_degree", *_PARTS), "the file has the whole clip"
+        ("times", "motion", "joints", "folder", "sh_degree", "compress", *_PARTS), "the file has the whole clip"
     ),
 }
 """Options that do not go with a format, and why."""
 _ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of a person"))
 _ONLY |= {"folder": ("html sog", "html or sog"), "max_gaussians_drawn": ("html", "html --folder")}
-_ONLY |= {"max_change": ("dyngs", "dyngs")}
+_ONLY |= {"max_change": ("dyngs", "dyngs"), "spz_version": ("spz", "spz"), "compress": ("glb", "glb")}
 """Options, the formats that they go with, and how these are asked for."""
 
 _EPILOG = """\
@@ -227,13 +227,14 @@ def _export_splats(
     """Write a sequence if several times of a moving scene are requested, else one file; return the paths."""
     from dyngs.export.redrawn import compare_run
     from dyngs.export.splat_files import scene_part, write_run_levels, write_run_sequence, write_run_splats, writing_of
-    from dyngs.splats.formats import format_named, known_format, read_splats
+    from dyngs.splats.formats import chosen_variant, format_named, known_format, read_splats
 
     own, part = format_named(kind), _part(arguments)
     suffix, scene = own.suffixes[0], scene_part(opened.scene, part)
     if opened.scene.colour is not None:
         args.print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
     how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
+    how = replace(how, own=chosen_variant(own, arguments.spz_version, arguments.compress))
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)

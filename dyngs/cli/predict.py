@@ -6,7 +6,7 @@ import argparse
 
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import as_word, counted
+from dyngs.errors import as_word, counted, show
 
 _EPILOG = """\
 examples:
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     refine = (
         f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""
     )  # fields are not trained
-    print(
+    show(
         f"predicted: {what} from {', '.join(made.views)}\n"
         f"time:      {made.seconds:.2f} s{trained}\n"
         f"written:   {out}\nnext:      dyngs eval {word}{refine}"

@@ -89,10 +89,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for nothing to render, nowhere to write, or an option that does not apply."""
     args.require_motion_for_feet(arguments)
+    arguments.source = args.run_of_scene_file(arguments.source)
     known = command_for(arguments.source)
     if known is not None and not (arguments.source / "config.yaml").is_file():
         raise DyngsError(f"{arguments.source}: nothing that can be drawn; {known}")
-    arguments.source = args.run_of_scene_file(arguments.source)
     is_file = arguments.source.is_file()
     if is_file and arguments.split:
         raise DyngsError(f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json")

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from dyngs.errors import escaped
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -31,5 +33,5 @@ def numbers_table(title: str, head: Sequence[str], cells: Sequence[Sequence[str]
     for name in head[1:]:
         table.add_column(name, justify="right")
     for row in cells:
-        table.add_row(*map(escape, row))
+        table.add_row(*(escape(escaped(cell)) for cell in row))
     return table

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.tables import numbers_table, print_tables
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -101,7 +101,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.ray,
     )
     try:
-        measurements = sweep(runs, plan, print)
+        measurements = sweep(runs, plan, show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished measurements are kept; the same command continues") from None
     files = write_report(runs.out, measurements)

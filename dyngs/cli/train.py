@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
-from dyngs.errors import DyngsError, as_word, counted
+from dyngs.errors import DyngsError, as_word, counted, show
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -37,7 +37,7 @@ All keys are listed in docs/cli.md.
 _LOGGING = tuple(f"train.{name}" for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard"))
 _FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
 """Keys that change nothing that a run ends with."""
-WITH_RESUME = ("train.steps", "data.root", *_FOR_THIS_CALL)
+WITH_RESUME = ("train.steps", "data.root", "data.follow_links", *_FOR_THIS_CALL)
 """Keys that may be given with ``--resume``."""
 
 
@@ -96,7 +96,7 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.server import Serving
     from dyngs.view.training import TrainingView
 
-    return TrainingView(config, Serving(arguments.host, arguments.port), lambda line: print(line, flush=True))
+    return TrainingView(config, Serving(arguments.host, arguments.port), show)
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:

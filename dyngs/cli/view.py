@@ -7,7 +7,7 @@ import threading
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, show
 
 _EPILOG = """\
 examples:
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     args.print_notes(first.notes)
     serving = Serving(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
-        print(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it", flush=True)
+        show(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it")
         wait_for_interrupt()
     print("\nended")
     return 0

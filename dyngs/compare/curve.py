@@ -14,10 +14,11 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import Drawing
+from dyngs.files.limits import read_limited
 from dyngs.metrics import psnr, ssim
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.log import LOG_NAME
+from dyngs.runs.log import LOG_NAME, MOST_LOG_BYTES
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.study.stored import AS_STORED
 from dyngs.training.events import Evaluated, Event, StepDone
@@ -91,7 +92,8 @@ def read_curve(run_dir: Path, split: str) -> tuple[CurvePoint, ...]:
     """Return the points of the log of a run in the order of its steps; lines that are damaged are passed over."""
     seconds, scores = dict[int, float](), dict[int, float]()
     path = run_dir / LOG_NAME
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+    log = read_limited(path, MOST_LOG_BYTES) if path.is_file() else b""
+    for line in log.splitlines():
         try:
             values = json.loads(line)
             if values.get("split") == split:

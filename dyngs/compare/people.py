@@ -22,7 +22,7 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 from dyngs.files.outputs import new_folder
 from dyngs.files.write import write_image, write_text
 from dyngs.gps.pairs import angle, around
@@ -95,7 +95,7 @@ class Method:
 
 
 def compare_people(
-    bench: PeopleBench, out: Path, say: Callable[[str], None] = print
+    bench: PeopleBench, out: Path, say: Callable[[str], None] = show
 ) -> tuple[list[str], list[list[str]]]:
     """Write ``out`` with the scores as .csv, the table as .md, and pictures of truth, prediction and error.
 

@@ -10,7 +10,7 @@ from dyngs.compare.page import page_text
 from dyngs.compare.plan import Bench
 from dyngs.compare.result import Result
 from dyngs.study.plots import can_plot, svg_of, write_files
-from dyngs.study.tables import csv_text, markdown_table
+from dyngs.study.tables import csv_text, markdown_table, markdown_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,9 +53,12 @@ def write_report(bench: Bench, results: Sequence[Result], left_out: Mapping[str,
     """Write the table, the page and, with matplotlib, the plot; return their paths."""
     rows, out = table_rows(results), bench.out
     head, cells = table_cells(rows)
-    missing = "".join(f"\nLeft out: {name}: {problem}\n" for name, problem in left_out.items())
+    missing = "".join(f"\nLeft out: {markdown_text(f'{name}: {problem}')}\n" for name, problem in left_out.items())
     figure = _curves(results) if can_plot() and any(result.curve for result in results) else None
-    texts = {"csv": csv_text(rows), "md": f"{about(bench, results)}\n\n{markdown_table(head, cells)}{missing}"}
+    texts = {
+        "csv": csv_text(rows),
+        "md": f"{markdown_text(about(bench, results))}\n\n{markdown_table(head, cells)}{missing}",
+    }
     svg = "" if figure is None else svg_of(figure)
     texts["html"] = page_text(bench, results, left_out, (about(bench, results), head, cells, svg))
     return write_files(out / STEM, texts, svg, figure)

@@ -30,6 +30,7 @@ from dyngs.config.schema import (
 )
 from dyngs.config.yaml_reader import Leaf, read_file, read_override, require_usable
 from dyngs.errors import DyngsError, as_word, printable
+from dyngs.files.containment import follows_links_of_runs
 from dyngs.files.write import write_text
 from dyngs.files.wrong_place import command_for
 
@@ -38,7 +39,10 @@ RESOLVED_NAME = "config.yaml"
 
 MAX_WHOLE = 2**63 - 1
 """The largest whole number of a configuration."""
+REMOVED_KEYS: dict[tuple[str, ...], object] = {("model", "loose"): False, ("budget", "min_fps"): None}
+"""Keys of earlier versions that configurations of runs may still have, with the value at which they had no effect."""
 MOST_KEYS = 40  # Of a section that are listed in one line
+_FOLLOW_LINKS = ("data", "follow_links")
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
 
@@ -72,7 +76,11 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
         layers.add(read_file(file))
         if file.resolve() not in [packaged.resolve() for packaged in packaged_presets().values()]:
             own |= _own_keys(layers)
-    own |= layers.add_overrides(overrides)
+    given = layers.add_overrides(overrides)
+    if layers.value_at(_FOLLOW_LINKS) and _FOLLOW_LINKS not in given:
+        where = layers.origin_of(_FOLLOW_LINKS)
+        raise DyngsError(f"{where}: no file may allow links; if you trust the capture, give data.follow_links=true")
+    own |= given
     config = _validate(layers)
     _note_requested(config, (), own)
     body = config.data.body
@@ -85,7 +93,8 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     """Return the configuration of a finished or interrupted run.
 
     Args:
-        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one next to the file.
+        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one next to the file, and
+            ``data.follow_links`` has no effect there: see ``dyngs.files.containment.following_links_of_runs``.
         overrides: as in ``load_config``.
         data_root: where the capture lies by now, if it was moved.
     """
@@ -98,9 +107,12 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     if file == path and command_for(path):
         raise DyngsError(f"{path}: not a run folder; {command_for(path)}")
     layers = _Layers()
-    layers.add(read_file(file))
+    leaves = read_file(file)
+    layers.add(x for x in leaves if x.keys not in REMOVED_KEYS or x.value != REMOVED_KEYS[x.keys])
     if not layers.tree.get("data"):
         raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
+    if isinstance(layers.tree["data"], dict):
+        layers.tree["data"]["follow_links"] = follows_links_of_runs()
     body = layers.value_at(("data", "body"))
     if isinstance(body, str):
         layers.tree["data"]["body"] = str(file.parent.absolute() / body)

@@ -21,16 +21,19 @@ from yaml.reader import ReaderError
 
 from dyngs.errors import DyngsError, printable, reason, require_name
 
-MAX_BYTES = 2**20
-"""Largest size of a preset or an override; the longest that we know has 5 KB."""
+MAX_BYTES = 2**18
+"""Largest size of a preset or an override: read in 3 s; the longest that we know has 5 KB."""
 MAX_DEPTH = 40
 """Deepest nesting of mappings and lists; a configuration has 4."""
 _BITS = 63
 """Largest size of an integer."""
 _SHOWN = 100
 """Characters of an override that a message repeats."""
-_ODD_NUMBER = re.compile(r"[-+]?(0\d|\d[\d_]*:)")
+_NUMBER_TAGS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+_ODD_NUMBER = re.compile(r"[-+_\s]*(0[\d_]|[\d_]+:)")
 """YAML 1.1 takes 010 for 8 and 1:30 for 90: nobody means that."""
+_LONGEST_NUMBER = 400
+"""Characters; longer numbers take quadratic time."""
 _EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 
@@ -52,7 +55,7 @@ def read_file(path: Path) -> list[Leaf]:
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
     if len(data) > MAX_BYTES:
-        raise DyngsError(f"{path}: is larger than {MAX_BYTES // 2**20} MiB, no configuration is; give a YAML preset")
+        raise DyngsError(f"{path}: is larger than {MAX_BYTES // 2**10} KiB, no configuration is; give a YAML preset")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -124,11 +127,12 @@ class _PresetLoader(yaml.SafeLoader):
         """Return the value of a node; its text where it only looks like a number or date, or is too large a number."""
         if not isinstance(node, yaml.ScalarNode):
             return super().construct_object(node, deep)  # type: ignore[no-untyped-call]
+        is_number = node.tag in _NUMBER_TAGS
+        if is_number and (_ODD_NUMBER.match(node.value) or len(node.value) > _LONGEST_NUMBER):
+            return node.value
         try:
             value = super().construct_object(node, deep)  # type: ignore[no-untyped-call]
         except Exception:  # of int(), date() and the like, which YAML passes on
-            return node.value
-        if isinstance(value, (int, float)) and _ODD_NUMBER.match(node.value):
             return node.value
         return node.value if isinstance(value, int) and value.bit_length() > _BITS else value
 

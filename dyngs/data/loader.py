@@ -25,9 +25,9 @@ from dyngs.data.images.images import (
     read_image,
     read_mask,
     straight_uint8,
-    target_size,
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
+from dyngs.data.smaller_images import view_size
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
 from dyngs.ops.device import CPU, gpu_memory, sent
@@ -289,8 +289,7 @@ class ImageLoader:
     @property
     def sizes(self) -> list[tuple[int, int]]:
         """Width and height of the images, in px, without decoding any."""
-        options = self._options
-        return [target_size(v.width, v.height, options.downscale, options.longest_side) for v in self._views]
+        return [view_size(view, self._options) for view in self._views]
 
     @property
     def keeps_all(self) -> bool:
@@ -390,7 +389,7 @@ class ImageLoader:
         if view.mask_path is not None:
             mask = read_mask(view.mask_path)
             _require_size(view, view.mask_path, mask.shape, "mask")
-        size = target_size(view.width, view.height, self._options.downscale, self._options.longest_side)
+        size = view_size(view, self._options)
         maps = self._maps(view, size)
         if is_pinhole(view.lens) and size == (view.width, view.height):
             return Decoded(pixels, mask, **maps)
@@ -454,12 +453,11 @@ def check_files(views: Sequence[View]) -> None:
     """Check that all images and masks of ``views`` exist, look complete and have the size of their view."""
     silhouettes = [view.silhouette.path for view in views if view.silhouette]
     paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + silhouettes
-    missing = [path for path in paths if not path.is_file()]
-    if missing:
-        raise DyngsError(
-            f"{len(missing)} of {len(paths)} images are missing, the first is {missing[0]}; restore them or remove "
-            f"them from the capture"
-        )
+    missing = next((path for path in paths if not path.is_file()), None)
+    if missing is not None:
+        is_image = any(view.image_path == missing for view in views)
+        more = ", or leave out views without images (data.skip_missing=true)" if is_image else ""
+        raise DyngsError(f"{missing}: no such file; restore it{more}")
     for view in views:
         header = check_image(view.image_path)
         if header.size_for((view.width, view.height)) != (view.width, view.height):

@@ -15,9 +15,21 @@ from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits,
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
-from dyngs.data.readers import blender, camera_folders, colmap, nerfies, neuman, people_snapshot, zju_mocap
+from dyngs.data.readers import (
+    blender,
+    camera_folders,
+    colmap,
+    nerfies,
+    neuman,
+    people_snapshot,
+    phone_apps,
+    photogrammetry,
+    zju_mocap,
+)
 from dyngs.data.scene_space import normalise_capture
+from dyngs.data.smaller_images import with_smaller_images
 from dyngs.errors import DyngsError, NoCaptureError, reading
+from dyngs.files.archive import is_archive, unpacked
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
 
@@ -35,6 +47,11 @@ FORMATS: tuple[CaptureFormat, ...] = (
     blender.NERFSTUDIO_FORMAT,
     colmap.FORMAT,
     nerfies.FORMAT,
+    phone_apps.POLYCAM_FORMAT,
+    phone_apps.RECORD3D_FORMAT,
+    photogrammetry.METASHAPE_FORMAT,
+    photogrammetry.REALITYCAPTURE_FORMAT,
+    photogrammetry.ODM_FORMAT,
     camera_folders.FORMAT,
     camera_folders.LLFF_FORMAT,
 )
@@ -42,7 +59,7 @@ FORMATS: tuple[CaptureFormat, ...] = (
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
-    """Read the capture in a folder; images are not decoded, only their headers are read.
+    """Read the capture in a folder or a .zip; images are not decoded, only their headers are read.
 
     Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and ``pose_frames`` those
     of a person that become the split pose. Where the format names no test views, every ``test_every``-th image is
@@ -59,7 +76,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         image.cameras, image.rgb_premultiplied  # what to render from, and what should come out
 
     Args:
-        source: the folder, or a ``dyngs.config.DataConfig``: the folder as ``root``, and options such as ``frames``.
+        source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and options such as ``frames``.
         decode_videos: write the chosen frames of videos as image files, see ``images.frame_cache``; otherwise views
             may name files that do not exist yet.
 
@@ -67,8 +84,9 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names the file.
     """
     options = source if isinstance(source, DataConfig) else DataConfig(root=Path(source))
-    root = options.root
-    require_folder(root)
+    require_folder(options.root)
+    root = capture_folder(options.root)
+    options = options.model_copy(update={"root": root})
     with reading(root, "choose another folder or change its permissions"):
         found = [format for format in FORMATS if format.recognise(root)]
     chosen = _chosen_format(options, found)
@@ -86,16 +104,37 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
 
 
 def require_folder(root: Path) -> None:
-    """Check that the folder of a capture exists. Raises NoCaptureError."""
-    if not root.is_dir():
+    """Check that the folder or the archive of a capture exists. Raises NoCaptureError."""
+    if not root.is_dir() and not is_archive(root):
         problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
         raise NoCaptureError(f"{root}: {problem}")
 
 
 def is_capture(root: Path) -> bool:
-    """Whether a folder is recognised as a capture of any format."""
-    with reading(root, "choose another folder or change its permissions"):
-        return root.is_dir() and any(format.recognise(root) for format in FORMATS)
+    """Whether a folder, or an archive, is recognised as a capture of any format."""
+    folder = capture_folder(root)
+    return folder.is_dir() and _is_recognised(folder)
+
+
+def capture_folder(root: Path) -> Path:
+    """Return the folder of a capture: ``root``, or that of an archive, unpacked.
+
+    Many archives hold a single folder, in which the capture lies.
+    """
+    if not is_archive(root):
+        return root
+    folder: Path = unpacked(root)
+    while not _is_recognised(folder):
+        inner = list(folder.iterdir())
+        if len(inner) != 1 or not inner[0].is_dir():
+            break
+        folder = inner[0]
+    return folder
+
+
+def _is_recognised(folder: Path) -> bool:
+    with reading(folder, "choose another folder or change its permissions"):
+        return any(format.recognise(folder) for format in FORMATS)
 
 
 def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFormat:
@@ -116,17 +155,19 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
 
 
 def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
+    if options.skip_missing:
+        capture = _without_missing(capture)
     capture, notes = _with_splits(capture, options)
-    splits = _wide(capture.splits) if options.undistort == "wide" else capture.splits
+    splits, copies = with_smaller_images(capture.root, capture.splits, options)
+    splits = _wide(splits) if options.undistort == "wide" else splits
     for view in all_views(splits):
         _check_places(view)
     splits, tracks, absent = _present_priors(splits, capture.tracks_path)
     if decode_videos:
         frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
-    seen = all_views(splits)
-    missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
-    lacking = [f"{len(missing)} of {len(seen)} images are missing, first {missing[0]}"] if missing else []
+    lacking = _missing(splits)
+    has_alpha, layers = _first_image(splits["train"])
     points, more = _finite_points(capture.points)
     warnings = [*capture.warnings, *_check_names(capture.root, splits)]
     capture = replace(
@@ -135,10 +176,37 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         points=points,
         tracks_path=tracks,
         points_file=capture.points_file if points is not None else None,
-        has_alpha=_first_has_alpha(splits["train"]),
-        warnings=(*warnings, *lacking, *notes, *more, *absent),
+        has_alpha=has_alpha,
+        warnings=(*warnings, *lacking, *layers, *notes, *copies, *more, *absent),
     )
     return normalise_capture(capture if options.body is None else with_fitted_body(capture, options.body))
+
+
+def _is_missing(view: View) -> bool:
+    return view.video is None and not view.image_path.is_file()
+
+
+def _missing(splits: Splits) -> list[str]:
+    """Return a line on the images that are not there, none if all are."""
+    views = all_views(splits)
+    missing = [view.image_path for view in views if _is_missing(view)]
+    return [f"{len(missing)} of {len(views)} images are missing, first {missing[0]}"] if missing else []
+
+
+def _without_missing(capture: Capture) -> Capture:
+    """Return the capture without the views whose images are not there, with a warning."""
+    present: Splits = {}
+    for name, views in capture.splits.items():
+        present[name] = tuple(view for view in views if not _is_missing(view))
+    lines = [f"{line}; these views are left out" for line in _missing(capture.splits)]
+    return replace(capture, splits=present, warnings=(*capture.warnings, *lines))
+
+
+def require_images(capture: Capture) -> Capture:
+    """Return the capture. Raises DyngsError: images of it are missing; says how many."""
+    for line in _missing(capture.splits):
+        raise DyngsError(f"{line}; restore them, or train on the others with data.skip_missing=true")
+    return capture
 
 
 def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[str]]:
@@ -149,10 +217,6 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
     if capture.body is not None:  # people are drawn in the poses of their frames, which are found by their times
         splits = times.times_of_frames(splits)
     new_poses = splits.pop("pose", None)
-    if options.train_cameras is not None:
-        splits = times.split_by_camera(capture.root, splits, options.train_cameras)
-        said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
-        capture = replace(capture, warnings=said)
     by_name: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
@@ -162,6 +226,11 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         raise DyngsError(
             f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
         )
+    splits = times.number_cameras(splits)
+    if options.train_cameras is not None:
+        splits = times.split_by_camera(capture.root, splits, options.train_cameras)
+        said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
+        capture = replace(capture, warnings=said)
     written = splits
     # People move by frame number: of their captures, times within [0, 1] are left as they are.
     splits, notes = times.unit_times(capture.root, splits, stretch=capture.body is None)
@@ -233,15 +302,17 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
     return [f"{len(leaked)} test images are also training images, first {leaked[0]}"] if leaked else []
 
 
-def _first_has_alpha(views: tuple[View, ...]) -> bool:
+def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
+    """Return whether the first readable image has alpha, and a line on the layer of EXR images."""
     for view in views:
         if view.silhouette is not None:
-            return True
+            return True, []
         try:
-            return read_header(view.image_path).has_alpha
+            header = read_header(view.image_path)
         except DyngsError:
             continue
-    return False
+        return header.has_alpha, [f"the layer {header.layer} of EXR images is read"] if header.layer else []
+    return False, []
 
 
 def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[str]]:

@@ -26,6 +26,9 @@ SECONDS_FILE = "times.json"
 """Seconds of the images of a capture, next to them: COLMAP's models have no times."""
 SAME_TIME = 1e-6
 """Times closer than this are the same time: files of one capture are often rounded differently."""
+SAME_POSE = 1e-5
+"""Entries of rotations, and positions in distances of the farthest camera from the mean one, up to which poses of a
+camera that does not move differ by rounding: 0.01 px at a focal length of 1,000 px."""
 MENTIONED_CHANGE = 0.05
 """Times that are scaled by less than this are not mentioned: the last of n times is often written as (n - 1) / n."""
 SCATTERED = 0.5
@@ -282,6 +285,47 @@ def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[
     new = {time: (time - picked[0]) / span if span else 0.0 for time in picked}
     unit = {written: new[time] for written, time in distinct.items() if time in new}
     return {name: tuple(replace(v, time=unit[v.time]) for v in kept if v.time in unit) for name, kept in splits.items()}
+
+
+def number_cameras(splits: Splits) -> Splits:
+    """Return the views with a number for each camera, where they share one although they are of several cameras.
+
+    These are cameras that do not move: each pose repeats at another time, up to rounding, and some
+    times are seen from several poses. The views of a camera get exactly one pose.
+    """
+    views = sorted(all_views(splits), key=lambda view: view.name)
+    if len({view.camera_id for view in views}) != 1 or any(view.time is None for view in views):
+        return splits
+    distinct = distinct_times(views)
+    firsts = dict(zip((view.name for view in views), _first_of_pose(views), strict=True))
+    seen = {(firsts[view.name], distinct[view.time or 0.0]) for view in views}
+    num_times = Counter(first for first, _ in seen)
+    if min(num_times.values()) < 2 or len(seen) == len(set(distinct.values())):
+        return splits
+    cameras = sorted(num_times)
+
+    def numbered(view: View) -> View:
+        first = firsts[view.name]
+        return replace(view, camera_id=cameras.index(first), cam_from_world=views[first].cam_from_world)
+
+    return each_view(splits, numbered)
+
+
+def _first_of_pose(views: Sequence[View]) -> list[int]:
+    """Return for each view the index of the first one with its pose; only up to a pose for every two views."""
+    poses = np.stack([inverse_rigid(view.cam_from_world)[:3] for view in views])
+    centers = poses[:, :, 3] - poses[:, :, 3].mean(axis=0)
+    poses[:, :, 3] = centers / (np.linalg.norm(centers, axis=1).max() or 1.0)
+    rows = poses.reshape(len(views), -1)
+    firsts = np.arange(len(views))
+    left = np.arange(len(views))
+    for _ in range(len(views) // 2):
+        is_same = np.abs(rows[left] - rows[left[0]]).max(axis=1) < SAME_POSE
+        firsts[left[is_same]] = left[0]
+        left = left[~is_same]
+        if not len(left):
+            break
+    return firsts.tolist()
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:

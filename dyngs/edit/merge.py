@@ -11,7 +11,7 @@ import numpy as np
 from dyngs.errors import DyngsError, counted
 from dyngs.export.splat_files import splats_at, up_of
 from dyngs.runs.opened import open_scene
-from dyngs.splats.formats import known_format, read_splats
+from dyngs.splats.formats import format_to_read, read_splats
 from dyngs.splats.rotation import axis_of, joined, turn_between
 from dyngs.splats.similarity import Similarity
 from dyngs.splats.splat_file import SplatFile, splat_options, with_degree
@@ -45,7 +45,7 @@ def merged(
 
 def _still(file: Path) -> tuple[SplatFile, Sequence[float] | None]:
     """Return the Gaussians of a file or a run that does not move, and the direction that is up in them."""
-    if file.is_file() and known_format(file) is not None:
+    if format_to_read(file) is not None:
         splat = read_splats(file, nonfinite="skip")
         return splat, None if splat.up is None else axis_of(splat.up)
     opened = open_scene(file)

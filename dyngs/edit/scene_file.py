@@ -15,7 +15,7 @@ from dyngs.edit.frame import Frame, GeoFrame
 from dyngs.edit.gps import gps_frame
 from dyngs.edit.merge import merged
 from dyngs.edit.run_folder import write_edited_run
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 from dyngs.export.redrawn import Redrawn, compare_run, compare_splats
 from dyngs.export.splat_files import SUFFIX, UP, Writing, read_moment, splats_at, up_of, write_moving
 from dyngs.gaussians.scene import GaussianScene
@@ -25,6 +25,7 @@ from dyngs.runs.opened import Opened, open_scene, opened_scene
 from dyngs.splats.formats import (
     all_suffixes,
     format_of,
+    format_to_read,
     known_format,
     moved_file,
     read_splats,
@@ -112,7 +113,7 @@ class _Source:
 
 
 def edit_scene(
-    source: Path, out: Path, edits: Edits, reads: Sequence[Path] = (), data_root: Path | None = None, tell: Tell = print
+    source: Path, out: Path, edits: Edits, reads: Sequence[Path] = (), data_root: Path | None = None, tell: Tell = show
 ) -> EditedFile:
     """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the format, none is a run.
 
@@ -151,11 +152,12 @@ def write_part(opened: Opened, rows: torch.Tensor, out: Path, time: float | None
 
 
 def _opened(source: Path, data_root: Path | None) -> _Source:
-    if source.is_file() and known_format(source) is not None and data_root is None:
+    own = format_to_read(source)
+    if own is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
         opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), source)
         info = replace(opened.info, world_offset=splat.file_offset)
-        return _Source(replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, format_of(source).up)
+        return _Source(replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, own.up)
     return _Source(open_scene(source, data_root=data_root))
 
 

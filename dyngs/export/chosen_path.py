@@ -146,7 +146,7 @@ def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     if file is None:
         found = _placed(opened, name, options)
     else:
-        found = read_path(file, opened.world_offset)
+        found = read_path(file, opened.world_offset, options.size)
         found = replace(found, cameras=opened.frame.inverse().cameras(found.cameras))
     if options.times is None:
         return found

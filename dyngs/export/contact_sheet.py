@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.files.write import to_uint8
 
 GAP = 6
@@ -82,7 +83,7 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
     linear = np.clip(
         np.asarray(colored.get_pixels(oiio.FLOAT))[..., :3], 0.0, 1.0
     )  # OpenImageIO's tables are in linear light
-    return to_uint8(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+    return to_uint8(srgb_encoded(linear))
 
 
 def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:

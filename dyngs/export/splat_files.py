@@ -22,7 +22,7 @@ from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.formats import Written, fitted, format_named, moved_file, turned_file, write_splats
+from dyngs.splats.formats import Format, Written, fitted, format_named, moved_file, turned_file, write_splats
 from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.sog_levels import write_sog_levels
@@ -40,6 +40,7 @@ class Writing:
     up: str | None = None  # axis that then points up, such as "-y"; None: not known
     sh_degree: int | None = None  # degree of the harmonics in the file; None: as they are, up to what the format holds
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
+    own: Format | None = None  # a variant of the format that the suffix names; None: the usual one
 
 
 AS_THEY_ARE = Writing()
@@ -192,7 +193,7 @@ def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = 
 
 
 def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: Writing) -> Written:
-    return write_splats(path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree)
+    return write_splats(path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree, own=how.own)
 
 
 def _require_no_others(folder: Path, names: Sequence[str], suffix: str) -> None:

@@ -40,6 +40,7 @@ class _Boundary:
 
 
 _boundary: ContextVar[_Boundary | None] = ContextVar("boundary", default=None)
+_links_of_runs: ContextVar[bool] = ContextVar("links_of_runs", default=False)
 _max_megapixels: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
 
 
@@ -51,6 +52,21 @@ def staying_within(root: Path, follow_links: bool = False) -> Iterator[None]:
         yield
     finally:
         _boundary.reset(token)
+
+
+@contextmanager
+def following_links_of_runs(allowed: bool) -> Iterator[None]:
+    """Set whether captures of runs that are opened in the block may name files elsewhere; no run may say so itself."""
+    token = _links_of_runs.set(allowed)
+    try:
+        yield
+    finally:
+        _links_of_runs.reset(token)
+
+
+def follows_links_of_runs() -> bool:
+    """Return whether the innermost block of ``following_links_of_runs`` allows it."""
+    return _links_of_runs.get()
 
 
 @contextmanager

@@ -6,28 +6,47 @@ import json
 import math
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TextIO, TypeGuard
 
 import numpy as np
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
+from dyngs.files.limits import read_limited
 
 LARGEST = 1e30
 """Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
 
 
 def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
-    """Read the JSON object in ``path``; a byte order mark is allowed. ``what``: the error for anything else."""
-    with reading(path, "it must be a JSON file; copy or export it again"):
-        try:
-            fields = json.loads(inside(path).read_text(encoding="utf-8-sig"))
-        except json.JSONDecodeError as error:
-            where = f"{path}, line {error.lineno} column {error.colno}"
-            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
+    """Read the JSON object in ``path``, UTF-8, 16 or 32. ``what``: the error for anything else."""
+    fields = read_json(path)
     if not isinstance(fields, dict):
         raise DyngsError(f"{path}: {what}")
     return fields
+
+
+def read_json(path: Path) -> object:
+    """Read the JSON in ``path``: UTF-8, 16 or 32."""
+    with reading(path, "it must be a JSON file; copy or export it again"):
+        try:
+            return json.loads(read_limited(inside(path)))
+        except json.JSONDecodeError as error:
+            where = f"{path}, line {error.lineno} column {error.colno}"
+            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file within the limit on its size, UTF-8 or, as its first bytes show, UTF-16 or UTF-32."""
+    data = read_limited(inside(path))
+    return data.decode(json.detect_encoding(data))
+
+
+def open_text(path: Path) -> TextIO:
+    """Open a text file for reading, UTF-8 or, as its first bytes show, UTF-16 or UTF-32."""
+    with inside(path).open("rb") as file:
+        start = file.read(4)
+    return path.open(encoding=json.detect_encoding(start))
 
 
 def is_number(value: object) -> TypeGuard[int | float]:

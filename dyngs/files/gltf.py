@@ -191,16 +191,11 @@ class GltfFile:
             raise self.error(f"accessor {index} must hold {kind}, not {accessor.type[:20]!r}; export it again")
         if accessor.bufferView is None or accessor.sparse is not None:
             raise self.error(f"accessor {index} is sparse or has no data; export it with plain accessors")
-        if accessor.bufferView >= len(document.bufferViews):
-            raise self.error(f"accessor {index} refers to a missing buffer view; export it again")
-        view = document.bufferViews[accessor.bufferView]
-        if any("compression" in name for name in view.extensions):
-            raise self.error(f"accessor {index} is compressed; export it without compression")
-        data = memoryview(self._buffer(view.buffer))[view.byteOffset : view.byteOffset + view.byteLength]
+        view, data = self._view(accessor.bufferView, f"accessor {index}")
         stored, width = np.dtype("<" + _TYPES[accessor.componentType]), _WIDTHS[kind]
         stride = view.byteStride or width * stored.itemsize
         needed = accessor.byteOffset + stride * (accessor.count - 1) + width * stored.itemsize
-        if len(data) < view.byteLength or len(data) < needed:
+        if len(data) < needed:
             raise self.error(f"accessor {index} lies outside its buffer; the file is cut off or broken")
         self._count += accessor.count * width
         most = max(_MOST_NUMBERS, 4 * sum(map(len, self._buffers.values())))
@@ -215,6 +210,24 @@ class GltfFile:
         if values.size <= _KEPT_NUMBERS:
             self._kept[index, dtype] = values
         return values
+
+    def view_bytes(self, index: object, who: str) -> bytes:
+        """Return the bytes of a buffer view that ``who`` names. Raises DyngsError: it is missing or cut off."""
+        if not isinstance(index, int) or index < 0:
+            raise self.error(f"{who} names no buffer view; export it again")
+        return bytes(self._view(index, who)[1])
+
+    def _view(self, index: int, who: str) -> tuple[_View, memoryview]:
+        """Return a buffer view and its bytes."""
+        if index >= len(self.document.bufferViews):
+            raise self.error(f"{who} refers to a missing buffer view; export it again")
+        view = self.document.bufferViews[index]
+        if any("compression" in name for name in view.extensions):
+            raise self.error(f"{who} is compressed; export it without compression")
+        data = memoryview(self._buffer(view.buffer))[view.byteOffset : view.byteOffset + view.byteLength]
+        if len(data) < view.byteLength:
+            raise self.error(f"{who} lies outside its buffer; the file is cut off or broken")
+        return view, data
 
     def _buffer(self, index: int) -> bytes:
         if index >= len(self.document.buffers):
@@ -295,6 +308,15 @@ class GlbDocument:
         accessor |= {"count": len(rows), "type": {width: name for name, width in _WIDTHS.items()}[rows.shape[1]]}
         if limits:
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def add_placeholder(self, values: np.ndarray, limits: bool = False) -> int:
+        """Add an accessor of float32 numbers (K, D) that an extension provides; return its index."""
+        kinds = {width: name for name, width in _WIDTHS.items()}
+        accessor: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": kinds[values.shape[1]]}
+        if limits:
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         self._accessors.append(accessor)
         return len(self._accessors) - 1
 

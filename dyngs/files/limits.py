@@ -6,10 +6,12 @@ import math
 import os
 from pathlib import Path
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, require_regular
 
 VARIABLE = "DYNGS_LIMITS"
 """Environment variable that multiplies all limits: 4 allows four times as much of everything."""
+MOST_TEXT_BYTES = 1 << 26
+"""Largest JSON or text file: 64 MiB hold the cameras of 100,000 images."""
 
 
 def allowed(most: int) -> int:
@@ -33,3 +35,15 @@ def require_at_most(where: Path | str, amount: int, most: int, what: str) -> Non
             f"{where}: asks for {shown} {what}, of which {allowed(most):,} are read at most; if you trust the file, "
             f"set the environment variable {VARIABLE}={factor}"
         )
+
+
+def read_limited(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
+    """Return the bytes of a file, at most ``most``, a limit that ``DYNGS_LIMITS`` may raise.
+
+    Raises:
+        DyngsError: it is larger, a pipe or a device.
+        OSError: it cannot be read.
+    """
+    require_regular(path)
+    require_at_most(path, path.stat().st_size, most, "bytes")
+    return path.read_bytes()

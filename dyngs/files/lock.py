@@ -13,7 +13,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, warn
+from dyngs.files.containment import leaving_links
+from dyngs.files.outputs import require_within_run
 
 if sys.platform == "win32":
     import msvcrt
@@ -65,8 +67,12 @@ def writing(folder: Path) -> Iterator[Held]:
 
     Raises:
         InUseError: another process writes there.
-        DyngsError: nobody can.
+        DyngsError: nobody can; a link leads out of the folder.
     """
+    require_within_run(folder)
+    links = leaving_links(folder)
+    if links:
+        raise DyngsError(f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it")
     made = _made(folder)
     try:
         file, locks = _locked(folder / LOCK_NAME)
@@ -138,10 +144,9 @@ def _locked(path: Path) -> tuple[int, bool]:
             return file, True
         except OSError as error:
             if error.errno in _WITHOUT_LOCKS:
-                print(
-                    f"dyngs: warning: {folder}: this file system has no locks ({error.strerror}); "
-                    "see to it that no two commands write into that folder at once",
-                    file=sys.stderr,
+                warn(
+                    f"{folder}: this file system has no locks ({error.strerror}); "
+                    "see to it that no two commands write into that folder at once"
                 )
                 return file, False
             os.close(file)

@@ -17,6 +17,7 @@ SOURCES_NAME = "sources.json"
 """In a capture made of photos or videos: where these lie."""
 _RUN_MARK = "config.yaml"
 """In a run folder, which is no part of the capture that it lies in."""
+_OF_RUNS = ("checkpoints", "scene.dyngs")
 _MAX_SOURCES_BYTES = 2**20
 _Identity = tuple[int | str, int | str]
 
@@ -37,10 +38,11 @@ class Inputs:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
         Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is
-        read; it is a folder that holds a link to an input; or a device, a pipe or the like. A run folder in a capture,
-        an empty folder, and a folder around a capture may be written to.
+        read; it is a folder that holds a link to an input, a device, a pipe or the like; or a link leads it out of
+        its run folder. A run folder in a capture, an empty folder, and a folder around a capture may be written to.
         """
         require_replaceable(out)
+        require_within_run(out)
         if not os.path.lexists(out):
             return
         for folder in self._folders:
@@ -70,6 +72,16 @@ class Inputs:
         single = (path for path in (*self.paths, *_sources(self.paths), *self.elsewhere()) if not path.is_dir())
         paths = (*single, *(path for folder in self._folders for path in _files_below(folder, set())))
         return {identity: path for path in paths if (identity := _identity(path)) is not None}
+
+
+def require_within_run(out: Path) -> None:
+    """Check that no link, as in the run of a stranger, leads an output that lies in a run folder out of it."""
+    for run in out.absolute().parents:
+        if (run / _RUN_MARK).is_file() and any((run / name).exists() for name in _OF_RUNS):
+            place = out if out.is_dir() else out.parent
+            if not place.resolve().is_relative_to(run.resolve()):
+                raise DyngsError(f"{out}: a link leads to {place.resolve()}, out of the run; give another output")
+            return
 
 
 def require_new_folder(out: Path) -> None:

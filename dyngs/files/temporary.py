@@ -6,6 +6,7 @@ import hashlib
 import os
 import platform
 import re
+import secrets
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,28 +17,36 @@ from typing import Literal
 from dyngs.errors import DyngsError
 
 CACHE_VARIABLE = "DYNGS_CACHE_DIR"
-_NAME = re.compile(r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})\.dyngs(?P<suffix>\.[^.]*)?", re.DOTALL)
+_NAME = re.compile(
+    r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})(-[0-9a-f]{12})?\.dyngs(?P<suffix>\.[^.]*)?", re.DOTALL
+)
 
 
 def temporary_beside(path: Path) -> Path:
-    """Return a hidden path next to ``path``, unique to this process, with its suffix; the folder is created if missing.
+    """Create a hidden empty file next to ``path``, with its suffix; the folder is created if missing.
 
-    Temporary files that killed processes left in that folder are removed, once per folder and process.
+    In a shared folder nobody can guess its name and plant a link there. Temporary files that killed processes left in
+    that folder are removed, once per folder and process.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_once(str(path.parent.absolute()), os.getpid())
-    return path.with_name(f".{path.stem}.{os.getpid()}-{_home()}.dyngs{path.suffix}")
+    temporary = _unused_name(path)
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0), 0o666))
+    return temporary
 
 
 def temporary_folder_beside(path: Path) -> Path:
-    """Create an empty temporary folder, to be renamed to ``path``; an earlier one of this process is replaced."""
+    """Create an empty temporary folder, to be renamed to ``path``."""
     try:
-        folder = temporary_beside(path)
-        shutil.rmtree(folder, ignore_errors=True)
+        folder = _unused_name(path)
         folder.mkdir()
     except OSError as error:
         raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
     return folder
+
+
+def _unused_name(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_once(str(path.parent.absolute()), os.getpid())
+    return path.with_name(f".{path.stem}.{os.getpid()}-{_home()}-{secrets.token_hex(6)}.dyngs{path.suffix}")
 
 
 def remove_leftovers(folder: Path, only_ours: Callable[[str], bool] | None = None) -> None:
@@ -99,7 +108,7 @@ def _is_alive(pid: int) -> bool:
     return True
 
 
-def cache_folder(kind: Literal["frames", "poses", "bodies", "people"]) -> Path:
+def cache_folder(kind: Literal["frames", "poses", "bodies", "people", "captures"]) -> Path:
     """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the user's cache."""
     chosen = os.environ.get(CACHE_VARIABLE, "")
     if chosen:

@@ -40,11 +40,6 @@ class HumanModel(_OnTemplate):
         description="learn light that is fixed in the world: colours depend on where the surface faces (with "
         "colour.kind=sh, model.refine=true)",
     )
-    loose: bool = Field(
-        default=False,
-        description="learn how skirts and coats hang and swing, from the pose and how the body has moved; needs a "
-        "capture with frames per second, and model.refine=true",
-    )
     fine_limbs: bool = Field(
         default=True,
         description="four texels instead of one on hands and feet, if one is wider than two pixels of the images",

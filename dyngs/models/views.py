@@ -11,8 +11,8 @@ from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import scaled_intrinsics
-from dyngs.data.images.images import target_size
 from dyngs.data.loader import Image
+from dyngs.data.smaller_images import view_size
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
 OPAQUE = 0.99  # Alpha from which a pixel shows no background
@@ -62,7 +62,7 @@ def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras
     """Return the cameras of ``views`` as images of their training size, one each; no image is read."""
     cameras = []
     for view in views:
-        width, height = target_size(view.width, view.height, options.downscale, options.longest_side)
+        width, height = view_size(view, options)
         intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
         pose = torch.from_numpy(view.cam_from_world).float()
         cameras.append(Cameras(pose[None], torch.from_numpy(intrinsics).float()[None], width, height))

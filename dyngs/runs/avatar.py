@@ -22,10 +22,8 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
-from dyngs.human.avatar.loose import LR as CLOTH
-from dyngs.human.avatar.loose import hold_of
 from dyngs.human.avatar.posing import TERMS, PoseBlendShapes, Skeleton
-from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_cloth, require_shapes
+from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.body_reader import template_path
 from dyngs.models.views import background_colour
@@ -93,8 +91,6 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         tensors |= {"shapes.directions": scene.shapes.directions.half(), "shapes.faces": scene.shapes.faces.int()}
     if scene.light is not None:
         tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
-    if scene.hold is not None:
-        tensors |= {name: x for name, x in scene.learned.values().items() if name in CLOTH}
     file = template_path(model)
     template = TemplateRef(file.name, _sha256(file), model.body is None)
     header = {**asdict(run.info), "near": model.near, "eps2d": model.eps2d, "template": asdict(template)}
@@ -160,7 +156,6 @@ def _check(tensors: Mapping[str, Tensor]) -> None:
     shapes |= {"fit.log_scale": (1,), "reference.trans": (3,), "reference.scale": (1,)}
     if "light" in tensors:
         shapes |= {"light": (TERMS, 3), "normals": (n, 3)}
-    require_cloth({name: x for name, x in tensors.items() if name in CLOTH}, "")
     if not n:
         raise ValueError("there are no Gaussians")
     for name, shape in shapes.items():
@@ -202,14 +197,12 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
         "log_scale": tensors["fit.log_scale"],
         "weights": torch.zeros_like(anchors.weights),
     }
-    values |= {name: tensors[name] for name in ("light", "normals", *CLOTH) if name in tensors}
-    nodes = tensors.get("cloth_nodes")
+    values |= {name: tensors[name] for name in ("light", "normals") if name in tensors}
     return HumanScene(
         gaussians=Gaussians.stored(Gaussians(**part("gaussians.")).tensors()),  # and nothing else
         anchors=anchors,
         skeleton=skeleton,
         clip=reference,
-        learned=new_corrections(reference, skeleton, anchors, tensors.get("normals"), nodes).restored(values),
+        learned=new_corrections(reference, skeleton, anchors, tensors.get("normals")).restored(values),
         shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
-        hold=None if nodes is None else hold_of(anchors.points, nodes),
     )

@@ -17,6 +17,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import camera_center
 from dyngs.data.people_set import captures_in
 from dyngs.errors import DyngsError
+from dyngs.files.limits import read_limited
 from dyngs.files.write import write_text
 
 RECORD_NAME = "capture.json"
@@ -42,7 +43,7 @@ def changed_files(folder: Path, data: DataConfig, capture: Capture | None) -> li
     path = folder / RECORD_NAME
     now = _record(data, capture)
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(read_limited(path))
         change = _change(stored["views"], now["views"])
         files = [name for name, digest in now["files"].items() if stored["files"].get(name) != digest]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # of an earlier version, or damaged

@@ -21,7 +21,8 @@ from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import View
-from dyngs.errors import DyngsError, as_word, reading, require_regular
+from dyngs.errors import DyngsError, as_word, reading
+from dyngs.files.limits import read_limited
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
@@ -33,6 +34,7 @@ from dyngs.training.corrections.camera_refinement import CameraCorrections, Came
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
+_MOST_TIMING_BYTES = 1 << 20
 SCENE_FILE = "scene.dyngs"
 """Name of the .dyngs file that holds a finished run, see ``dyngs.storage``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
@@ -177,8 +179,7 @@ def seconds_at(run_dir: Path, step: int) -> float:
 
 def _read_seconds(run_dir: Path) -> dict[str, float]:
     try:
-        require_regular(run_dir / TIMING_NAME)
-        stored = json.loads((run_dir / TIMING_NAME).read_text(encoding="utf-8"))
+        stored = json.loads(read_limited(run_dir / TIMING_NAME, _MOST_TIMING_BYTES))
         known = {str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()}
         return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}
     except Exception:  # a lost or damaged file costs no more than the times

@@ -229,5 +229,9 @@ def _config_of_begun(folder: Path) -> Config | None:
 
 def _is_same_run(one: Config, other: Config) -> bool:
     """Return whether two runs have the same bytes, whatever they are called, wherever they are, by how many threads."""
-    first, second = (c.model_copy(update={"run": RunConfig(seed=c.run.seed)}) for c in (one, with_body_of(other, one)))
-    return first == second
+    return _what_counts(one) == _what_counts(with_body_of(other, one))
+
+
+def _what_counts(config: Config) -> Config:
+    data = config.data.model_copy(update={"follow_links": False})
+    return config.model_copy(update={"run": RunConfig(seed=config.run.seed), "data": data})

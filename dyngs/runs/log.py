@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from dyngs.errors import DyngsError
+from dyngs.files.limits import read_limited
 from dyngs.files.write import write_text
 from dyngs.training.events import Evaluated, Event, StepDone
 
 LOG_NAME = "log.jsonl"
+MOST_LOG_BYTES = 1 << 28
+"""A line per step has 150 bytes."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def _lines_up_to(path: Path, step: int) -> list[str]:
     if step == 0 or not path.is_file():
         return []
     kept = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_limited(path, MOST_LOG_BYTES).decode(errors="replace").splitlines():
         try:
             if json.loads(line)["step"] <= step:
                 kept.append(line + "\n")

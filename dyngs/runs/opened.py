@@ -19,7 +19,6 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.loose import past_motion, remembering
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
@@ -30,7 +29,7 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.splats.formats import all_suffixes, known_format, read_splats
+from dyngs.splats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.splats.rotation import AXES, inverse
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import Nonfinite, drawing_options
@@ -244,8 +243,6 @@ class Opened(LoadedRun):
             unit = self.info.world_scale
             motion = replace(motion, trans=trans / unit, scale=motion.scale / unit)
         clip = motion_clip(motion)
-        if scene.hold is not None:
-            clip = replace(clip, past=past_motion(clip, np.arange(len(clip)) / motion.fps))
         if not is_fit:
             clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         playing, notes = scene.playing(clip), (*self.notes, *motion.notes)
@@ -311,7 +308,7 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    if path.is_dir() or (path.name == SCENE_FILE and path.exists()):
+    if (path.is_dir() and format_to_read(path) is None) or (path.name == SCENE_FILE and path.exists()):
         return open_run(path if path.is_dir() else path.parent, data_root=data_root)
     if not path.exists():
         raise DyngsError(f"{path}: no such file or folder; give what `dyngs train` or `dyngs export` wrote")
@@ -319,8 +316,8 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
         raise DyngsError(f"{path}: a file, not a run, so it has no capture; leave out data.root")
     if path.suffix.lower() == AVATAR_SUFFIX:
         return Opened(**vars(read_avatar(path)), name=path.name, path=path)
-    if known_format(path) is None:
-        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
+    if format_to_read(path) is None:
+        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()}, .ckpt, .pt)"
         other = command_for(path)
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path, nonfinite=nonfinite)
@@ -379,4 +376,4 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
     if split != "pose" and same_bodies(own, trained):
         return run.renderable
     shown = captured_motion(capture.root, own, split_views(capture, split), avatar.skeleton.joints)
-    return avatar.playing(shown.clip if avatar.hold is None else remembering(shown, capture.fps))
+    return avatar.playing(shown.clip)

@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import IO, Any
 
 from dyngs.config import Config
+from dyngs.errors import escaped
 from dyngs.runs.log import LogRecord, record_of
 from dyngs.training.clock import Forecast
 from dyngs.training.events import Evaluated, Event, Message, StepDone, TotalChanged
@@ -90,6 +91,7 @@ class Progress:
 
     def say(self, line: str) -> None:
         """Show ``line`` above the progress bar."""
+        line = escaped(line)
         with suppress(OSError):
             if self._bar is not None:
                 self._bar.console.print(line, markup=False, highlight=False)

@@ -69,6 +69,15 @@ FORMATS = (
     Format("usd", (".usdc", ".usd", ".usda"), "y", 4, False, ("usd", "read_usd", "write_usd")),
 )
 """All formats; a suffix that ends another one stands after it."""
+SPZ_4 = Format("spz", (".spz",), "y", 4, True, ("spz", "read_spz", "write_spz_4"), (-10.0, 5.9375))
+GLB_OF_SPZ = Format("glb", (".glb",), "y", 3, True, ("gltf", "read_gltf", "write_compressed"), (-10.0, 5.9375))
+"""Other ways to write files of a suffix."""
+SOG_META, SOG_INDEX = "meta.json", "lod-meta.json"
+"""Files of a .sog as a folder, and of one in levels of detail."""
+CHECKPOINT = Format("checkpoint", (".ckpt", ".pt"), "z", 4, False, ("checkpoint", "read_checkpoint", ""))
+"""Read, never written."""
+SYSTEM_OF_UP = {"y": 4, "-y": 6, "z": 12, "-z": 14}
+"""Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot state others."""
 _MOST_LOST = 0.01  # fraction of the Gaussians that may be of a size that a format does not hold, without a note
 
 
@@ -77,7 +86,7 @@ class Written:
     """A file that was written."""
 
     path: Path  # of it
-    splat: SplatFile  # what it is meant to hold, before the format rounded it
+    splat: SplatFile  # what is read from it, but for what the format rounded
     notes: tuple[str, ...] = ()  # a line about each thing that the format could not hold
 
 
@@ -97,6 +106,33 @@ def known_format(path: Path) -> Format | None:
         if any(name.endswith(suffix) and name != suffix for suffix in candidate.suffixes):
             return candidate
     return None
+
+
+def format_to_read(path: Path) -> Format | None:
+    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if it is none.
+
+    A run is none, whatever lies in its folder. Raises DyngsError as of ``sog_meta``.
+    """
+    if path.is_dir():
+        is_run = (path / "config.yaml").is_file()
+        return None if is_run or sog_meta(path) is None else format_named("sog")
+    if sog_meta(path) is not None:
+        return format_named("sog")
+    return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
+
+
+def sog_meta(path: Path) -> Path | None:
+    """Return the ``meta.json`` that is, or lies in, ``path``; None: it is something else.
+
+    Raises DyngsError: it is the index of a .sog in levels of detail.
+    """
+    if path.name == SOG_INDEX or (path / SOG_INDEX).is_file():
+        raise DyngsError(
+            f"{path}: is a .sog in levels of detail; give the {SOG_META} of one of its folders, such as 0_0"
+        )
+    if path.name == SOG_META:
+        return path
+    return path / SOG_META if (path / SOG_META).is_file() else None
 
 
 def format_named(name: str) -> Format:
@@ -121,10 +157,11 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     file.
     """
     path = Path(path)
-    own = format_of(path)
+    own = format_to_read(path) or format_of(path)
     if not path.exists():
         raise DyngsError(f"{path}: no such file")
     require_regular(path)
+    path = sog_meta(path) or path
     with reading(path):
         splat = own.reader(path)
         if splat.up is None:
@@ -134,15 +171,31 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
         return drawable(move_to_origin(splat), path, nonfinite)
 
 
-def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
+def chosen_variant(usual: Format, spz_version: int | None, compress: str | None) -> Format:
+    """Return the format that ``--spz-version`` or ``--compress`` chooses.
+
+    Raises DyngsError: an option of another format.
+    """
+    if spz_version is not None and usual.name != "spz":
+        raise DyngsError(f"--spz-version goes with .spz files, not with {usual.suffixes[0]}")
+    if compress is not None and usual.name != "glb":
+        raise DyngsError(f"--compress goes with .glb files, not with {usual.suffixes[0]}")
+    if compress is not None:
+        return GLB_OF_SPZ
+    return SPZ_4 if spz_version == 4 else usual
+
+
+def write_splats(
+    path: Path | str, splat: SplatFile, *, sh_degree: int | None = None, own: Format | None = None
+) -> Written:
     """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names the format.
 
     ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None: up to what the
-    format holds. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree that the format
-    does not hold.
+    format holds. ``own``: ``SPZ_4`` or ``GLB_OF_SPZ`` instead of the usual format of the suffix. Raises DyngsError: an
+    unknown suffix, no Gaussians, non-finite values, or a degree that the format does not hold.
     """
     path = Path(path)
-    own = format_of(path)
+    own = own or format_of(path)
     whole, notes = fitted(path, own, splat, sh_degree)
     with atomic_file(path) as temporary:
         try:
@@ -150,8 +203,10 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
         except DyngsError as error:
             reason = str(error).removeprefix(f"{temporary}: ")
             raise DyngsError(f"{path}: not written: {reason}") from error
-    if not own.holds_comments and splat.edited != UNMOVED:
-        write_note(path, splat.edited)
+    if own is SPZ_4 and whole.up in SYSTEM_OF_UP:
+        whole = upright(whole, own.up, path)  # as its reader turns what states its axes
+    if not own.holds_comments and whole.edited != UNMOVED:
+        write_note(path, whole.edited)
         notes += (f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does",)
     return Written(path, whole, notes)
 

@@ -2,6 +2,9 @@
 
 A primitive of points with the attributes ``KHR_gaussian_splatting:ROTATION`` (xyzw), ``SCALE`` (linear), ``OPACITY``
 and ``SH_DEGREE_l_COEF_n`` up to degree 3, and ``COLOR_0`` (linear RGB) for viewers that know only points. y is up.
+
+With ``KHR_gaussian_splatting_compression_spz_2`` (a draft of 2025), all of them are in a .spz within the file, whose
+axes are those of the document, as CesiumJS takes them.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.conventions import SH_C0, num_sh_terms
+from dyngs.conventions import SH_C0, RasterizeMode, num_sh_terms
 from dyngs.files.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
@@ -26,8 +29,16 @@ from dyngs.splats.splat_file import (
     header_comments,
     stored_comments,
 )
+from dyngs.splats.spz import packed_spz, unpacked_spz
 
 EXTENSION = "KHR_gaussian_splatting"
+_COMPRESSIONS = f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz"  # the draft has both names
+_PROPERTIES = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
 _POINTS = 0
 _MOST_NODES, _MOST_DEPTH = 4096, 32  # limits on the nodes that are visited, and on those above one another
 
@@ -40,26 +51,56 @@ def read_gltf(path: Path) -> SplatFile:
     """
     file = GltfFile(path)
     found: list[Gaussians] = []
+    mode = RasterizeMode.CLASSIC
     for primitive, world in _primitives(file):
-        own = placed(_gaussians(file, primitive), world)
+        compressed = _compressed(file, primitive)
+        if compressed is not None:
+            mode = compressed.mode
+        own = placed(_gaussians(file, primitive) if compressed is None else compressed.gaussians, world)
         if own is None:
             raise file.error("a node distorts or mirrors its Gaussians; apply its transform before exporting")
         found.append(own)
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
-    return described(SplatFile(joined(found), comments=stored_comments(file.document.asset.extras)), path)
+    return described(SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras)), path)
 
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
     """Write a .glb with one primitive of Gaussians, harmonics up to degree 3."""
     document = GlbDocument()
+    document.json["extensionsUsed"] = [EXTENSION]
+    _write_primitive(path, splat, document, add_gaussians(document, splat.gaussians))
+
+
+def write_compressed(path: Path, splat: SplatFile) -> None:
+    """Write a .glb whose Gaussians are compressed as a .spz; readers that do not know that show nothing.
+
+    Raises DyngsError as ``packed_spz`` does.
+    """
+    document = GlbDocument()
+    view = document.add_bytes(packed_spz(splat))
+    gaussians = splat.gaussians
+    arrays = {"POSITION": gaussians.means, "COLOR_0": gaussians.quats}  # of which only the shapes count
+    arrays |= {f"{EXTENSION}:SCALE": gaussians.means, f"{EXTENSION}:ROTATION": gaussians.quats}
+    for degree in range(1, gaussians.sh_degree + 1):
+        arrays |= {f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}": gaussians.means for k in range(2 * degree + 1)}
+    attributes = {
+        name: document.add_placeholder(array.numpy(), limits=name == "POSITION") for name, array in arrays.items()
+    }
+    own = _PROPERTIES | {"extensions": {_COMPRESSIONS[0]: {"bufferView": view}}}
+    document.json["extensionsUsed"] = document.json["extensionsRequired"] = [EXTENSION, _COMPRESSIONS[0]]
+    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
+    _write_primitive(path, splat, document, primitive)
+
+
+def _write_primitive(path: Path, splat: SplatFile, document: GlbDocument, primitive: dict[str, Any]) -> None:
+    """Write a document with one mesh in one node."""
     document.json["asset"]["extras"] = header_comments(splat)
     document.json |= {
-        "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [add_gaussians(document, splat.gaussians)]}],
+        "meshes": [{"primitives": [primitive]}],
     }
     document.write(path)
 
@@ -84,9 +125,7 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
         name: document.add_numbers(values.astype(np.float32, copy=False), VERTICES, limits=name == "POSITION")
         for name, values in arrays.items()
     }
-    own = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    own |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
-    return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
+    return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _PROPERTIES}}
 
 
 def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
@@ -126,13 +165,33 @@ def _matrix(node: Node) -> np.ndarray:
     return matrix
 
 
-def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
-    own, names = primitive.extensions[EXTENSION], primitive.attributes
-    if not isinstance(own, dict) or "extensions" in own:
-        raise file.error("its Gaussians are compressed by another extension; export them without")
-    for key, known in (("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")):
-        if own.get(key) != known:
+def _compressed(file: GltfFile, primitive: Primitive) -> SplatFile | None:
+    """Return the Gaussians of the .spz that a primitive names; None: they are not compressed.
+
+    Raises DyngsError: compressed in another way, or a kernel or colour space other than those of 3DGS.
+    """
+    own = primitive.extensions[EXTENSION]
+    if not isinstance(own, dict):
+        raise file.error(f"{EXTENSION} is no object; export it again")
+    more = own.get("extensions", {})
+    if not isinstance(more, dict):
+        raise file.error(f"the extensions of {EXTENSION} are no object; export it again")
+    # The draft of the compression leaves out both, which the base extension requires.
+    is_optional = any(name in more for name in _COMPRESSIONS)
+    for key in ("kernel", "colorSpace"):
+        known = _PROPERTIES[key]
+        if own.get(key, known if is_optional else None) != known:
             raise file.error(f"{key} {own.get(key)!r:.40} is not supported, only {known}")
+    for name, value in more.items():
+        if name not in _COMPRESSIONS:
+            raise file.error(f"its Gaussians need the extension {name!r:.80}, which is not supported")
+        view = value.get("bufferView") if isinstance(value, dict) else None
+        return unpacked_spz(file.path, file.view_bytes(view, name))
+    return None
+
+
+def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
+    names = primitive.attributes
 
     def numbers(name: str, kind: str) -> np.ndarray:
         if name not in names:

@@ -55,6 +55,21 @@ def turned(
     )
 
 
+def mirrored(gaussians: Gaussians) -> Gaussians:
+    """Return the mirror image of Gaussians, x becoming -x."""
+    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=gaussians.means.dtype, device="cpu")
+    turn = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=gaussians.quats.dtype, device="cpu")
+    # Of degree l and order m, a harmonic with a cosine of m times the azimuth changes its sign for odd m, one with a
+    # sine for even m.
+    signs = [
+        (-1.0) ** order if order >= 0 else -((-1.0) ** order)
+        for degree in range(gaussians.sh_degree + 1)
+        for order in range(-degree, degree + 1)
+    ]
+    sh = gaussians.sh * torch.tensor(signs, dtype=gaussians.sh.dtype, device="cpu")[:, None]
+    return gaussians.replace(means=gaussians.means * flip, quats=gaussians.quats * turn, sh=sh)
+
+
 def placed(gaussians: Gaussians, world: np.ndarray) -> Gaussians | None:
     """Return the Gaussians where an affine matrix (4, 4) puts them, None where that distorts or mirrors them.
 

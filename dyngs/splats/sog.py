@@ -1,7 +1,8 @@
 """PlayCanvas' ``.sog``: a zip of lossless WebP images with a pixel per Gaussian, and ``meta.json``; version 2.
 
 Positions take 16 bits per axis on a logarithmic scale, rotations 26 bits, scales and colours index a table of 256
-values, and harmonics above degree 0 a palette of up to 65,536 rows of such indices. Axes are those of the .ply.
+values, and harmonics above degree 0 a palette of up to 65,536 rows of such indices. Axes are those of the .ply. The
+same files may lie in a folder, unpacked.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -19,10 +20,11 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError
 
 from dyngs.conventions import RasterizeMode, num_sh_terms
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, require_regular
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.order import morton_order
+from dyngs.splats.formats import SOG_META
 from dyngs.splats.packing import codebook, largest_and_others, logit, nearest_entries, palette, with_largest
 from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, described, header_comments, stored_comments
 
@@ -80,11 +82,20 @@ class _Meta(_Part):
     shN: _Rest | None = None
 
 
+_Members = Callable[[str, int, str], bytes]
+"""Returns the bytes of a file of the given name, whose size is at most so many of what the last argument says."""
+
+
 def read_sog(path: Path) -> SplatFile:
-    """Read a .sog of version 2. Raises DyngsError if it is damaged or asks for too much memory."""
+    """Read a .sog of version 2, or the ``meta.json`` of an unpacked one.
+
+    Raises DyngsError if it is damaged or asks for too much memory.
+    """
+    if path.name == SOG_META:
+        return _read(path, _in_folder(path))
     try:
         with zipfile.ZipFile(path) as archive:
-            return _read(path, archive)
+            return _read(path, _in_archive(path, archive))
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise DyngsError(f"{path}: is no .sog or is cut off ({str(error)[:80]}); copy or export it again") from error
 
@@ -143,7 +154,7 @@ def sog_parts(splat: SplatFile) -> Iterator[tuple[str, bytes]]:
         images["shN_centroids.webp"] = _palette_image(nearest_entries(values, rows))
         files = ["shN_centroids.webp", labelled]
         meta["shN"] = {"count": len(rows), "bands": gaussians.sh_degree, "codebook": values.tolist(), "files": files}
-    yield "meta.json", json.dumps(meta).encode()
+    yield SOG_META, json.dumps(meta).encode()
     for name, image in images.items():
         yield name, _encoded(image)
 
@@ -165,13 +176,40 @@ def _encoded(image: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
-    meta = _meta(path, archive)
+def _in_archive(path: Path, archive: zipfile.ZipFile) -> _Members:
+    def member(name: str, most: int, what: str) -> bytes:
+        try:
+            info = archive.getinfo(name)
+        except KeyError:
+            raise DyngsError(f"{path}: has no {name:.60}, so it is no .sog; export it again") from None
+        require_at_most(path, info.file_size, most, what)
+        with archive.open(info) as file:
+            return file.read(info.file_size)
+
+    return member
+
+
+def _in_folder(path: Path) -> _Members:
+    def member(name: str, most: int, what: str) -> bytes:
+        file = path.with_name(name) if Path(name).name == name and "\\" not in name else None
+        if file is None or (file.exists() and file.resolve().parent != path.parent.resolve()):
+            raise DyngsError(f"{path}: {name!r:.60} lies outside of its folder; put the file there")
+        require_regular(file)
+        if not file.is_file():
+            raise DyngsError(f"{path}: {name:.60} is missing beside it; export it again")
+        require_at_most(file, file.stat().st_size, most, what)
+        return file.read_bytes()
+
+    return member
+
+
+def _read(path: Path, member: _Members) -> SplatFile:
+    meta = _meta(path, member)
     n = meta.count
     require_at_most(path, n, MOST_GAUSSIANS, "Gaussians")
 
     def pixels(name: str) -> np.ndarray:
-        found = _image(path, archive, name).reshape(-1, 4)
+        found = _image(path, member, name).reshape(-1, 4)
         if len(found) < n:
             raise DyngsError(f"{path}: {name:.60} has {len(found):,} pixels for {n:,} Gaussians; export it again")
         return found[:n]
@@ -188,7 +226,7 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
     base = pixels(meta.sh0.files[0])
     sh = np.array(meta.sh0.codebook, np.float32)[base[:, :3]][:, None]
     if meta.shN is not None:
-        sh = np.concatenate([sh, _rest(path, archive, meta.shN, pixels(meta.shN.files[1]))], axis=1)
+        sh = np.concatenate([sh, _rest(path, member, meta.shN, pixels(meta.shN.files[1]))], axis=1)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats),
@@ -200,9 +238,9 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
     return described(SplatFile(gaussians, mode, comments=stored_comments(meta.asset.comments)), path)
 
 
-def _rest(path: Path, archive: zipfile.ZipFile, rest: _Rest, labels: np.ndarray) -> np.ndarray:
+def _rest(path: Path, member: _Members, rest: _Rest, labels: np.ndarray) -> np.ndarray:
     name, terms = rest.files[0], num_sh_terms(rest.bands) - 1
-    image = _image(path, archive, name)
+    image = _image(path, member, name)
     row = labels[:, 0].astype(np.int64) | (labels[:, 1].astype(np.int64) << 8)
     fits = image.shape[1] == _PER_ROW * terms and image.shape[0] * _PER_ROW >= rest.count
     if not fits or int(row.max()) >= rest.count:
@@ -213,14 +251,10 @@ def _rest(path: Path, archive: zipfile.ZipFile, rest: _Rest, labels: np.ndarray)
     return table[row]
 
 
-def _meta(path: Path, archive: zipfile.ZipFile) -> _Meta:
+def _meta(path: Path, member: _Members) -> _Meta:
+    text = member(SOG_META, _MOST_META_BYTES, f"bytes of {SOG_META}")
     try:
-        info = archive.getinfo("meta.json")
-    except KeyError:
-        raise DyngsError(f"{path}: has no meta.json, so it is no .sog") from None
-    require_at_most(path, info.file_size, _MOST_META_BYTES, "bytes of meta.json")
-    try:
-        tree = json.loads(_content(archive, info))
+        tree = json.loads(text)
         if isinstance(tree, dict) and tree.get("version") != 2:
             raise DyngsError(f"{path}: is a .sog of version {tree.get('version', 1)!r:.20}, only 2 is known")
         return _Meta.model_validate(tree)
@@ -232,23 +266,13 @@ def _meta(path: Path, archive: zipfile.ZipFile) -> _Meta:
         raise DyngsError(f"{path}: its meta.json is no .sog's ({problem:.120}); export it again") from error
 
 
-def _image(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
+def _image(path: Path, member: _Members, name: str) -> np.ndarray:
     from PIL import Image
 
+    data = member(name, 8 * _MOST_PIXELS, "bytes of an image")
     try:
-        info = archive.getinfo(name)
-    except KeyError:
-        raise DyngsError(f"{path}: {name:.60} is missing; export it again") from None
-    require_at_most(path, info.file_size, 8 * _MOST_PIXELS, "bytes of an image")
-    try:
-        with Image.open(io.BytesIO(_content(archive, info)), formats=("WEBP", "PNG")) as image:
+        with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
             require_at_most(path, image.width * image.height, _MOST_PIXELS, "pixels of an image")
             return np.asarray(image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DyngsError(f"{path}: {name:.60} cannot be read ({str(error)[:80]}); export it again") from error
-
-
-def _content(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Return the bytes of a member, no more than its header states."""
-    with archive.open(info) as member:
-        return member.read(info.file_size)

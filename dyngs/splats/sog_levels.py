@@ -20,10 +20,10 @@ from dyngs.files.outputs import new_folder, require_new_folder
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import MERGED, Levels, levels_of
 from dyngs.ops.quaternions import rotation_matrices
+from dyngs.splats.formats import SOG_INDEX
 from dyngs.splats.sog import sog_parts
 from dyngs.splats.splat_file import SplatFile
 
-INDEX = "lod-meta.json"
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
 PER_FILE = MERGED**9  # at most, at each level
 COARSEST = 4  # Level, at most; 64 Gaussians of a leaf
@@ -59,7 +59,7 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
             "filenames": names,
             "tree": _joined(list(_leaves(tree, counts, first))),
         }
-        (started / INDEX).write_text(json.dumps(index, separators=(",", ":")), encoding="utf-8")
+        (started / SOG_INDEX).write_text(json.dumps(index, separators=(",", ":")), encoding="utf-8")
     return counts
 
 

@@ -2,7 +2,8 @@
 
 Versions 1 to 3 are one gzip stream of a 16-byte header and the attributes one after the other; version 4 is a 32-byte
 header, a table of sizes, and a Zstandard stream per attribute, which needs ``pip install 'dyngs[zstd]'``. Version 3 is
-written, which all readers of today know. y is up: axes are right, up, back.
+written by default, which most readers of today know. y is up: axes are right, up, back, unless an extension of the
+header states other ones.
 """
 
 from __future__ import annotations
@@ -10,21 +11,31 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
+from dyngs.splats.formats import SYSTEM_OF_UP
 from dyngs.splats.packing import largest_and_others, logit, with_largest
+from dyngs.splats.rotation import mirrored, turned
 from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
-_ANTIALIASED = 1
+_WHOLE_HEADER = 32  # bytes, of version 4
+_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+_COORDINATE_SYSTEM = 0xADBE0003  # type of Adobe's extension that states one
+_NUM_SYSTEMS = 16
+_STANDARD = 4  # x points right, y up, z back
+_MOST_EXTENSION_BYTES = 1 << 16
 _MOST_RATIO = 1032  # largest compression of deflate
 _MOST_BYTES = 1 << 31
 _COLOUR_SCALE = 0.15
@@ -34,8 +45,15 @@ _TOP = (1 << 9) - 1
 
 
 def read_spz(path: Path) -> SplatFile:
-    """Read a .spz of version 1 to 4. Raises DyngsError if it is damaged or asks for too much memory."""
-    data = path.read_bytes()
+    """Read a .spz of version 1 to 4, turned to y up where it states other axes.
+
+    Raises DyngsError if it is damaged or asks for too much memory.
+    """
+    return unpacked_spz(path, path.read_bytes())
+
+
+def unpacked_spz(path: Path, data: bytes) -> SplatFile:
+    """Return what the bytes of a .spz hold; ``path`` is for messages. Errors as of ``read_spz``."""
     if data[:4] == _MAGIC:
         return _read_streams(path, data)
     if data[:2] != b"\x1f\x8b":
@@ -50,21 +68,54 @@ def read_spz(path: Path) -> SplatFile:
     total = _HEADER.size + sum(sizes.values())
     require_count(path, count, _MOST_RATIO * len(data), total / max(count, 1))
     require_at_most(path, total, _MOST_BYTES, "bytes of Gaussians")
-    content = _inflated(path, data, total)
+    more = _MOST_EXTENSION_BYTES if flags & _HAS_EXTENSIONS else 0
+    content = _inflated(path, data, total + more)
     if len(content) < total:
         raise DyngsError(f"{path}: is truncated: {count:,} Gaussians need {total:,} bytes, found {len(content):,}")
     parts, start = {}, _HEADER.size
     for name, size in sizes.items():
         parts[name] = np.frombuffer(content, np.uint8, size, start)
         start += size
-    return _splat(path, parts, version, degree, fraction_bits, flags)
+    splat = _splat(path, parts, version, degree, fraction_bits, flags)
+    return _standard_axes(path, splat, content[total:] if more else b"")
 
 
 def write_spz(path: Path, splat: SplatFile) -> None:
-    """Write a .spz of version 3.
+    """Write a .spz of version 3. Raises DyngsError as ``packed_spz`` does."""
+    path.write_bytes(packed_spz(splat))
+
+
+def write_spz_4(path: Path, splat: SplatFile) -> None:
+    """Write a .spz of version 4, which states its coordinate system if up is known.
+
+    Raises DyngsError: as ``packed_spz`` does, or the package zstandard is missing.
+    """
+    head, *parts = _packed_parts(splat)
+    compressor = _zstandard(path).ZstdCompressor(level=12)
+    streams = [compressor.compress(part) for part in parts if part]
+    extensions = b""
+    if splat.up is not None and splat.up in SYSTEM_OF_UP:
+        extensions = struct.pack("<III", _COORDINATE_SYSTEM, 4, SYSTEM_OF_UP[splat.up])
+    _, _, count, degree, fraction_bits, flags, _ = _HEADER.unpack(head)
+    flags |= _HAS_EXTENSIONS if extensions else 0
+    start = _WHOLE_HEADER + len(extensions)
+    head = _HEADER.pack(_MAGIC, 4, count, degree, fraction_bits, flags, len(streams)) + struct.pack("<I12x", start)
+    sizes = [(len(stream), len(part)) for stream, part in zip(streams, filter(None, parts), strict=True)]
+    table = b"".join(struct.pack("<QQ", *size) for size in sizes)
+    path.write_bytes(b"".join([head, extensions, table, *streams]))
+
+
+def packed_spz(splat: SplatFile) -> bytes:
+    """Return the bytes of a .spz of version 3.
 
     Raises DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
     """
+    compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
+    return b"".join([*(compressor.compress(part) for part in _packed_parts(splat)), compressor.flush()])
+
+
+def _packed_parts(splat: SplatFile) -> list[bytes]:
+    """Return the header of version 3 and the attributes, in the order of the file."""
     gaussians = splat.gaussians
     means = gaussians.means.double().numpy()
     extent = float(np.abs(means).max())
@@ -80,7 +131,7 @@ def write_spz(path: Path, splat: SplatFile) -> None:
     coded_sh = np.clip(np.round(sh * 128 / step) * step + 128, 0, 255).astype(np.uint8)
     colours = gaussians.sh[:, 0].numpy() * (_COLOUR_SCALE * 255) + 0.5 * 255
     flags = _ANTIALIASED if splat.mode is RasterizeMode.ANTIALIASED else 0
-    parts = [
+    return [
         _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.sh_degree, fraction_bits, flags, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
         _as_bytes(gaussians.opacities.numpy() * 255),
@@ -89,8 +140,6 @@ def write_spz(path: Path, splat: SplatFile) -> None:
         _packed_rotations(gaussians.quats.numpy()).astype("<u4").tobytes(),
         coded_sh.tobytes(),
     ]
-    compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
-    path.write_bytes(b"".join([*(compressor.compress(part) for part in parts), compressor.flush()]))
 
 
 def _sizes(path: Path, version: int, count: int, degree: int) -> dict[str, int]:
@@ -114,7 +163,7 @@ def _inflated(path: Path, data: bytes, most: int) -> bytes:
 
 
 def _read_streams(path: Path, data: bytes) -> SplatFile:
-    if len(data) < 32:
+    if len(data) < _WHOLE_HEADER:
         raise DyngsError(f"{path}: is truncated: it ends within its header")
     _, version, count, degree, fraction_bits, flags, streams = _HEADER.unpack(data[:16])
     start = int.from_bytes(data[16:20], "little")
@@ -133,16 +182,61 @@ def _read_streams(path: Path, data: bytes) -> SplatFile:
         parts[name] = np.frombuffer(_unpacked(path, data[begin : begin + packed], size), np.uint8)
         begin += packed
     parts.setdefault("sh", np.zeros(0, np.uint8))
-    return _splat(path, parts, version, degree, fraction_bits, flags)
+    splat = _splat(path, parts, version, degree, fraction_bits, flags)
+    return _standard_axes(path, splat, data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b"")
 
 
-def _unpacked(path: Path, data: bytes, size: int) -> bytes:
+def _standard_axes(path: Path, splat: SplatFile, extensions: bytes) -> SplatFile:
+    """Return the contents with x right, y up and z back, given the extensions of the file: type, size and value."""
+    start = 0
+    while start < len(extensions):
+        kind, size = (int.from_bytes(extensions[start + i : start + i + 4], "little") for i in (0, 4))
+        value = extensions[start + 8 : start + 8 + size]
+        start += 8 + size
+        if start > len(extensions):
+            raise DyngsError(f"{path}: is damaged in its extensions; copy or export it again")
+        if kind == _COORDINATE_SYSTEM:
+            return _from_system(path, splat, int.from_bytes(value, "little"))
+    return splat
+
+
+def _from_system(path: Path, splat: SplatFile, number: int) -> SplatFile:
+    """Return the contents in standard axes, given in the coordinate system of that number; 0 states none.
+
+    Bits of the number, less one: x points right, y up, z to the front; with the fourth bit z is the vertical axis, and
+    the third bit is y to the back.
+    """
+    if number > _NUM_SYSTEMS:
+        raise DyngsError(
+            f"{path}: states coordinate system {number}, but only 1 to {_NUM_SYSTEMS} exist; export it again"
+        )
+    if number in (0, _STANDARD):
+        return splat
+    right, up, front, is_z_vertical = ((number - 1) >> bit & 1 for bit in range(4))
+    axes = np.diag([2.0 * right - 1, 2.0 * up - 1, 1 - 2.0 * (front ^ is_z_vertical)])
+    if is_z_vertical:
+        axes = axes[:, [0, 2, 1]]
+    gaussians = splat.gaussians
+    if np.linalg.det(axes) < 0:
+        gaussians = mirrored(gaussians)
+        axes[:, 0] *= -1
+    x, y, z, w = Rotation.from_matrix(axes).as_quat(canonical=True).tolist()
+    note = "it states other axes than right, up and back: turned to those"
+    return replace(splat, gaussians=turned(gaussians, (w, x, y, z)), notes=(*splat.notes, note))
+
+
+def _zstandard(path: Path) -> Any:
     try:
         import zstandard
     except ImportError:
         raise DyngsError(
             f"{path}: a .spz of version 4 needs the package zstandard: pip install 'dyngs[zstd]' (version 3 does not)"
         ) from None
+    return zstandard
+
+
+def _unpacked(path: Path, data: bytes, size: int) -> bytes:
+    zstandard = _zstandard(path)
     try:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
             content = stream.read(size)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
@@ -20,6 +19,7 @@ import numpy as np
 
 from dyngs.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.errors import DyngsError
+from dyngs.files.child import python_command
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats import usd_child
@@ -41,9 +41,8 @@ def read_usd(path: Path) -> SplatFile:
     require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of a USD file")
     with TemporaryDirectory(prefix="dyngs-usd-") as folder:
         out = Path(folder) / "arrays.npz"
-        places = os.pathsep.join(name for name in sys.path if name)  # the child finds the same packages
-        environment = os.environ | {"PYTHONPATH": places, "PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
-        command = [sys.executable, "-m", usd_child.__name__, str(path.resolve()), str(out)]
+        environment = os.environ | {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
+        command = python_command(usd_child.__name__, str(path.resolve()), str(out))
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=_SECONDS, check=False, env=environment, errors="replace"
         )

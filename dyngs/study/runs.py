@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,6 +11,8 @@ from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
+from dyngs.files.child import home_of_dyngs
+from dyngs.files.containment import following_links_of_runs, follows_links_of_runs
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Listener
 
@@ -45,15 +48,28 @@ def done_in_turn(
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise DyngsError("--ray needs the package ray; run pip install 'dyngs[ray]'") from None
-    ray.init()
+    here = os.getcwd()
+    os.chdir(home_of_dyngs())  # Ray's processes import modules from the folder that is the current one here
     try:
-        remote: Any = ray.remote(num_cpus=ray_cores)(_attempted)
-        waiting = {remote.remote(do, task): task for task in tasks}
+        ray.init()
+    finally:
+        os.chdir(here)
+    try:
+        remote: Any = ray.remote(num_cpus=ray_cores)(_attempted_in)
+        links = follows_links_of_runs()
+        waiting = {remote.remote(here, links, do, task): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting))
             yield waiting.pop(ready), ray.get(ready)
     finally:
         ray.shutdown()
+
+
+def _attempted_in(folder: str, links: bool, do: Callable[[T], R], task: T) -> R | DyngsError:
+    """Attempt a task in another process, with the current folder and permissions of that which asks for it."""
+    os.chdir(folder)
+    with following_links_of_runs(links):
+        return _attempted(do, task)
 
 
 def _attempted(do: Callable[[T], R], task: T) -> R | DyngsError:

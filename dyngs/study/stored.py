@@ -9,7 +9,8 @@ from typing import Any, TypeVar, cast
 
 from pydantic import ConfigDict, TypeAdapter
 
-from dyngs.errors import DyngsError, printable, reading, require_regular
+from dyngs.errors import DyngsError, printable, reading
+from dyngs.files.limits import read_limited
 from dyngs.files.write import write_text
 
 AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -20,8 +21,7 @@ T = TypeVar("T")
 def read_stored(path: Path, kind: TypeAdapter[T], what: str) -> T:
     """Return a result. Raises DyngsError: the file is damaged; ``what`` it should be is said."""
     with reading(path, f"it is no {what}: remove it to have it measured again"):
-        require_regular(path)
-        return kind.validate_json(path.read_bytes())
+        return kind.validate_json(read_limited(path))
 
 
 def write_stored(path: Path, values: Mapping[str, Any]) -> None:
@@ -38,7 +38,7 @@ def require_same_study(path: Path, facts: Mapping[str, object], compared: Sequen
         write_stored(path, facts)
         return
     try:
-        known = cast(object, json.loads(path.read_text(encoding="utf-8")))
+        known = cast(object, json.loads(read_limited(path)))
     except (ValueError, RecursionError):
         known = None
     if not isinstance(known, dict):

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
+from dyngs.files.child import python_command
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
 from dyngs.tradeoff.measure import variant_drawing
@@ -77,7 +78,8 @@ class MemoryMeter:
     def _started(self) -> subprocess.Popen[str] | None:
         """Return the process, started by the first measurement; in a session of its own, so that Ctrl-C spares it."""
         if self._process is None and _STATUS.is_file():
-            command, pipe = [sys.executable, "-m", "dyngs.tradeoff.memory"], subprocess.PIPE
+            command = python_command("dyngs.tradeoff.memory")
+            pipe = subprocess.PIPE
             self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
         return self._process
 

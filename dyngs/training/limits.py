@@ -51,9 +51,11 @@ def shared(config: Config, processes: Processes) -> Config:
     """Return ``config`` for so many processes: with one view for each of them where one per step was asked for."""
     if processes.size == 1:
         return config
-    for key, value in {"train.minutes": config.train.minutes, "budget.min_fps": config.budget.min_fps}.items():
-        if value is not None:
-            raise DyngsError(f"{key}={value:g}: is measured with one process; leave it out, or start without torchrun")
+    minutes = config.train.minutes
+    if minutes is not None:
+        raise DyngsError(
+            f"train.minutes={minutes:g}: is measured with one process; leave it out, or start without torchrun"
+        )
     if config.train.batch_size == 1:
         config = config.model_copy(update={"train": config.train.model_copy(update={"batch_size": processes.size})})
     processes.share(config.train.batch_size)

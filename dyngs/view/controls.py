@@ -15,6 +15,7 @@ from dyngs.view.captured_views import has_timeline, views_of
 from dyngs.view.edit_controls import EditControls, can_be_edited
 from dyngs.view.frusta import Frusta
 from dyngs.view.layers import LAYERS, PARTS, draw, shows_filled
+from dyngs.view.markdown import as_text
 from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion
 from dyngs.view.recording import Keyframe, Recording
 from dyngs.view.source import MOST_IMAGES, PeopleNetwork, Source
@@ -180,7 +181,7 @@ class Controls:
 def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
     gui.add_markdown(HELP)
     for note in opened.notes:
-        gui.add_markdown(f"*{note}*")
+        gui.add_markdown(f"*{as_text(note)}*")
 
 
 def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None:

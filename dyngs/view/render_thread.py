@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable
+from contextvars import copy_context
 
 from dyngs.errors import DyngsError
 from dyngs.view.session import Session
@@ -50,7 +51,7 @@ class Drawer:
 
     def start(self) -> None:
         """Draw in a thread of its own."""
-        self._thread = threading.Thread(target=self._run, name="dyngs-view", daemon=True)
+        self._thread = threading.Thread(target=copy_context().run, args=(self._run,), name="dyngs-view", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:

@@ -16,6 +16,7 @@ from dyngs.runs.opened import Opened
 from dyngs.view.cameras import fitting_fov, look_point, pose_of
 from dyngs.view.captured_views import viewpoint_of, views_of
 from dyngs.view.gate import free_port, gate_for, guarded, link_to, port_taken
+from dyngs.view.markdown import as_text
 from dyngs.view.pace import Pace
 from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Eye, Sent, Session
@@ -104,7 +105,7 @@ class Browsing:
         rate = self._since_told / max(now - self._told_at, 1e-6)
         shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
         view = self.session.shown_view
-        truth = "" if view is None else f", truth: {views_of(self.session.opened).names[view]}"
+        truth = "" if view is None else f", truth: {as_text(views_of(self.session.opened).names[view])}"
         if self.status is not None:
             self.status.content = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}{truth}"
         if self.time_slider is not None and self.session.timeline.playing:

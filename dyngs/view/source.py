@@ -19,6 +19,7 @@ from dyngs.files.wrong_place import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import Opened, open_scene
+from dyngs.splats.formats import format_to_read
 from dyngs.view.layers import coarser
 
 _DEEPEST = 3
@@ -123,7 +124,7 @@ def open_source(
     def shown(opened: Opened) -> Opened:
         return opened.to(device) if most is None else coarser(opened.to(device), most)
 
-    if not path.is_dir() or _is_run(path):
+    if not path.is_dir() or _is_run(path) or format_to_read(path) is not None:
         name = path.name or str(path)
         return Source((name,), lambda _: shown(open_to_view(path, name, up, data_root)))
     if data_root is not None:

@@ -53,8 +53,9 @@ BUSY = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset
 BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90, min_opacity=0.45)
 
 IN_TERMINAL = """
-import fcntl, sys, termios
+import fcntl, signal, sys, termios
 from dyngs.__main__ import main
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup pytest: children inherit that it is ignored
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)  # signals of the terminal reach this process
 sys.argv = ["dyngs", "train", sys.argv[1], f"run.dir={sys.argv[2]}"]
 sys.exit(main())

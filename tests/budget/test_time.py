@@ -98,7 +98,7 @@ def simulated(seconds: float, most_steps: int, *, fits: bool) -> Deadline:
     trainer = Counting()
     loop = Loop(trainer, most_steps, Stopwatch())
     run = LimitedRun(Path("nowhere"), PLAIN, loop, cast(Trainer, trainer), given=seconds)
-    return Deadline(run, most_steps, fits=fits, refit_seconds=0.0, save=lambda: None, on_refit=lambda: None)
+    return Deadline(run, most_steps, fits=fits, refit_seconds=0.0, save=lambda: None)
 
 
 @pytest.mark.parametrize("factor", [0.3, 1.0, 4.0])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hdr_clips import BT2020, PQ, encoded, patches
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -76,6 +77,53 @@ def test_heic_becomes_png_with_its_tags(tmp_path: Path, orientation: int) -> Non
     heif = pytest.importorskip("pillow_heif")
     shown = np.asarray(heif.HeifImageFile(tmp_path / "photos" / "a.HEIC").convert("RGB"))
     assert np.array_equal(stored, shown)
+
+
+def test_hdr_heic_is_tone_mapped_with_a_note(tmp_path: Path) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    levels = np.round(65535 * encoded(patches(), BT2020, PQ)).astype(np.uint16)
+    (tmp_path / "photos").mkdir()
+    heif.from_bytes(mode="RGB;16", size=(64, 48), data=levels.tobytes()).save(
+        tmp_path / "photos" / "a.HIF",
+        format="HEIF",
+        quality=95,
+        color_primaries=BT2020,
+        transfer_characteristics=PQ,
+        matrix_coefficients=BT2020,
+        full_range_flag=1,
+    )
+    names, notes = _gather(tmp_path)
+    assert notes == ("HEIC photos: PQ is tone-mapped to SDR (white: 203 cd/m2; brighter is clipped)",)
+    stored = read_image(tmp_path / "images" / names["a.HIF"]).numpy()
+    assert np.sqrt(np.mean((stored - 255 * patches()) ** 2)) < 4
+
+
+@pytest.mark.parametrize(
+    ("content", "name"), [("jpeg", "a.png"), ("png", "a.jpg"), ("webp", "a.jpg"), ("webp", "a.png"), ("jpeg", "a.heic")]
+)
+def test_photos_are_read_by_content_whatever_their_name(tmp_path: Path, content: str, name: str) -> None:
+    options = {"jpeg": {"quality": 98, "subsampling": 0}, "webp": {"lossless": True}}
+    _save(tmp_path / "photos" / name, format=content, **options.get(content, {}))
+    photos, _ = gather_photos(tmp_path / "photos", tmp_path / "images", tmp_path / "out")
+    tolerance = 6 if content == "jpeg" else 0
+    stored = read_image(tmp_path / "images" / photos[0].name).numpy().astype(int)
+    assert np.abs(stored - COLOURS).max() <= tolerance
+    (tmp_path / "work").mkdir()
+    (laid,) = lay_out(photos, tmp_path / "images", tmp_path / "work" / "images", {})
+    with Image.open(tmp_path / "work" / "images" / laid) as image:
+        assert image.format is not None
+        assert image.format.lower() in ("jpeg", "png")
+        assert Path(laid).suffix == {"JPEG": ".jpg", "PNG": ".png"}[image.format], (
+            "as programs that trust names read it"
+        )
+        assert np.abs(np.asarray(image).astype(int) - COLOURS).max() <= tolerance
+
+
+def test_heic_that_is_named_as_jpeg(tmp_path: Path) -> None:
+    _save_heic(tmp_path / "photos" / "a.heic").rename(tmp_path / "photos" / "a.jpg")
+    names, _ = _gather(tmp_path)
+    assert names == {"a.jpg": "a.png"}
+    assert np.abs(read_image(tmp_path / "images" / "a.png").numpy().astype(int) - COLOURS).mean() < 10
 
 
 def test_heic_without_its_package_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,12 +9,15 @@ import numpy as np
 import OpenImageIO as oiio
 import pycolmap
 import pytest
+from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 from skimage.transform import resize_local_mean
 
 from dyngs.api.load import read_capture
-from dyngs.capture.sfm import SfmResult, estimate_poses
+from dyngs.capture.sfm import SfmResult, _frames_of, estimate_poses
 from dyngs.capture.sfm_work import SfmOptions
+from dyngs.conventions import report_nothing
 from dyngs.data.capture import all_views
+from dyngs.data.images.images import read_image
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
 from dyngs.errors import DyngsError
 from dyngs.export.video import VideoWriter
@@ -80,6 +83,14 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     for i in registered:
         assert seconds[names[i].removesuffix(".png")] == pytest.approx((i - first) / (last - first))
     assert read_capture(out).seconds == pytest.approx(0.2 * (last - first)), "every second frame of 10 per second"
+
+
+def test_frames_of_hdr_video_are_tone_mapped_with_a_note(tmp_path: Path) -> None:
+    write_clip(tmp_path / "a.mp4", encoded(patches(), BT2020, HLG), (BT2020, HLG, BT2020))
+    found = _frames_of(tmp_path / "a.mp4", tmp_path / "work" / "capture", SfmOptions(), report_nothing)
+    image = read_image(tmp_path / "work" / "capture" / "images" / found.photos[0].name).numpy()
+    assert np.sqrt(np.mean((image - 255 * patches()) ** 2)) < 2.5
+    assert any("1 video: HLG is tone-mapped to SDR" in note for note in found.notes)
 
 
 def test_real_photos_register_and_repeat_bytewise(tmp_path: Path) -> None:

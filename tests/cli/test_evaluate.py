@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import pytest
 from moving_scene import write_moving_run
+from refused import error_line
 
 from dyngs.cli import main
 
@@ -32,3 +35,28 @@ def test_eval_of_a_moving_run(moving_run: Path, capsys: pytest.CaptureFixture[st
     for part in (f"worst at time {worst['time']:g}", "2 (40.0%)", f"{report['flicker']:.3f} of 255", "deforming"):
         assert part in " ".join(text.replace("│", " ").split())
     assert "flicker error" in text
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links")
+def test_only_the_command_line_lets_a_capture_name_files_elsewhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not the run, which may be that of a stranger."""
+    run = write_moving_run(tmp_path)
+    config = run / "config.yaml"
+    assert "follow_links: false" in config.read_text()
+    config.write_text(config.read_text().replace("follow_links: false", "follow_links: true"))
+    image = next((tmp_path / "capture").rglob("*.png"))
+    shutil.move(image, tmp_path / "private.png")
+    image.symlink_to(tmp_path / "private.png")
+    refused = "lies outside the capture"
+    assert refused in error_line(capsys, "eval", run)
+    assert refused in error_line(capsys, "eval", run, "data.follow_links=false")
+    assert refused in error_line(capsys, "train", "--resume", run, "train.steps=9", begun=True)
+    assert main(["eval", str(run), "data.follow_links=true"]) == 0
+    preset = tmp_path / "preset.yaml"
+    preset.write_text(
+        f"data:\n  root: {tmp_path / 'capture'}\n  follow_links: true\nrun: {{dir: {tmp_path / 'new'}}}\n"
+    )
+    assert "preset.yaml:3: no file may allow links" in error_line(capsys, "train", preset)
+    assert not (tmp_path / "new").exists()

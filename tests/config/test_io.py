@@ -347,3 +347,15 @@ def test_folders_of_data_are_absolute_so_that_later_commands_find_them(
     data = load_config("human", ["data.root=capture", "data.body=fits/ann"]).data
     assert (data.root, data.body) == (tmp_path / "capture", tmp_path / "fits" / "ann")
     assert load_config("human", ["data.root=capture"]).data.body is None
+
+
+def test_a_run_of_an_earlier_version_may_have_a_removed_key_that_had_no_effect(tmp_path: Path) -> None:
+    save_config(load_config("human", [ROOT]), tmp_path / "config.yaml")
+    text = (tmp_path / "config.yaml").read_text(encoding="utf-8")
+    for value, works in (("false", True), ("true", False)):
+        (tmp_path / "config.yaml").write_text(text.replace("model:\n", f"model:\n  loose: {value}\n"), encoding="utf-8")
+        if works:
+            assert load_resolved(tmp_path).model.kind == "human"
+        else:
+            with pytest.raises(DyngsError, match=r"unknown key 'model\.loose'"):
+                load_resolved(tmp_path)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from tiny_captures import (
@@ -14,6 +15,7 @@ from tiny_captures import (
     write_cameras_json,
     write_colmap,
     write_folder,
+    write_frames,
     write_image,
     write_nerfies,
     write_poses_bounds,
@@ -29,7 +31,7 @@ from dyngs.data import readers
 from dyngs.data.capture import Capture, CaptureFormat
 from dyngs.data.geometry import camera_center
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import FORMATS
+from dyngs.data.read import FORMATS, require_images
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 
@@ -125,7 +127,7 @@ def test_no_such_folder(tmp_path: Path) -> None:
 def test_nothing_recognised_lists_what_was_looked_for(tmp_path: Path) -> None:
     with pytest.raises(DyngsError) as caught:
         read(tmp_path)
-    files = ("transforms_train.json", "transforms.json", "cameras.bin", "sparse/0")
+    files = ("transforms_train.json", "transforms.json", "cameras.bin", "colmap/sparse/0")
     for wanted in (*files, "dataset.json", "poses_bounds.npy", "cameras.json"):
         assert wanted in str(caught.value)
 
@@ -156,6 +158,41 @@ def test_missing_images_are_a_warning_and_then_an_error_of_the_loader(colmap_roo
     assert "1 of 9 images are missing" in capture.warnings[0]
     with pytest.raises(DyngsError, match=r"left/03\.jpg"):
         ImageLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
+
+
+def test_views_without_images_may_be_left_out(colmap_root: Path) -> None:
+    """Before every n-th of the others is held out; the count is of all splits."""
+    for name in ("left/01.jpg", "left/03.jpg"):
+        (colmap_root / "images" / name).unlink()
+    with pytest.raises(DyngsError, match=r"2 of 9 images are missing, first .*left/03\.jpg; .*skip_missing=true"):
+        require_images(read(colmap_root))
+    capture = require_images(read(colmap_root, skip_missing=True))
+    assert (names(capture, "test"), len(capture.splits["train"])) == (["left/05"], 6)
+    assert any("2 of 9 images are missing" in line and line.endswith("left out") for line in capture.warnings)
+    ImageLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
+
+
+def test_without_any_image_there_is_nothing_to_train_on(nerfstudio_root: Path) -> None:
+    for path in (nerfstudio_root / "images").iterdir():
+        path.unlink()
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(w=12, h=8))
+    with pytest.raises(DyngsError, match="has no training views"):
+        read(nerfstudio_root, skip_missing=True)
+
+
+def test_the_layer_that_is_read_of_exr_images_is_named(tmp_path: Path) -> None:
+    for i in range(4):
+        spec = oiio.ImageSpec(8, 6, 7, "half")
+        spec.channelnames = [*(f"N.{c}" for c in "RGB"), *(f"ViewLayer.Combined.{c}" for c in "RGBA")]
+        output = oiio.ImageOutput.create(str(tmp_path / f"{i}.exr"))
+        assert output.open(str(tmp_path / f"{i}.exr"), spec)
+        assert output.write_image(np.full((6, 8, 7), 0.2 * i, np.float32))
+        output.close()
+    fields = {"fl_x": 8.0, "w": 8, "h": 6}
+    write_frames(tmp_path / "transforms.json", [f"{i}.exr" for i in range(4)], fields)
+    capture = read(tmp_path)
+    assert "the layer ViewLayer.Combined of EXR images is read" in capture.warnings
+    assert capture.has_alpha
 
 
 def test_two_images_of_one_name(nerfstudio_root: Path) -> None:

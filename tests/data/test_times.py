@@ -19,6 +19,7 @@ from dyngs.data.times import (
     clip_seconds,
     distinct_times,
     hold_out_frames,
+    number_cameras,
     parse_frames,
     read_seconds,
     select_frames,
@@ -157,6 +158,46 @@ def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View
         for camera, count in enumerate(counts)
     ]
     return {"train": tuple(v for kept in views[1:] for v in kept), "test": views[0]}
+
+
+def sharing_one_number(splits: Splits, noise: float = 0.0) -> Splits:
+    """Views of camera 0 in the sequence of their times, with poses that differ by rounding."""
+    draw = np.random.default_rng(0)
+
+    def changed(view: View) -> View:
+        pose = np.linalg.inv(view.cam_from_world) + noise * draw.uniform(-1, 1, (4, 4)) * ([1], [1], [1], [0])
+        return replace(view, camera_id=0, cam_from_world=pose)
+
+    return {name: tuple(map(changed, views)) for name, views in splits.items()}
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-6])
+@pytest.mark.parametrize("counts", [[5, 5, 5, 5], [3, 5, 2], [6, 6]])
+def test_poses_that_repeat_at_the_same_times_are_cameras(noise: float, counts: list[int]) -> None:
+    numbered = number_cameras(sharing_one_number(rig(counts), noise))
+    views = all_views(numbered)
+    assert [(v.name, v.camera_id) for v in views] == [(v.name, v.camera_id) for v in all_views(rig(counts))]
+    assert len({v.cam_from_world.tobytes() for v in views}) == len(counts)
+    assert [len(x) for x in videos(views)] == [counts[v.camera_id] for v in views if v.time == 0.0]
+    trained = split_by_camera(ROOT, numbered, (1,))["train"]
+    assert len(trained) == counts[1]
+
+
+@pytest.mark.parametrize("case", ["one_walk", "resting", "scattered", "numbered", "untimed", "one_fixed", "beside"])
+def test_cameras_that_keep_their_numbers(case: str) -> None:
+    walk = [view(f"{i}", i / 10, pose=opengl_pose(0.3 * i)) for i in range(10)]
+    others = [view(f"test{i}", i / 10, pose=opengl_pose(0.3 * i + 0.1)) for i in range(10)]
+    still = [view(f"rest{i}", 2 + i / 10, pose=opengl_pose(0.0)) for i in range(10)]
+    splits = {
+        "one_walk": train(*walk),
+        "resting": train(*walk, *still),  # all one after the other
+        "scattered": {"train": tuple(walk), "test": (*others, replace(walk[3], name="again", time=0.5))},
+        "numbered": rig([4, 4]),
+        "untimed": {"train": tuple(replace(v, camera_id=0, time=None) for v in all_views(rig([4, 4])))},
+        "one_fixed": sharing_one_number(rig([5])),
+        "beside": {"train": tuple(walk), "test": rig([9])["test"]},  # a moving camera and a fixed one
+    }[case]
+    assert number_cameras(splits) is splits
 
 
 def test_different_numbers_of_frames() -> None:

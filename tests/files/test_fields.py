@@ -10,7 +10,7 @@ import pytest
 from measured import cost_of
 
 from dyngs.errors import DyngsError
-from dyngs.files.fields import first_few, numbers_of, read_json_object
+from dyngs.files.fields import first_few, numbers_of, open_text, read_json_object
 
 
 def test_some() -> None:
@@ -34,6 +34,16 @@ def test_texts_among_numbers(tmp_path: Path) -> None:
             numbers_of("x", [shared, shared], None)
 
     assert cost_of(read)[0] < 1e6
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig"])
+def test_other_encodings(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes('{"né": [1]}'.encode(encoding))
+    assert read_json_object(path) == {"né": [1]}
+    path.write_bytes("# né\r\n1 2\r\n".encode(encoding))
+    with open_text(path) as file:
+        assert file.read() == "# né\n1 2\n"
 
 
 def test_an_object_with_a_byte_order_mark(tmp_path: Path) -> None:

@@ -173,6 +173,24 @@ def test_two_trainings_into_one_folder(still: Path, tmp_path: Path, capsys: pyte
     assert load_run(run).step % 5 == 0
 
 
+@pytest.mark.skipif(os.name != "posix", reason="links")
+@pytest.mark.parametrize("name", ["checkpoints", "export", "log.jsonl", "tradeoff/training", "body"])
+def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) -> None:
+    """The run of a stranger may hold links to files and folders of the user, which training would change."""
+    run = tmp_path / "run"
+    (run / name).parent.mkdir(parents=True)
+    (tmp_path / "precious").mkdir()
+    (run / name).symlink_to(tmp_path / "precious")
+    with pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, out of .*run"), writing(run):
+        pytest.fail("it may be written to")
+    assert list((tmp_path / "precious").iterdir()) == []
+    (run / name).unlink()
+    (run / "own").mkdir()
+    (run / name).symlink_to(run / "own")
+    with writing(run):
+        pass
+
+
 # --- folders of the cache ---------------------------------------------------------------------------------------------
 
 

@@ -156,3 +156,22 @@ def test_a_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
     for taken in (out, out / "1.jpg"):
         with pytest.raises(DyngsError, match="exists already; name a new folder"):
             require_new_folder(taken)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links")
+def test_outputs_in_a_run_stay_there(tmp_path: Path) -> None:
+    """A link of a stranger's run must not lead a sequence or a sweep elsewhere; that of the run itself may."""
+    (tmp_path / "disk" / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "disk" / "run" / "config.yaml").touch()
+    (tmp_path / "precious").mkdir()
+    run = tmp_path / "run"
+    run.symlink_to(tmp_path / "disk" / "run")
+    for name in ("frames", "tradeoff/training/one"):
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
+        Inputs(()).require_output(run / name)
+        (run / name).symlink_to(tmp_path / "precious")
+        for out in (run / name, run / name / "frame_0000.ply", run / name / "new" / "a.png"):
+            with pytest.raises(DyngsError, match=r"a link leads to .*precious.*, out of the run"):
+                Inputs(()).require_output(out)
+    (run / "splats.ply").symlink_to(tmp_path / "precious.ply")
+    Inputs(()).require_output(run / "splats.ply")  # an atomic file replaces the link itself

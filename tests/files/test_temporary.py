@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from dyngs.errors import DyngsError
 from dyngs.files.temporary import remove_leftovers, temporary_beside, temporary_folder_beside
 from dyngs.files.write import write_text
 
@@ -38,7 +39,6 @@ def test_the_next_process_that_writes_there_cleans_up(tmp_path: Path) -> None:
 
 def test_what_lives_and_what_is_not_ours_stays(tmp_path: Path) -> None:
     mine = temporary_beside(tmp_path / "mine.json")
-    mine.touch()
     dead = mine.name.replace(str(os.getpid()), "999999999")
     elsewhere = dead[: dead.index("-") + 1] + "000000.dyngs.json"
     outside = tmp_path / "outside"
@@ -59,12 +59,30 @@ def test_what_lives_and_what_is_not_ours_stays(tmp_path: Path) -> None:
     assert _names(folder) == {*kept, link} - {mine.name, elsewhere}
 
 
-def test_a_folder_of_that_name_is_empty_and_its_links_are_not_followed(tmp_path: Path) -> None:
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "outside" / "precious").touch()
-    folder = temporary_folder_beside(tmp_path / "deep" / "run")
-    (folder / "link").symlink_to(tmp_path / "outside")
-    again = temporary_folder_beside(tmp_path / "deep" / "run")
-    assert again == folder
-    assert not list(again.iterdir())
-    assert (tmp_path / "outside" / "precious").exists()
+def test_nobody_can_plant_a_link_at_a_temporary_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither at that of an earlier file of the same process, nor at one that is guessed."""
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    for make in (temporary_beside, temporary_folder_beside):
+        first = make(tmp_path / "run.json")
+        first.unlink() if first.is_file() else first.rmdir()
+        first.symlink_to(precious)
+        assert make(tmp_path / "run.json") != first
+        guessed = first.name.split("-")[2].partition(".")[0]
+        monkeypatch.setattr("secrets.token_hex", lambda size, guessed=guessed: guessed)
+        with pytest.raises((FileExistsError, DyngsError)):
+            make(tmp_path / "run.json")
+        with pytest.raises(DyngsError, match=r"cannot write .*run.json: File exists"):
+            write_text(tmp_path / "run.json", "theirs")
+        monkeypatch.undo()
+    assert precious.read_text() == "mine"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+def test_files_have_the_permissions_that_the_umask_leaves(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_text(tmp_path / "a.txt", "a")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o640

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,17 @@ from splat_scenes import AROUND, cameras_turned, cloud, seen
 
 from dyngs.errors import DyngsError
 from dyngs.ops.quaternions import rotate
-from dyngs.splats.rotation import AXES, axis_of, inverse, nearest_axis, product, turn_between, turned, turned_harmonics
+from dyngs.splats.rotation import (
+    AXES,
+    axis_of,
+    inverse,
+    mirrored,
+    nearest_axis,
+    product,
+    turn_between,
+    turned,
+    turned_harmonics,
+)
 
 ODD = tuple(torch.nn.functional.normalize(torch.tensor([0.3, -0.7, 0.2, 0.6], dtype=torch.float64), dim=0).tolist())
 
@@ -77,3 +88,16 @@ def test_no_turn_changes_no_bit() -> None:
     scene = cloud(10, 2)
     assert turned(scene, (1.0, 0.0, 0.0, 0.0)) is scene
     assert AROUND.width == 48
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_a_mirrored_scene_is_seen_in_a_mirror(degree: int) -> None:
+    """A camera on the plane of the mirror sees the image flipped."""
+    scene = cloud(150, degree)
+    camera = AROUND.select(0)
+    pose = torch.eye(4)[None].clone()
+    pose[0, 2, 3] = 4.0
+    ahead = replace(camera, cam_from_world=pose)
+    got = seen(mirrored(scene), ahead)
+    torch.testing.assert_close(got, seen(scene, ahead).flip(2), rtol=0, atol=3e-5)
+    assert float((seen(scene, ahead) - got).abs().max()) > 0.1

@@ -14,8 +14,8 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import levels_of
 from dyngs.splats import sog_levels
-from dyngs.splats.formats import read_splats
-from dyngs.splats.sog_levels import INDEX, write_sog_levels
+from dyngs.splats.formats import SOG_INDEX, read_splats
+from dyngs.splats.sog_levels import write_sog_levels
 from dyngs.splats.splat_file import SplatFile
 
 N = 20_000
@@ -45,7 +45,7 @@ def test_leaves_are_alternatives_of_one_place(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(sog_levels, "PER_FILE", 8192)
     splat = scene()
     counts = write_sog_levels(tmp_path / "town", splat)
-    index = json.loads((tmp_path / "town" / INDEX).read_text(encoding="utf-8"))
+    index = json.loads((tmp_path / "town" / SOG_INDEX).read_text(encoding="utf-8"))
     assert counts == (20_000, 5_000, 1_250)
     assert (index["version"], index["lodLevels"], index["counts"]) == (1, 3, list(counts))
     assert index["count"] == sum(counts)

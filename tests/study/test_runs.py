@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -39,3 +43,21 @@ def test_a_fault_of_ours_keeps_its_traceback() -> None:
 def test_without_ray_a_line_says_how_to_get_it() -> None:
     with pytest.raises(DyngsError, match=r"pip install 'dyngs\[ray\]'"):
         list(done_in_turn(reciprocal, [1.0], 1))
+
+
+def test_ray_imports_no_module_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its processes import from the folder that is current in ``ray.init``; tasks run in ours."""
+    importing: list[str] = []
+    fake = SimpleNamespace(
+        init=lambda: importing.append(os.getcwd()),
+        remote=lambda **_: lambda do: SimpleNamespace(remote=lambda *given: (os.chdir("/"), do(*given))[1]),
+        wait=lambda waiting: (waiting[:1], waiting[1:]),
+        get=lambda found: found,
+        shutdown=lambda: None,
+    )
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.chdir(tmp_path)
+    assert list(done_in_turn(lambda _: os.getcwd(), ["a"], 1)) == [("a", str(tmp_path))]
+    assert tmp_path not in map(Path, importing)
+    assert len(importing) == 1
+    assert os.getcwd() == str(tmp_path)

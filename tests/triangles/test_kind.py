@@ -131,7 +131,7 @@ def test_fewer_triangles_are_trained_for_a_trade(capture: Path, tmp_path: Path) 
         (["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"], "1 to 64"),
         (["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"], "radiance field"),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
-        (["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.min_fps=5"], "model.max_triangles"),
+        (["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"], "model.max_triangles"),
     ],
 )
 def test_what_does_not_go_is_refused(

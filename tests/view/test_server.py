@@ -1,5 +1,7 @@
 """The viewer in a real browser, and what it does with messages that no browser sends."""
 
+import json
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +22,7 @@ from dyngs.cli import main
 from dyngs.metrics import ssim
 from dyngs.view.pace import Pace
 from dyngs.view.recording import Keyframe, Recording
-from dyngs.view.server import Browsing, Serving, Viewer
+from dyngs.view.server import Browsing, Serving, Viewer, notify
 from dyngs.view.source import open_source
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
@@ -172,3 +174,56 @@ def test_a_dead_server_is_shown_as_such(viewer: Viewer, browser: Browser) -> Non
     page.driven.get_by_text("Connecting...").wait_for(timeout=15_000)
     assert not page.driven.get_by_text("Connected", exact=True).is_visible()
     page.close()
+
+
+SCRIPT = "<img src=x onerror=window.ran=1>"
+FRAME = '<iframe srcdoc="<script>parent.ran=1</script>"></iframe>'
+LINKS = "[a](javascript:window.ran=1) ![b](x) <a href=http://evil.example>c</a>"
+LINKS += " http://evil.example www.evil.example me@evil.example"
+
+
+def hostile_run(folder: Path) -> Path:
+    """A run whose name, capture and names of views are HTML and Markdown."""
+    made = write_moving_run(folder)
+    run = made.rename(folder / f"*run* {SCRIPT}")
+    root = (folder / "capture").rename(folder / f"capture {SCRIPT}")
+    for split in ("train", "test"):
+        file = root / f"transforms_{split}.json"
+        document = json.loads(file.read_text())
+        for i, frame in enumerate(document["frames"]):
+            name = f"{split}/{i} {SCRIPT} {LINKS.replace('/', ':')}"
+            (root / f"{frame['file_path']}.png").rename(root / f"{name}.png")
+            frame["file_path"] = name
+        file.write_text(json.dumps(document))
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace(f"root: {folder / 'capture'}", f"root: {json.dumps(str(root))}"))
+    return run
+
+
+def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: Path) -> None:
+    """Names of the run and of views, and the folder of the capture, in a note because it is gone."""
+    run = hostile_run(tmp_path)
+    other = write_moving_run(tmp_path / "other")
+    config = other / "config.yaml"
+    gone = f"/nowhere/{FRAME} {SCRIPT} {LINKS}"
+    config.write_text(re.sub(r"root: .*", lambda _: f"root: {json.dumps(gone)}", config.read_text(), count=1))
+    for folder, wanted in ((run, "truth: "), (other, "without the capture")):
+        source = open_source(folder)
+        with Viewer(source, source.load(source.names[0]), Serving()) as viewer:
+            page = browser.open(viewer.link, *SIZE)
+            until(lambda viewer=viewer: any(one.num_sent for one in viewer.browsing), page)
+            (browsing,) = viewer.browsing
+            if folder == run:
+                browsing.session.change(view=0, comparing=True)
+                notify(browsing.client, SCRIPT, FRAME)
+            else:
+                page.click("text=Help")
+            until(lambda page=page, wanted=wanted: wanted in page.evaluate("document.body.textContent"), page)
+            page.driven.wait_for_timeout(500)
+            text = page.evaluate("document.body.textContent").replace("\u200b", "")
+            assert SCRIPT in text
+            assert "![b](x) <a href=http:" in text
+            assert page.evaluate("window.ran") is None
+            assert page.evaluate("document.querySelectorAll('iframe, img[src=x], a[href*=evil]').length") == 0
+            assert not [address for address in page.requests if "evil" in address or address.endswith("/x")]
+            page.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from dyngs.data.times import distinct_times, evenly_spaced
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import staying_within
 from dyngs.files.fields import read_json_object
+from dyngs.files.find import FileFinder
 
 MAX_LINES_PER_KIND = 5  # problems of one kind that are listed; the others are counted
 MAX_VIEWS = 300  # views, chosen at random, in which points are looked for
@@ -37,7 +39,9 @@ UNSEEN_SIDE = 200.0  # degrees around a body without a camera from which on a pa
 
 def before_training(capture: Capture) -> list[str]:
     """Return one line for everything about a capture that is likely to spoil a training; only some masks are read."""
-    found = [*capture.warnings, *mask_problems(capture), *time_problems(capture), *scene_problems(capture)]
+    masks = described_masks(capture)
+    line = [] if masks is None else [f"masks of {masks}"]
+    found = [*capture.warnings, *line, *mask_problems(capture), *time_problems(capture), *scene_problems(capture)]
     return list(dict.fromkeys([*found, *body_problems(capture)]))
 
 
@@ -265,7 +269,8 @@ def transforms_file_problems(root: Path, known: str) -> list[str]:
             with reading(file):
                 entries = [(str(frame["file_path"]), np.array(frame["transform_matrix"], float)) for frame in frames]
                 names = Counter(name for name, _ in entries)
-                missing = [n for n in names if not any((root / (n + suffix)).is_file() for suffix in ("", *SUFFIXES))]
+                images = FileFinder(root)
+                missing = [n for n in names if not any(images.find(n + suffix).is_file() for suffix in ("", *SUFFIXES))]
         except DyngsError as error:
             if str(file) not in known:
                 why = reason(error.__cause__ or error)
@@ -289,21 +294,38 @@ LOOKED_AT = 4  # masks that are read
 MOST_IGNORED = 0.5  # fraction of the pixels that masks may ignore before that is suspicious: passers-by fill less
 
 
+def described_masks(capture: Capture) -> str | None:
+    """Return how many images have masks, which value counts, and how much a few masks ignore; None without masks."""
+    views = all_views(capture.splits)
+    count = sum(view.mask_path is not None for view in views)
+    if not count:
+        return None
+    ignored = _ignored_fractions(capture)
+    share = f": {fmean(ignored.values()):.0%} of the pixels in {len(ignored)} that were read" if ignored else ""
+    return f"{count} of {len(views)} images; white counts, black is ignored{share}"
+
+
 def mask_problems(capture: Capture) -> list[str]:
     """Return a line if masks ignore most of the pixels; a few masks are read, unreadable ones are passed over."""
-    masked = [view for view in all_views(capture.splits) if view.mask_path is not None and view.mask_path.is_file()]
-    looked_at = [masked[i] for i in evenly_spaced(len(masked), LOOKED_AT)]
-    try:
-        ignored = [1 - float(read_mask(view.mask_path).float().mean()) for view in looked_at if view.mask_path]
-        if not ignored or sum(ignored) <= MOST_IGNORED * len(ignored):
-            return []
-        brightest = max(int(read_image(view.mask_path)[..., :3].max()) for view in looked_at if view.mask_path)
-    except DyngsError:  # told of by those who check files
+    ignored = _ignored_fractions(capture)
+    if not ignored or fmean(ignored.values()) <= MOST_IGNORED:
         return []
-    fraction, first = sum(ignored) / len(ignored), looked_at[0].mask_path
+    brightest = max(int(read_image(path)[..., :3].max()) for path in ignored)
     why = (
         f"they hold no value above {brightest}, but white is 255: are they labels?"
         if brightest < 128
         else "white counts and black is ignored: are they inverted?"
     )
+    fraction = fmean(ignored.values())
+    first = next(iter(ignored))
     return [f"masks ignore {fraction:.0%} of the pixels in {len(ignored)} that were looked at, first {first}; {why}"]
+
+
+def _ignored_fractions(capture: Capture) -> dict[Path, float]:
+    """Return which fraction of its pixels each of a few masks ignores; none if one of them is unreadable."""
+    paths = [view.mask_path for view in all_views(capture.splits) if view.mask_path and view.mask_path.is_file()]
+    looked_at = [paths[index] for index in evenly_spaced(len(paths), LOOKED_AT)]
+    try:
+        return {path: 1 - float(read_mask(path).float().mean()) for path in looked_at}
+    except DyngsError:  # those who check files report it
+        return {}

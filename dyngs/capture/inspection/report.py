@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.capture.first_points import checked_points
-from dyngs.capture.inspection.problems import listed, problems_of, tallied, transforms_file_problems
+from dyngs.capture.inspection.problems import described_masks, listed, problems_of, tallied, transforms_file_problems
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import camera_center, inverse_rigid, pose_fault
@@ -35,7 +35,6 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
     focal_px = [float(f) for view in views for f in (view.intrinsics[0, 0], view.intrinsics[1, 1])]
     fov_deg = [float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views]
     centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3) * capture.world_scale
-    masked = sum(view.mask_path is not None for view in views)
     file = "" if capture.points_file is None else f" ({capture.points_file.name})"
     facts = [
         ("format", capture.format),
@@ -47,7 +46,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("lens", tallied(lenses) + _kept(views)),
         *_exposures(views),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
-        ("masks", f"{masked} of {len(views)} images; white counts, black is ignored" if masked else "none"),
+        ("masks", described_masks(capture) or "none"),
         *_prior_facts(capture),
         *_time_facts(capture),
         ("points", "none" if capture.points is None else f"{len(capture.points.xyz)}{file}"),

@@ -65,6 +65,7 @@ def video_facts(path: Path) -> VideoFacts:
     facts = (
         ("size", f"{film.info.width}x{film.info.height}" + shown),
         ("frames", f"{len(seconds)} in {seconds[-1] + 1 / film.rate:.2f} s, {_rate(film)}"),
+        *([("colours", film.info.colours)] if film.info.colours else []),
         ("sound", sound),
         ("sharpness", _sharpness(sharpness)),
         ("camera", _camera(small, displaced)),

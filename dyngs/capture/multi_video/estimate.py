@@ -22,10 +22,10 @@ from dyngs.capture.multi_video.films import (
     read_given,
     small_images,
 )
-from dyngs.capture.multi_video.starts import Watcher, found_starts, given_starts, motion_of
+from dyngs.capture.multi_video.starts import describe_starts, found_starts
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.images.video import read_numbered_frames, videos_in
+from dyngs.data.images.video import colour_notes, read_numbered_frames, videos_in
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import Taken, taken_frames, write_seconds
@@ -78,12 +78,17 @@ def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgre
     if options.starts is not None:
         starts = checked_starts(options.starts, [film.name for film in films], "--start")
     small = small_images(films, report)
-    lines = [_require_fixed(source, films, small)]
-    films, small, found, line = _posed(work, films, small, options, report)
+    lines = colour_notes(film.info for film in films)
+    lines.append(_require_fixed(source, films, small))
+    if starts is None:
+        starts, line = found_starts(films)
+    else:
+        line = f"offsets between the cameras as given: {describe_starts(starts)}"
     lines.append(line)
-    watchers = [_watcher(film, grey, found.model) for film, grey in zip(films, small, strict=True)]
-    begun, line = found_starts(films, watchers) if starts is None else given_starts(films, starts)
+    films, found, line = _posed(work, films, small, options, report)
     lines.append(line)
+    begun = np.array([starts[film.name] for film in films])
+    begun = begun - begun.min()
     clocks = [film.seconds + start for film, start in zip(films, begun, strict=True)]
     taken, line = taken_frames(source, clocks, [film.rate for film in films], options.num_frames)
     lines.append(line)
@@ -185,8 +190,8 @@ def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[np.ndarr
 
 def _posed(
     work: Path, films: list[Film], small: list[np.ndarray], options: SfmOptions, report: ReportProgress
-) -> tuple[list[Film], list[np.ndarray], FixedModel, str]:
-    """Return the cameras that have a pose, with their small images, the poses, and a line on them."""
+) -> tuple[list[Film], FixedModel, str]:
+    """Return the cameras that have a pose, the poses, and a line on them."""
     images = []
     for film, shown in zip(films, small, strict=True):
         images.append(image_without_movers(film, len(shown)))
@@ -202,7 +207,7 @@ def _posed(
             "poses in cameras.json (docs/formats.md)"
         )
     left = [film.name for film in films if film.name not in names]
-    kept = [(film, shown) for film, shown in zip(films, small, strict=True) if film.name in names]
+    kept = [film for film in films if film.name in names]
     model = found.model
     lens = "one lens for all of a size" if found.shared else "a lens each"
     line = (
@@ -211,18 +216,4 @@ def _posed(
     )
     if left:
         line += f"; left out, they do not match the others: {first_few(left)}"
-    return [film for film, _ in kept], [shown for _, shown in kept], found, line
-
-
-def _watcher(film: Film, grey: np.ndarray, model: pycolmap.Reconstruction) -> Watcher:
-    image = next(image for image in model.images.values() if camera_name(image) == film.name)
-    camera = model.cameras[image.camera_id]
-    height, width = grey.shape[1:]
-    rows, columns = np.mgrid[0:height, 0:width]
-    step = camera.width // width
-    places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1) * step
-    directions = np.concatenate([np.asarray(camera.cam_from_img(places)), np.ones((len(places), 1))], axis=1)
-    rotation = np.asarray(image.cam_from_world().rotation.matrix())
-    rays = np.nan_to_num(directions) @ rotation
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
-    return Watcher(np.asarray(image.projection_center()), rays, motion_of(grey), film.seconds[: len(grey)])
+    return kept, found, line

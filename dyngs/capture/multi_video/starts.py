@@ -1,19 +1,13 @@
-"""When each of several videos begins, in one clock: given, or found from their sound, or from the motion in them.
-
-All planes that contain both cameras' centres cut both images in lines, which show the same part of the world. So the
-amount of motion on them, over time, is nearly the same signal for both cameras, once their clocks agree (the motion
-barcodes of epipolar lines, Ben-Artzi et al. 2016).
-"""
+"""Seconds at which several videos begin, in one clock: given, or estimated from their sound."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from dyngs.capture.multi_video.films import VIDEOS_FILE, Film
 from dyngs.data.images.video import opened_video
@@ -114,7 +108,7 @@ def correlate(a: np.ndarray, b: np.ndarray) -> Correlation | None:
     return Correlation(int(shifts[0]), np.where(norm > floor, products[shifts] / np.maximum(norm, 1e-12), 0.0))
 
 
-def align(pairs: Mapping[tuple[int, int], Correlation], count: int, near: np.ndarray | None = None) -> Alignment:
+def align(pairs: Mapping[tuple[int, int], Correlation], count: int) -> Alignment:
     """Return the shifts at which all pairs together correlate best.
 
     The pairs with the highest peaks join all recordings first; then each recording is shifted to where the sum of its
@@ -123,13 +117,12 @@ def align(pairs: Mapping[tuple[int, int], Correlation], count: int, near: np.nda
     Args:
         pairs: correlation of recordings i and j, i < j: shift of j less shift of i.
         count: of recordings.
-        near: (C,) shifts that are only to be improved, by less than ``PEAK_WIDTH``; None: nothing is known.
     """
-    shifts = _spanning(pairs, count) if near is None else near.copy()
+    shifts = _spanning(pairs, count)
     for _ in range(_ROUNDS):
         before = shifts.copy()
         for i in range(1, count):
-            shifts[i] = _best_shift(i, shifts, pairs, None if near is None else float(near[i]))
+            shifts[i] = _best_shift(i, shifts, pairs)
         if np.abs(shifts - before).max() < 1e-3:
             break
     agree = {
@@ -175,7 +168,7 @@ def _spanning(pairs: Mapping[tuple[int, int], Correlation], count: int) -> np.nd
     return shifts
 
 
-def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Correlation], near: float | None) -> float:
+def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Correlation]) -> float:
     """Return the shift of recording ``i`` with the highest sum of correlations, the others as they are."""
     curves = []
     for (first, second), found in pairs.items():
@@ -187,8 +180,6 @@ def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Corr
     if not curves:
         return float(shifts[i])
     low, high = min(own[0] for own, _ in curves), max(own[-1] for own, _ in curves)
-    if near is not None:
-        low, high = near - PEAK_WIDTH, near + PEAK_WIDTH
     grid = np.arange(np.floor(low), np.ceil(high) + 1)
     total = np.sum([np.interp(grid, own, values, left=0.0, right=0.0) for own, values in curves], axis=0)
     return float(grid[0] + peak_place(total))
@@ -202,25 +193,8 @@ def _reached(links: set[tuple[int, int]], count: int) -> set[int]:
     return reached
 
 
-BINS = 48  # planes between the lowest and the highest one that both cameras see
 _NOISE = 6.0  # differences below so many times the typical one are noise
 _LEAST_CHANGE = 8.0  # grey levels below which a difference is noise anyway
-_MIN_BASELINE = 1e-6
-
-
-@dataclass(frozen=True)
-class Watcher:
-    """A fixed camera at ``center`` (3,), with the motion that it sees.
-
-    Attributes:
-        rays: (P, 3) unit vectors in the world, of the P pixels of the small images, row by row.
-        motion: (F, P) grey levels of change against what stands, at ``seconds`` (F,) of its own clock.
-    """
-
-    center: np.ndarray
-    rays: np.ndarray
-    motion: np.ndarray
-    seconds: np.ndarray
 
 
 def motion_of(grey: np.ndarray) -> np.ndarray:
@@ -233,76 +207,6 @@ def motion_of(grey: np.ndarray) -> np.ndarray:
         change = np.abs(change - np.median(change)).ravel()
         motion[number] = np.clip(change - max(_NOISE * float(np.median(change)), _LEAST_CHANGE), 0, 255)
     return motion
-
-
-def correlations(
-    watchers: Sequence[Watcher], rate: float, most: int, blur: float
-) -> dict[tuple[int, int], Correlation]:
-    """Return the correlation of the motion of each camera with that of the ``most`` others that look most alike.
-
-    Args:
-        watchers: fixed cameras; pairs that share no planes are left out.
-        rate: samples per second of the shifts.
-        blur: standard deviation in samples by which motion is blurred in time: what moves by more than its size from
-            frame to frame is not alike otherwise.
-    """
-    axes = np.stack([watcher.rays.mean(axis=0) for watcher in watchers])
-    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-9)
-    pairs = set()
-    for i, likeness in enumerate(axes @ axes.T):
-        nearest = [int(j) for j in np.argsort(-likeness, kind="stable") if j != i][:most]
-        pairs |= {(min(i, j), max(i, j)) for j in nearest}
-    found = {(i, j): _correlated(watchers[i], watchers[j], rate, blur) for i, j in sorted(pairs)}
-    return {pair: value for pair, value in found.items() if value is not None}
-
-
-def _correlated(a: Watcher, b: Watcher, rate: float, blur: float) -> Correlation | None:
-    """Return how alike the motion of two cameras is at every shift; None where they share no planes."""
-    bins = _bins_of(a, b)
-    if bins is None:
-        return None
-    signals = []
-    for watcher, own in zip((a, b), bins, strict=True):
-        times = np.arange(int(np.floor(watcher.seconds[-1] * rate + 1e-6)) + 1) / rate
-        binned = _binned(watcher.motion, own)
-        signal = np.stack([np.interp(times, watcher.seconds, values) for values in binned.T], axis=1)
-        if blur > 0:
-            signal = gaussian_filter1d(signal, blur, axis=0, mode="nearest", truncate=3.0)
-        signals.append(signal)
-    return correlate(signals[0], signals[1])
-
-
-def _bins_of(a: Watcher, b: Watcher) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return for both cameras the plane of each pixel, -1 for planes that the other one does not see."""
-    axis = b.center - a.center
-    length = float(np.linalg.norm(axis))
-    if length < _MIN_BASELINE:
-        return None
-    axis = axis / length
-    middle = a.rays.mean(axis=0) + b.rays.mean(axis=0)
-    ahead = middle - axis * (middle @ axis)
-    if np.linalg.norm(ahead) < 1e-3:
-        return None
-    ahead /= np.linalg.norm(ahead)
-    aside = np.cross(axis, ahead)
-    angles = [np.arctan2(watcher.rays @ aside, watcher.rays @ ahead) for watcher in (a, b)]
-    low = max(float(np.quantile(angle, 0.01)) for angle in angles)
-    high = min(float(np.quantile(angle, 0.99)) for angle in angles)
-    if high - low < 1e-3:
-        return None
-    placed = [np.floor((angle - low) / (high - low) * BINS).astype(int) for angle in angles]
-    first, second = (np.where((place >= 0) & (place < BINS), place, -1) for place in placed)
-    return first, second
-
-
-def _binned(motion: np.ndarray, bins: np.ndarray) -> np.ndarray:
-    """Return (F, BINS) mean motion of the pixels of each plane."""
-    which = np.zeros((len(bins), BINS), np.float32)
-    kept = np.flatnonzero(bins >= 0)
-    which[kept, bins[kept]] = 1.0
-    which /= np.maximum(which.sum(axis=0), 1.0)
-    sums = [motion[start : start + 256].astype(np.float32) @ which for start in range(0, len(motion), 256)]
-    return np.concatenate(sums)
 
 
 RATE = 100.0  # values of a signal per second
@@ -364,73 +268,56 @@ def _samples(path: Path) -> np.ndarray | None:
     return np.pad(samples, (missing, 0)) if missing >= 0 else samples[-missing:]
 
 
-NEIGHBOURS = 8  # other cameras that the motion seen by a camera is compared with
-COARSE, FINE = 1.2, 0.0  # blur of motion in time, in frames, with which the offsets are found, and then measured
 WHOLE = 0.2  # offsets so near to whole frames, in frames, are taken as whole: they are not known better
 TOGETHER = 0.97  # videos begin together if that explains them as well as the offsets found, to this fraction
 MAX_RATE = 60.0
 _SHOWN = 12
 
 
-Starts = tuple[np.ndarray, str]
-"""Seconds (C,) at which the videos begin in one clock, the earliest at 0, and a line on how they were found."""
+def found_starts(films: Sequence[Film]) -> tuple[dict[str, float], str]:
+    """Estimate the seconds at which videos begin, by name, the earliest at 0, from their sound.
 
-
-def given_starts(films: Sequence[Film], starts: Mapping[str, float]) -> Starts:
-    """Return the starts that a person gave, for those of the videos that are left."""
-    seconds = np.array([starts[film.name] for film in films])
-    seconds = seconds - seconds.min()
-    return seconds, f"offsets between the cameras as given: {_listed(films, seconds)}"
-
-
-def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
-    """Return the starts by the sound if all videos have some that tells, else by the motion that they show.
-
-    Raises DyngsError: neither sound nor motion tells; says what to give.
+    Returns also a line on how sure they are. Raises DyngsError: the sound does not tell; says what to give.
     """
-    by_sound, why_not = _by_sound(films)
+    found = _by_sound(films)
     rate = min(max(film.rate for film in films), MAX_RATE)
-    found, hertz = by_sound, RATE
-    if found is None:
-        found, hertz = align(correlations(watchers, rate, NEIGHBOURS, COARSE), len(films)), rate
-        if not found.holds:
-            raise DyngsError(
-                f"the offsets between the videos are not known: {why_not}, and the motion seen agrees for "
-                f"{found.agreeing} of {found.pairs} pairs of cameras only; give the second at which each video begins "
-                f'in {VIDEOS_FILE} beside them, {{"starts": {{"{films[0].name}": 0, "{films[1].name}": 0.5, ..}}}}, or '
-                '{"starts": 0} if all began at once'
-            )
-        fine = align(correlations(watchers, rate, NEIGHBOURS, FINE), len(films), found.shifts)
-        found = replace(found, shifts=fine.shifts, correlation=fine.correlation, together=fine.together)
-    what = "the motion seen" if by_sound is None else "the sound"
     sure = f"{found.agreeing} of {found.pairs} pairs agree, correlation {found.correlation:.2f}"
-    frames = found.shifts / hertz * rate
+    frames = found.shifts / RATE * rate
     if found.together >= TOGETHER * found.correlation or np.abs(frames).max() <= WHOLE:
-        return np.zeros(len(films)), f"the videos begin together, by {what} ({sure})"
+        return {film.name: 0.0 for film in films}, f"the videos begin together, by the sound ({sure})"
     rates = [film.rate for film in films]
     if max(rates) <= 1.01 * min(rates) and np.abs(frames - np.round(frames)).max() <= WHOLE:
         frames = np.round(frames)
         sure += ", whole frames"
     seconds = (frames - frames.min()) / rate
-    return seconds, f"offsets between the cameras by {what} ({sure}): {_listed(films, seconds)}"
+    starts = {film.name: float(start) for film, start in zip(films, seconds, strict=True)}
+    return starts, f"offsets between the cameras by the sound ({sure}): {describe_starts(starts)}"
 
 
-def _by_sound(films: Sequence[Film]) -> tuple[Alignment | None, str]:
-    """Return the alignment of the sound, None where it does not tell, with the reason."""
+def _by_sound(films: Sequence[Film]) -> Alignment:
+    """Return the alignment of the sound. Raises DyngsError: it does not tell."""
     heard = [onsets(film.path) for film in films]
     silent = [film.name for film, sound in zip(films, heard, strict=True) if sound is None]
     if silent:
-        return None, f"{silent[0]} has no sound" if len(silent) < len(films) else "there is no sound"
+        raise _unknown(films, f"{silent[0]} has no sound" if len(silent) < len(films) else "there is no sound")
     sounds = [sound for sound in heard if sound is not None]
     found = {(i, j): correlate(sounds[i], sounds[j]) for i, j in combinations(range(len(films)), 2)}
     pairs = {pair: value for pair, value in found.items() if value is not None}
     aligned = align(pairs, len(films))
-    if aligned.holds:
-        return aligned, ""
-    return None, f"the sound agrees for {aligned.agreeing} of {aligned.pairs} pairs only"
+    if not aligned.holds:
+        raise _unknown(films, f"the sound agrees for {aligned.agreeing} of {aligned.pairs} pairs only")
+    return aligned
 
 
-def _listed(films: Sequence[Film], seconds: np.ndarray) -> str:
+def _unknown(films: Sequence[Film], reason: str) -> DyngsError:
+    return DyngsError(
+        f"the offsets between the videos are not known: {reason}; give the second at which each video begins in "
+        f'{VIDEOS_FILE} beside them, {{"starts": {{"{films[0].name}": 0, "{films[1].name}": 0.5, ..}}}}, or '
+        '{"starts": 0} if all began at once'
+    )
+
+
+def describe_starts(starts: Mapping[str, float]) -> str:
     """Return the seconds by camera, in words; the first few of many."""
-    named = [f"{film.name} +{start:.3f} s" for film, start in zip(films, seconds, strict=True)]
+    named = [f"{name} +{start:.3f} s" for name, start in starts.items()]
     return ", ".join(named[:_SHOWN]) + (f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else "")

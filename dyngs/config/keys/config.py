@@ -58,11 +58,6 @@ class BudgetConfig(Section):
     max_mb: float | None = Field(
         default=None, gt=0, description="largest size of `export/scene.dyngs`, 1e6 bytes; the file is then written"
     )
-    min_fps: float | None = Field(
-        default=None,
-        gt=0,
-        description="fewest training views drawn per second on this machine, with fewer Gaussians if need be",
-    )
 
 
 class RunConfig(Section):

@@ -14,7 +14,7 @@ from dyngs.section import Positive, Section
 class DataConfig(Section):
     """Where the images are and how they are read."""
 
-    root: Path = Field(description="folder of the capture")
+    root: Path = Field(description="folder or .zip of the capture")
     format: Literal[
         "auto",
         "body_json",
@@ -25,6 +25,11 @@ class DataConfig(Section):
         "nerfstudio",
         "colmap",
         "nerfies",
+        "polycam",
+        "record3d",
+        "metashape",
+        "realitycapture",
+        "odm",
         "llff",
         "camera_folders",
     ] = Field(default="auto", description="layout of the capture's files (docs/formats.md); auto: detected")
@@ -51,6 +56,9 @@ class DataConfig(Section):
         default=None,
         gt=0,
         description="with times=order: so many numbers, or places in the order, are a second; null: not known",
+    )
+    skip_missing: bool = Field(
+        default=False, description="leave out views whose images are missing, instead of stopping with an error"
     )
     downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the images by this")
     longest_side: int | None = Field(

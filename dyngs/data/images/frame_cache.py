@@ -21,9 +21,10 @@ from typing import BinaryIO
 import numpy as np
 
 from dyngs.data.capture import VideoFrame
-from dyngs.data.images.video import VideoInfo, probe_video, read_numbered_frames
+from dyngs.data.images.video import DECODER_VERSION, VideoInfo, probe_video, read_numbered_frames
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
+from dyngs.files.limits import read_limited
 from dyngs.files.temporary import CACHE_VARIABLE, cache_folder
 from dyngs.files.write import atomic_file, image_error, write_text
 
@@ -61,7 +62,7 @@ def planned_frames(video: Path) -> VideoFrames:
         raise DyngsError(f"{video}: cannot be opened ({error.strerror})") from None
     label = re.sub(r"[^A-Za-z0-9-]", "_", video.stem)[:40]
     # Two cameras may have filmed the same: the name keeps their frames apart.
-    named = hashlib.sha256(os.fsencode(video.name) + b"\0" + digest).hexdigest()[:32]
+    named = hashlib.sha256(os.fsencode(video.name) + b"\0" + digest + DECODER_VERSION).hexdigest()[:32]
     folder = cache_folder("frames") / f"{label}.{named}"
     info = _stored_info(folder) or probe_video(video)
     return VideoFrames(info, video, tuple(folder / f"frame_{number:06d}.png" for number in range(info.num_frames)))
@@ -150,10 +151,11 @@ def _stored_info(folder: Path) -> VideoInfo | None:
     if folder.is_symlink() or mark.is_symlink():
         return None
     try:
-        fields = json.loads(mark.read_text(encoding="utf-8"))
+        fields = json.loads(read_limited(mark))
         width, height, count = (int(fields[key]) for key in ("width", "height", "num_frames"))
-        return VideoInfo(width, height, count, float(fields["fps"])) if fields["what"] == _MARK else None
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        info = VideoInfo(width, height, count, float(fields["fps"]), str(fields.get("colours", "")))
+        return info if fields["what"] == _MARK else None
+    except (DyngsError, OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
 
 

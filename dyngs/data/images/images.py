@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,8 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.data.images.colour_space import srgb_encoded
+from dyngs.data.images.exr_layers import Layer, beauty_pass, layers_of
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside, max_decoded_mb
+from dyngs.files.fields import first_few
 from dyngs.files.write import any_text, image_error
 
 if TYPE_CHECKING:
@@ -101,19 +104,26 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp")
 _TAIL_BYTES = 4096
 _STRIP_PIXELS = 2**18  # pixels of an image that are shrunk at a time
 _PNG_END = b"IEND"
-END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
-"""What complete files end in, by suffix."""
+END_MARKERS = {"png": _PNG_END, "jpeg": b"\xff\xd9"}
+"""What complete files end in, by ``ImageHeader.format_name``."""
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of an image file: pixels and number of channels as stored, whether one is alpha, the camera's tags."""
+    """Header of an image file: size and channels as stored, whether one is alpha, the camera's tags.
+
+    Attributes:
+        format_name: OpenImageIO's name of the format of the content.
+        layer: name of the beauty pass that was chosen among the layers of an EXR, else "".
+    """
 
     width: int
     height: int
     channels: int
     has_alpha: bool
     tags: PhotoTags = field(default_factory=PhotoTags)
+    format_name: str = ""
+    layer: str = ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -150,9 +160,9 @@ def read_header(path: Path) -> ImageHeader:
     """Read size and channels of an image without decoding it."""
     with _reading(path):
         source = _open(path)
-        spec = source.spec()
-        source.close()
-        return _header(spec)
+        header = _header(source)
+        source.reader.close()
+        return header
 
 
 def header_if_readable(path: Path) -> ImageHeader | None:
@@ -172,72 +182,38 @@ def header_if_readable(path: Path) -> ImageHeader | None:
 def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
     """Read an image as (H, W, 3) or, with alpha, (H, W, 4) uint8: sRGB, straight alpha.
 
-    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear with premultiplied
-    alpha: they are clamped to [0, 1] and encoded as sRGB. Grey becomes RGB.
+    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear:
+    they are clamped to [0, 1] and encoded as sRGB. Premultiplied colours (EXR, TIFF with associated
+    alpha) are divided by alpha. Grey becomes RGB. Of an EXR with several layers, the beauty pass is
+    read, in its display window.
 
     Args:
         size: (width, height) of its camera; an image that has this shape only when it is rotated as its EXIF tag says
             is rotated. None: as stored.
         upright: rotate it as its EXIF tag says in any case.
     """
+    import OpenImageIO as oiio
+
     with _reading(path):
-        pixels, spec, is_linear = _decoded(path, as_stored=False)
-        return _as_colours(path, pixels, spec, is_linear, size, upright)
+        source = _open(path)
+        header = _header(source)
+        is_exact = not _is_float(source.spec) and not source.is_premultiplied
+        pixels = _decoded(path, source.reader, oiio.TypeDesc(oiio.UINT8 if is_exact else oiio.FLOAT))
+        if upright or (size is not None and header.size_for(size) != header.size):
+            pixels = rotated_upright(pixels, header.tags.orientation)
+        return torch.as_tensor(np.ascontiguousarray(_straight_srgb(pixels, source)), device="cpu")
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
     return reading(path, "the image is damaged or of an unknown kind; copy or convert it again")
 
 
-def _decoded(path: Path, *, as_stored: bool) -> tuple[np.ndarray, OpenImageIO.ImageSpec, bool]:
-    """Return the pixels (H, W, D), the header, and whether they are floats; whole numbers as uint8 or as stored."""
-    import OpenImageIO as oiio
-
-    source = _open(path)
-    spec = source.spec()
-    check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
-    is_float = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-    pixels = source.read_image(oiio.FLOAT if is_float else spec.format if as_stored else oiio.UINT8)
-    message = image_error(source)
-    source.close()
-    # Half a JPEG decodes to an image with a grey lower half and a message.
-    if pixels is None or "premature" in message.lower():
-        reason = message or "the data ends early"
-        raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
-    return pixels.reshape(spec.height, spec.width, spec.nchannels), spec, is_float
-
-
-def _as_colours(
-    path: Path,
-    pixels: np.ndarray,
-    spec: OpenImageIO.ImageSpec,
-    is_linear: bool,
-    size: tuple[int, int] | None,
-    upright: bool,
-) -> Tensor:
-    header = _header(spec)
-    if upright or (size is not None and header.size_for(size) != header.size):
-        pixels = rotated_upright(pixels, header.tags.orientation)
-    alpha_channel = _alpha_channel(spec)
-    alpha = None if alpha_channel is None else pixels[..., alpha_channel]
-    colour_channels = [i for i in range(spec.nchannels) if i != alpha_channel]
-    if not colour_channels:
-        raise DyngsError(f"{path}: the image has no colour channel; use an RGB or RGBA image")
-    colour_channels = colour_channels[:3] if len(colour_channels) >= 3 else colour_channels[:1] * 3
-    as_stored = [*colour_channels, *([] if alpha_channel is None else [alpha_channel])] == list(range(spec.nchannels))
-    if as_stored and not is_linear:  # of most files, which need no copy
-        return torch.as_tensor(np.ascontiguousarray(pixels), device="cpu")
-    rgb = pixels[..., colour_channels]
-    if is_linear:
-        rgb, alpha = _encode_linear(rgb, alpha)
-    return torch.as_tensor(np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha])), device="cpu")
-
-
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
     """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers."""
     with _reading(path):
-        numbers, _, is_float = _decoded(path, as_stored=True)
-        return numbers.astype(np.float32), not is_float
+        reader = _open_reader(path)
+        spec = reader.spec()
+        return _decoded(path, reader, spec.format).astype(np.float32), not _is_float(spec)
 
 
 def read_mask(path: Path) -> Tensor:
@@ -249,7 +225,7 @@ def check_image(path: Path) -> ImageHeader:
     """Read the header and check that the file is very likely complete: a JPEG without end marker is decoded."""
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
-    marker = END_MARKERS.get(path.suffix.lower())
+    marker = END_MARKERS.get(header.format_name)
     if marker:
         with _reading(path), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
@@ -310,7 +286,41 @@ def straight_uint8(pixels: Tensor) -> Tensor:
     return (pixels.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
-def _open(path: Path) -> OpenImageIO.ImageInput:
+@dataclass(frozen=True)
+class _Source:
+    """An opened image at the part that is read, with the indices of its colours (three) and alpha."""
+
+    reader: OpenImageIO.ImageInput
+    spec: OpenImageIO.ImageSpec
+    colours: list[int]
+    alpha: int | None
+    layer: str = ""
+
+    @property
+    def is_premultiplied(self) -> bool:
+        """Whether colours are multiplied by alpha; formats but TIFF and EXR never are."""
+        is_straight = self.spec.get_int_attribute("oiio:UnassociatedAlpha") == 1
+        return self.alpha is not None and not is_straight and self.reader.format_name() in ("openexr", "tiff")
+
+
+def _open(path: Path) -> _Source:
+    """Open an image; of an EXR with several layers the beauty pass."""
+    reader = _open_reader(path)
+    layer = _exr_layer(path, reader) if reader.format_name() == "openexr" else None
+    spec = reader.spec()
+    # OpenImageIO counts alpha from 1 for GIF.
+    alpha = min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel >= 0 else None
+    colours = [index for index in range(spec.nchannels) if index != alpha]
+    if layer is not None and layer.colours:
+        alpha = layer.channels.get("a")
+        colours = list(layer.colours)
+    if not colours:
+        raise DyngsError(f"{path}: the image has no colour channel; use an RGB or RGBA image")
+    colours = colours[:3] if len(colours) >= 3 else colours[:1] * 3
+    return _Source(reader, spec, colours, alpha, layer.name if layer is not None else "")
+
+
+def _open_reader(path: Path) -> OpenImageIO.ImageInput:
     import OpenImageIO as oiio
 
     if not path.is_file():
@@ -319,33 +329,91 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
     oiio.attribute("limits:imagesize_MB", max_decoded_mb())
     config = oiio.ImageSpec()
     config["oiio:UnassociatedAlpha"] = 1
-    source = oiio.ImageInput.open(str(path), config)
-    if source is None:
+    reader = oiio.ImageInput.open(str(path), config)
+    if reader is None:
         reason = image_error(oiio) or "unknown format"
         raise DyngsError(f"{path}: cannot be read as an image ({reason}); copy or convert it again")
-    return source
+    return reader
 
 
-def _header(spec: OpenImageIO.ImageSpec) -> ImageHeader:
-    has_alpha = _alpha_channel(spec) is not None
-    return ImageHeader(spec.width, spec.height, spec.nchannels, has_alpha, tags_of(spec))
+def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> Layer | None:
+    """Go to the part of the beauty pass and return that layer; None if the file has a single layer."""
+    parts: list[tuple[str, Sequence[str]]] = []
+    while reader.seek_subimage(len(parts), 0):
+        spec = reader.spec()
+        # Deep parts hold samples at several depths instead of pixels.
+        names = () if spec.deep else spec.channelnames
+        parts.append((any_text(partial(spec.get_string_attribute, "oiio:subimagename")), names))
+    layers = layers_of(parts)
+    if not layers:
+        raise DyngsError(f"{path}: the image is deep, which dyngs does not read; flatten it")
+    chosen = layers[0] if len(layers) == 1 else beauty_pass(layers)
+    if chosen is None:
+        raise DyngsError(
+            f"{path}: which layer is the image is not clear; name one rgba, Combined, C or beauty, or save it alone. "
+            f"The file has {first_few([layer.label for layer in layers])}"
+        )
+    reader.seek_subimage(chosen.part, 0)
+    return chosen if len(layers) > 1 else None
 
 
-def _alpha_channel(spec: OpenImageIO.ImageSpec) -> int | None:
-    """Return the index of alpha; OpenImageIO counts it from 1 for GIF."""
-    return min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel >= 0 else None
+def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeDesc) -> np.ndarray:
+    """Return the pixels (H, W, D) of a part, of an EXR in its display window: 0 outside the data."""
+    import OpenImageIO as oiio
+
+    spec = reader.spec()
+    width, height = _shown_size(reader, spec)
+    check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
+    check_size(path, width, height, spec.nchannels)
+    pixels = reader.read_image(kind)
+    message = image_error(reader)
+    reader.close()
+    # Half a JPEG decodes to an image with a grey lower half and a message.
+    if pixels is None or "premature" in message.lower():
+        reason = message or "the data ends early"
+        raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
+    pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
+    left = spec.full_x - spec.x
+    top = spec.full_y - spec.y
+    if reader.format_name() == "openexr" and (left, top, width, height) != (0, 0, spec.width, spec.height):
+        window = oiio.ROI(left, left + width, top, top + height, 0, 1, 0, spec.nchannels)
+        pixels = np.asarray(oiio.ImageBufAlgo.crop(oiio.ImageBuf(pixels), window).get_pixels(kind))
+    return pixels
 
 
-def _encode_linear(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """uint8 sRGB and alpha from linear premultiplied floats."""
-    rgb = np.nan_to_num(rgb, nan=0.0, posinf=1.0, neginf=0.0)
-    if alpha is not None:
-        alpha = np.clip(np.nan_to_num(alpha, nan=0.0), 0, 1)
-        rgb = np.where(alpha[..., None] > 0, rgb / np.maximum(alpha[..., None], 1e-6), 0)
-        alpha = np.round(alpha * 255).astype(np.uint8)
-    rgb = np.clip(rgb, 0, 1)
-    encoded = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 0.0031308) ** (1 / 2.4) - 0.055)
-    return np.round(encoded * 255).astype(np.uint8), alpha
+def _shown_size(reader: OpenImageIO.ImageInput, spec: OpenImageIO.ImageSpec) -> tuple[int, int]:
+    """(width, height) of the display window of an EXR, of other images as stored."""
+    return (spec.full_width, spec.full_height) if reader.format_name() == "openexr" else (spec.width, spec.height)
+
+
+def _is_float(spec: OpenImageIO.ImageSpec) -> bool:
+    import OpenImageIO as oiio
+
+    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+
+
+def _header(source: _Source) -> ImageHeader:
+    width, height = _shown_size(source.reader, source.spec)
+    has_alpha = source.alpha is not None
+    name = source.reader.format_name()
+    return ImageHeader(width, height, source.spec.nchannels, has_alpha, tags_of(source.spec), name, source.layer)
+
+
+def _straight_srgb(pixels: np.ndarray, source: _Source) -> np.ndarray:
+    """Return (H, W, 3 or 4) uint8 sRGB with straight alpha; floats are linear, and encoded."""
+    channels = [*source.colours, *([] if source.alpha is None else [source.alpha])]
+    if channels != list(range(pixels.shape[-1])):  # most files need no copy
+        pixels = pixels[..., channels]
+    if pixels.dtype == np.uint8:
+        return pixels
+    pixels = np.nan_to_num(pixels, nan=0.0, posinf=1.0, neginf=0.0)
+    if source.is_premultiplied:
+        alpha = np.clip(pixels[..., 3:], 0, 1)
+        pixels[..., :3] = np.where(alpha > 0, pixels[..., :3] / np.maximum(alpha, 1e-6), 0)
+    pixels = np.clip(pixels, 0, 1)
+    if _is_float(source.spec):
+        pixels[..., :3] = srgb_encoded(pixels[..., :3])
+    return np.round(pixels * 255).astype(np.uint8)
 
 
 def _shrink_axis(

@@ -4,36 +4,52 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from dyngs.data.images.colour_space import BT2020, UNSPECIFIED, ColourTags, to_srgb
 from dyngs.data.images.images import files_in, rotated_upright
-from dyngs.errors import DyngsError, reading, reason
+from dyngs.errors import DyngsError, counted, reading, reason
 from dyngs.files.containment import check_size
 from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 
 if TYPE_CHECKING:
     import av
     from av.container import InputContainer
+    from av.video.codeccontext import VideoCodecContext
 
 MAX_FRAMES = 1_000_000  # limit on the frames of one video: ten hours
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
 """FFmpeg's names for files that hold images themselves, whatever their suffix says."""
 
 
+DECODER_VERSION = b"2"
+"""Changes when frames are converted in another way, so that frames cached before are not used."""
+_FULL_RANGE = 2  # FFmpeg's number of a range from 0 to the largest level
+BT709_MATRIX, BT601_MATRIX, BT2020_MATRIX = 1, 5, 9
+KNOWN_MATRICES = (0, BT709_MATRIX, UNSPECIFIED, 4, BT601_MATRIX, 6, 7, BT2020_MATRIX, 10)
+"""Matrices of ITU-T H.273 that swscale converts from; the others are YCgCo, ICtCp and the like."""
+
+
 @dataclass(frozen=True)
 class VideoInfo:
-    """Size of a video's images, rotated as its tag says, how many there should be, and mean rate, 0 if not said."""
+    """Size of a video's frames, upright, their number, and their mean rate, 0 if unknown.
+
+    ``colours`` is a line on how its colours are converted or assumed, "" if they are as tagged.
+    """
 
     width: int
     height: int
     num_frames: int
     fps: float
+    colours: str = ""
 
 
 def videos_in(folder: Path) -> list[Path]:
@@ -55,8 +71,8 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
 
     Raises DyngsError: no such file, no video in it, or damage (at the damaged place).
     """
-    for _, frame in _decoded(path, "AUTO"):
-        yield _rotated_rgb(path, frame)
+    for _, frame, tags in _decoded(path, "AUTO"):
+        yield _rotated_rgb(path, frame, tags)
 
 
 def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
@@ -67,11 +83,11 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
     """
     requested, last = set(numbers), max(numbers, default=-1)
     index = -1
-    for index, frame in _decoded(path) if requested else ():
+    for index, frame, tags in _decoded(path) if requested else ():
         if index in requested:
             if frame.is_corrupt:
                 raise _broken(path, index, "its data is damaged")
-            yield index, _rotated_rgb(path, frame)
+            yield index, _rotated_rgb(path, frame, tags)
         if index == last:
             return
     if index < last:
@@ -80,10 +96,11 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
 
 def probe_video(path: Path) -> VideoInfo:
     """Read size, length and frame rate of a video; the first frame is decoded, and the packets are counted."""
-    first = next((frame for _, frame in _decoded(path)), None)
-    if first is None:
+    decoded = next(_decoded(path), None)
+    if decoded is None:
         raise _broken(path, 0, "it holds no image")
-    height, width = _rotated_rgb(path, first).shape[:2]
+    _, first, tags = decoded
+    height, width = _rotated_rgb(path, first, tags).shape[:2]
     with _reading(path), opened_video(path) as container:
         stream = container.streams.video[0]
         fps, hidden = float(stream.average_rate or 0), [packet.is_discard for packet in _packets(container)]
@@ -91,7 +108,17 @@ def probe_video(path: Path) -> VideoInfo:
         count = max(stream.frames, len(hidden)) - sum(hidden)
     if count > MAX_FRAMES:
         raise DyngsError(f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up")
-    return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0)
+    note = tags.conversion
+    is_untagged = {tags.primaries, tags.transfer, tags.matrix} == {UNSPECIFIED}
+    if is_untagged and _matrix_of(first, tags) == BT709_MATRIX:
+        note = "HD without colour tags is read as BT.709"
+    return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0, note)
+
+
+def colour_notes(videos: Iterable[VideoInfo]) -> list[str]:
+    """Return a line for each of the different ``VideoInfo.colours`` of the videos of a capture."""
+    counts = Counter(video.colours for video in videos if video.colours)
+    return [f"{counted(count, 'video')}: {note}" for note, count in counts.items()]
 
 
 def frame_seconds(path: Path, num_frames: int) -> list[float]:
@@ -122,8 +149,10 @@ def _packets(container: InputContainer) -> Iterator[av.Packet]:
                 yield packet
 
 
-def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterator[tuple[int, av.VideoFrame]]:
-    """Yield number and frame, in order; damage is an error that names the frame.
+def _decoded(
+    path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE"
+) -> Iterator[tuple[int, av.VideoFrame, ColourTags]]:
+    """Yield number, frame and colour tags, in order; damage is an error that names the frame.
 
     With "AUTO", which is faster, several frames are decoded at once, and damage takes those before it along.
     """
@@ -137,10 +166,12 @@ def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterato
             with opened_video(path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = threads
+                # Decoders of HEVC and ProRes overwrite what the container says, even by "unspecified".
+                container_tags = _tags_of(stream.codec_context)
                 for frame in container.decode(stream):
                     if (frame.width, frame.height) != (stream.width, stream.height):
                         check_size(path, frame.width, frame.height)
-                    yield index, frame
+                    yield index, frame, _tags_of(stream.codec_context).or_else(container_tags)
                     index += 1
         except FFmpegError as error:
             if index == 0:
@@ -193,6 +224,43 @@ def orientation_of(frame: av.VideoFrame) -> int:
     return {(False, False): 5, (False, True): 6, (True, True): 7, (True, False): 8}[b < 0, c < 0]
 
 
-def _rotated_rgb(path: Path, frame: av.VideoFrame) -> np.ndarray:
+def _tags_of(context: VideoCodecContext) -> ColourTags:
+    is_full_range = context.color_range == _FULL_RANGE
+    return ColourTags(context.color_primaries, context.color_trc, context.colorspace, is_full_range)
+
+
+def _matrix_of(frame: av.VideoFrame, tags: ColourTags) -> int:
+    """Return the matrix of a frame; without a tag that of the primaries, else of the size."""
+    if tags.matrix != UNSPECIFIED or frame.format.is_rgb:
+        return tags.matrix
+    if tags.gamut == BT2020:
+        return BT2020_MATRIX
+    is_hd = frame.width >= 1280 or frame.height > 576
+    return BT709_MATRIX if is_hd else BT601_MATRIX
+
+
+def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarray:
+    matrix = _matrix_of(frame, tags)
+    if matrix not in KNOWN_MATRICES:  # as that of Dolby Vision without a base layer
+        raise DyngsError(
+            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which dyngs cannot convert; "
+            "export the video as SDR, HLG or HDR10"
+        )
+    # The nearest sample of chroma, as swscale takes it for 8 bits: filters mix colours at edges,
+    # which the curves of HDR amplify.
+    convert = partial(
+        frame.to_ndarray,
+        src_colorspace=matrix,
+        src_color_range=_FULL_RANGE if tags.is_full_range else None,
+        interpolation="POINT",
+    )
     with _reading(path):  # a damaged frame may not be convertible
-        return rotated_upright(frame.to_ndarray(format="rgb24"), orientation_of(frame))
+        if not tags.conversion:
+            rgb = convert(format="rgb24")
+        else:
+            # swscale expands limited range to 255 levels of 256 steps each.
+            white = 65535 if tags.is_full_range else 255 * 256
+            is_deep = frame.format.components[0].bits > 8
+            wide = convert(format="rgb48le") if is_deep else convert(format="rgb24") * np.uint16(white // 255)
+            rgb = to_srgb(wide, tags, white)
+        return rotated_upright(rgb, orientation_of(frame))

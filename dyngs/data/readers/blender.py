@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 from dyngs.data.body_frames import read_body_file, rows_of
-from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Split, Splits, View
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Split, Splits, View, all_views, each_view
+from dyngs.data.readers.colmap import find_masks, mask_of, unmasked_warning
 from dyngs.data.readers.transforms import SPLITS, FrameFile, find_points, read_frame_file, read_views, tracks_path_of
 from dyngs.errors import DyngsError
 
@@ -14,7 +17,7 @@ def read_blender(root: Path) -> Capture:
     """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test are optional.
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
-    Points: see ``find_points``.
+    Points: see ``find_points``. Masks: ``mask_path`` of the frames, else those in ``masks/`` that are named as images.
     """
     splits: Splits = {}
     warnings: list[str] = []
@@ -28,13 +31,38 @@ def read_blender(root: Path) -> Capture:
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
             warnings.append(f"{path.name}: lists no frames")
-    return _capture_of(root, "blender", train, splits, warnings)
+    splits, notes = _with_masks(root, splits)
+    return _capture_of(root, "blender", train, splits, [*warnings, *notes])
+
+
+def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
+    """Return the views with masks of ``masks/`` where the files name none, and a line about views without one."""
+    views = all_views(splits)
+    has_people = any(view.silhouette for view in views) or any(root.glob("body_*.npz"))
+    if has_people or any(view.mask_path for view in views):
+        return splits, []
+    masks = find_masks(root / "masks")
+    images = root / "images"
+
+    def with_mask(view: View) -> View:
+        path = view.image_path
+        name = os.path.relpath(path, images if path.is_relative_to(images) else root)
+        return replace(view, mask_path=mask_of(name, masks))
+
+    splits = each_view(splits, with_mask)
+    return splits, unmasked_warning(all_views(splits), bool(masks))
 
 
 def _capture_of(root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]) -> Capture:
     points, path, notes = find_points(file)
     tracks, lines = tracks_path_of(file), (*warnings, *notes)
     return Capture(root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines)
+
+
+def training_capture(root: Path, format: str, file: FrameFile, *more: str) -> Capture:
+    """Return the capture of a file whose frames are all for training, with ``more`` warnings."""
+    views, warnings = read_views(file)
+    return _capture_of(root, format, file, {"train": tuple(views.values())}, [*warnings, *more])
 
 
 FORMAT = CaptureFormat(
@@ -52,7 +80,8 @@ def read_nerfstudio(root: Path) -> Capture:
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
     splits, notes = _nerfstudio_splits(file, views)
-    return _capture_of(root, "nerfstudio", file, splits, [*warnings, *notes])
+    splits, more = _with_masks(root, splits)
+    return _capture_of(root, "nerfstudio", file, splits, [*warnings, *notes, *more])
 
 
 def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:

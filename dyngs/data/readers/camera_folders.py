@@ -14,7 +14,7 @@ from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, checked_pose, match_size, opengl_from_cam, rescale_warning
 from dyngs.data.images.frame_cache import VideoFrames, planned_frames
 from dyngs.data.images.images import SUFFIXES, files_in
-from dyngs.data.images.video import VideoInfo, videos_in
+from dyngs.data.images.video import VideoInfo, colour_notes, videos_in
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.fields import first_few, is_number, matrix_of, read_json_object
@@ -80,6 +80,7 @@ def sequence_views(
     span = max(numbers[-1] - numbers[0], 1)
     views: dict[str, tuple[View, ...]] = {}
     warnings = _rate_warning(cameras)
+    warnings += colour_notes(camera.video.info for camera in cameras if camera.video is not None)
     for index, camera in enumerate(cameras):
         own = dict(calibrations[camera.name])
         where = f"{path}, camera {camera.name}"

@@ -16,6 +16,7 @@ from dyngs.data.readers.transforms import SPLITS
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, first_few, numbers_of
+from dyngs.files.limits import read_limited
 from dyngs.files.numpy_files import read_npz
 from dyngs.files.pickles import read_pickle, read_pickled_array
 
@@ -118,7 +119,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
         if not path.is_file():
             continue
         with reading(path, "it lists names of images, one a line"):
-            listed = list(dict.fromkeys(inside(path).read_text(encoding="utf-8").split()))
+            listed = list(dict.fromkeys(read_limited(inside(path)).decode().split()))
         unposed += [name for name in listed if name not in people]
         splits[split] = tuple(people[name] for name in listed if name in people)
     if "train" not in splits:

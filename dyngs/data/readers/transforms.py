@@ -24,9 +24,11 @@ from dyngs.data.geometry import (
     rescale_warning,
 )
 from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
+from dyngs.data.readers.point_colours import point_colours
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import is_number, matrix_of, read_json_object
+from dyngs.files.find import FileFinder
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 MAX_FPS = 1e6
@@ -110,7 +112,8 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     Raises DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same image twice.
     """
     root = file.path.parent
-    paths = [_image_path(root, frame) for frame in file.frames]
+    files = FileFinder(root)
+    paths = [_image_path(files, frame) for frame in file.frames]
     twice = [path for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise DyngsError(f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames")
@@ -123,7 +126,7 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     rescaled: list[str] = []
     views = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
-        view, repaired[frame.where], is_rescaled = _view(frame, root, path, header, common)
+        view, repaired[frame.where], is_rescaled = _view(frame, files, path, header, common)
         rescaled += [frame.where] if is_rescaled else []
         views[str(frame.own["file_path"])] = view
     return _with_flow_targets(views), repair_warning(repaired) + rescale_warning(rescaled)
@@ -134,7 +137,7 @@ def tracks_path_of(file: FrameFile) -> Path | None:
     written = file.fields.get("tracks_file_path")
     if written is not None and not isinstance(written, str):
         raise DyngsError(f"{file.path}: 'tracks_file_path' must be a string, got {written!r:.40}")
-    return _below(file.path.parent, written, str(file.path)) if written else None
+    return _below(FileFinder(file.path.parent), written, str(file.path)) if written else None
 
 
 def view_name(path: Path, root: Path) -> str:
@@ -144,7 +147,7 @@ def view_name(path: Path, root: Path) -> str:
 
 
 def _view(
-    frame: FrameEntry, root: Path, path: Path, header: ImageHeader | None, common: tuple[int, int] | None
+    frame: FrameEntry, files: FileFinder, path: Path, header: ImageHeader | None, common: tuple[int, int] | None
 ) -> tuple[View, float, bool]:
     """Return a view, by how much its rotation was repaired, and whether its intrinsics were rescaled."""
     described = _described_size(frame)
@@ -157,11 +160,11 @@ def _view(
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
     matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
     pose, error = checked_pose(matrix, frame.where)
-    masks = [_named_file(root, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
-    silhouette = _named_file(root, frame, "silhouette_path")
+    masks = [_named_file(files, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
+    silhouette = _named_file(files, frame, "silhouette_path")
     camera = frame.integer("camera")
     view = View(
-        name=view_name(path, root),
+        name=view_name(path, files.root),
         image_path=path,
         cam_from_world=cam_from_opengl(pose),
         intrinsics=intrinsics,
@@ -169,15 +172,15 @@ def _view(
         height=size[1],
         lens=_lens(frame),
         camera_id=(camera if camera is not None else frame.integer("camera_id")) or 0,
-        mask_path=_named_file(root, frame, "mask_path"),
+        mask_path=_named_file(files, frame, "mask_path"),
         time=_number(frame.own.get("time"), "time", frame.where),
         frame=frame.integer("frame"),
         video=frame.video,
         silhouette=None if silhouette is None else Silhouette(silhouette, "white"),
-        depth_path=_named_file(root, frame, "depth_file_path"),
+        depth_path=_named_file(files, frame, "depth_file_path"),
         motion_mask_path=masks[0] or masks[1],
         motion_mask_labels=masks[0] is None and masks[1] is not None,
-        flow_path=_named_file(root, frame, "flow_file_path"),
+        flow_path=_named_file(files, frame, "flow_file_path"),
         exposure=header.tags.exposure if header else None,
     )
     return view, error, rescaled
@@ -194,9 +197,9 @@ def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
     return {key: replace(view, flow_to=following.get(key)) for key, view in views.items()}
 
 
-def _named_file(root: Path, frame: FrameEntry, key: str) -> Path | None:
+def _named_file(files: FileFinder, frame: FrameEntry, key: str) -> Path | None:
     written = frame.text(key)
-    return _below(root, written, frame.where) if written else None
+    return _below(files, written, frame.where) if written else None
 
 
 def _number(value: object, key: str, where: str) -> float | None:
@@ -207,26 +210,25 @@ def _number(value: object, key: str, where: str) -> float | None:
     return float(value)
 
 
-def _below(root: Path, written: str, where: str) -> Path:
-    path = Path(os.path.normpath(root / written.replace("\\", "/")))
-    if not path.name or path == Path(os.path.normpath(root)) or "\0" in written:
+def _below(files: FileFinder, written: str, where: str) -> Path:
+    path = files.find(written)
+    if not path.name or path == Path(os.path.normpath(files.root)) or "\0" in written:
         raise DyngsError(f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder")
     return path
 
 
-def _image_path(root: Path, frame: FrameEntry) -> Path:
-    """The image's file; extensions are tried where none is written, PNG first."""
+def _image_path(files: FileFinder, frame: FrameEntry) -> Path:
+    """Return the image's file; extensions are tried where none is written, PNG first."""
     if frame.image is not None:
         return frame.image
     written = frame.own.get("file_path")
     if not isinstance(written, str) or not written:
         raise DyngsError(f"{frame.where}: the key 'file_path' is missing")
-    path = _below(root, written, frame.where)
+    path = _below(files, written, frame.where)
     if path.suffix.lower() in SUFFIXES or path.is_file():
         return path
-    endings = (ending for suffix in SUFFIXES for ending in (suffix, suffix.upper()))
-    candidates = (path.with_name(path.name + ending) for ending in endings)
-    return next((candidate for candidate in candidates if candidate.is_file()), path.with_name(path.name + SUFFIXES[0]))
+    candidates = [files.find(written + suffix) for suffix in SUFFIXES]
+    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
 
 
 def _described_size(frame: FrameEntry) -> tuple[int, int] | None:
@@ -317,7 +319,7 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
     """
     root, written = file.path.parent, file.fields.get(KEY)
     if isinstance(written, str) and written:
-        path = inside(root / written)
+        path = inside(FileFinder(root).find(written))
         return read_points(path), path, []
     usual = [root / name for name in USUAL_NAMES if (root / name).is_file()]
     there = [path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file()]
@@ -332,7 +334,7 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read the points of a ``.ply`` file (through trimesh), grey where it has no colours."""
+    """Read the points of a ``.ply`` file (through trimesh), with colours as ``point_colours`` finds them."""
     import trimesh
 
     if not path.is_file():
@@ -341,9 +343,8 @@ def read_points(path: Path) -> PointCloud:
     with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
         loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
         xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        own = isinstance(loaded, trimesh.PointCloud)
-        colours = loaded.colors if own else getattr(loaded.visual, "vertex_colors", None)
-        rgb = np.full((len(xyz), 3), 128, np.uint8)
-        if colours is not None and len(colours) == len(xyz):
-            rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
+        columns = loaded.metadata["_ply_raw"]["vertex"]["data"]
+        if isinstance(columns, np.ndarray):  # of a binary file
+            columns = {name: columns[name] for name in columns.dtype.names or ()}
+        rgb = point_colours(columns, len(xyz))
     return PointCloud(xyz, rgb)

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dyngs.data.images.colour_space import srgb_encoded
+
 CAMERA_ANGLE_X = 0.6911112070083618
 """Horizontal field of view of the NeRF-synthetic scenes, radians."""
 
@@ -438,5 +440,4 @@ def _unit(a: np.ndarray) -> np.ndarray:
 
 def _srgb(linear: np.ndarray) -> np.ndarray:
     """Convert linear light to sRGB in [0, 1] (IEC 61966-2-1)."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-6), 1 / 2.4) - 0.055)
+    return srgb_encoded(np.clip(linear, 0.0, 1.0))

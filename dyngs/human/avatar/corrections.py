@@ -14,8 +14,6 @@ from torch import Tensor
 
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.avatar.loose import LR as CLOTH_LR
-from dyngs.human.avatar.loose import first_cloth
 from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
@@ -58,11 +56,8 @@ def new_corrections(
     skeleton: Skeleton,
     anchors: Anchors,
     normals: Tensor | None = None,
-    nodes: Tensor | None = None,
 ) -> Parameters:
     """Return the corrections to learn, all zero; with ``normals`` (N, 3) also the light that falls on them (``Light``).
-
-    With ``nodes`` (M, 3) also how loose cloth hangs on these (``first_cloth``).
 
     ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before those of the clip; ``trans`` (F, 3);
     ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K).
@@ -78,11 +73,9 @@ def new_corrections(
     }
     if normals is not None:
         zeros |= {"light": normals.new_zeros(TERMS, 3), "normals": normals}
-    if nodes is not None:
-        zeros |= first_cloth(nodes)
     own = ("weights", "normals")
     roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
-    return Parameters(zeros, LR | CLOTH_LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
+    return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
 
 
 def correction_penalties(learned: Parameters) -> dict[str, Tensor]:
@@ -102,7 +95,6 @@ def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
         clip.rotations[row] @ own,
         clip.trans[row] + learned["trans"][row],
         clip.scale[row] * learned["log_scale"][0].exp(),
-        None if clip.past is None else clip.past[row],
     )
 
 

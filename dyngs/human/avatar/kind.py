@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from dyngs.config import Config, HumanModel
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
@@ -15,7 +13,6 @@ from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of
 from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
-from dyngs.human.avatar.loose import remembering
 from dyngs.human.avatar.observations import Subject, in_colours_of
 from dyngs.human.avatar.outlines import outline_loss
 from dyngs.human.avatar.pose_refit import PoseRefit
@@ -28,10 +25,6 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.views import evaluation_background, training_cameras
 
-_NOT_LOOSE = (
-    "model.loose=true: how fast the person moves is not known, as the capture does not say its frames per second; "
-    'write "fps" into its transforms_train.json, or leave model.loose out'
-)
 FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
 
 
@@ -81,16 +74,12 @@ def human_start(config: Config, model: HumanModel, capture: Capture, images: Ima
         raise DyngsError(f"{capture.root}: {problem}")
     if sh_degree > 1:
         raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
-    if model.loose and (capture.fps is None or not model.refine):
-        raise DyngsError(_NOT_LOOSE if model.refine else "model.loose=true needs model.refine=true")
     given, body = capture.body["train"], load_template(model)
     vertices, joints = rest_shape(body, given)
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
     cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
     parts = surface_texels(body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0]))
     gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
-    if model.loose:
-        filmed = replace(filmed, clip=remembering(filmed, capture.fps))
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
     shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
     return in_colours_of(gaussians, normals, subject, shown), subject

@@ -124,9 +124,7 @@ def fitted_to_images(
     times = sorted(groups)
     parts = [scene.moves_as.at(time) for time in times]
     poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
-    pasts = [x.past for x in parts if x.past is not None]
-    past = torch.cat(pasts) if pasts else None
-    starts = MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale, past)
+    starts = MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
     found: list[Correction] = []
     counts: list[int] = []
     for row, time in enumerate(times):
@@ -217,7 +215,6 @@ class _Fit:
             start.rotations[0] @ axis_angle_to_matrix(correction.turns),
             start.trans[0] + correction.shift * start.scale[0],
             start.scale[0],
-            None if start.past is None else start.past[0],
         )
         moment = self.scene.in_pose(posing, self.time)
         losses = []

@@ -105,7 +105,6 @@ class BodyPose:
     rotations: Tensor  # (J, 3, 3) relative to the parent joints
     trans: Tensor  # (3,) world units, added last
     scale: Tensor  # () world units per metre
-    past: Tensor | None = None  # (P,) how the body has moved until then, see ``MotionClip``
 
 
 def pose_gaussians(
@@ -165,8 +164,7 @@ def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
 
 def frame_pose(clip: MotionClip, row: int) -> BodyPose:
     """Return the pose of one frame of a clip."""
-    past = None if clip.past is None else clip.past[row]
-    return BodyPose(clip.rotations[row], clip.trans[row], clip.scale[row], past)
+    return BodyPose(clip.rotations[row], clip.trans[row], clip.scale[row])
 
 
 def posed_joints(skeleton: Skeleton, pose: BodyPose) -> Tensor:

@@ -21,7 +21,6 @@ from dyngs.human.avatar.corrections import (
     learned_light,
     new_corrections,
 )
-from dyngs.human.avatar.loose import PAST, Hold, draped, first_cloth, hold_of
 from dyngs.human.avatar.posing import (
     LEFT_OUT,
     TERMS,
@@ -54,7 +53,6 @@ class HumanScene(GaussianScene):
     played: MotionClip | None = None
     # (N,) in [0, 1] how far colours are what the training views showed, not filled; None: that was not found out
     seen: Tensor | None = None
-    hold: Hold | None = None  # nodes of loose cloth that the Gaussians follow; None: cloth is tight
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
@@ -66,14 +64,13 @@ class HumanScene(GaussianScene):
         require_avatar(gaussians, tensors)
         anchors = Anchors(**{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)})
         given = (tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale"))
-        clip = MotionClip(*given, past=tensors.get("clip.past"))
+        clip = MotionClip(*given)
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
         own, shapes = part_of(tensors, "learned"), None
         if "shapes.directions" in tensors:
             require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
             shapes = PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
-        nodes = own.get("cloth_nodes")
-        learned = new_corrections(clip, skeleton, anchors, own.get("normals"), nodes).restored(own)
+        learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
             anchors=anchors,
@@ -82,7 +79,6 @@ class HumanScene(GaussianScene):
             learned=learned,
             shapes=shapes,
             seen=tensors.get("seen"),
-            hold=None if nodes is None else hold_of(anchors.points, nodes),
         )
 
     @property
@@ -145,10 +141,8 @@ class HumanScene(GaussianScene):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """What files that hold neither light nor loose cloth say of it."""
-        loose = "how loose cloth hangs and swings is left out: it follows the joints"
-        light = () if self.light is None else (LEFT_OUT,)
-        return light if self.hold is None else (*light, loose)
+        """Notes about what files without learned light leave out."""
+        return () if self.light is None else (LEFT_OUT,)
 
     @property
     def moves_as(self) -> MotionClip:
@@ -181,16 +175,12 @@ class HumanScene(GaussianScene):
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
         offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
-        if self.hold is not None:
-            gaussians = draped(gaussians, self.learned, self.hold, posing, self.up)
         return GaussianTimeStep(gaussians, time, RestFrame(self.gaussians.means, posing.rotations[0]))
 
-    def in_frame(
-        self, row: int, given_weights: Tensor | None = None, noise: Tensor | None = None
-    ) -> tuple[Gaussians, BodyPose]:
+    def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.
 
-        With ``given_weights`` (N, J) nothing that was learned about the body is applied. ``noise``: see ``draped``.
+        With ``given_weights`` (N, J) nothing that was learned about the body is applied.
         """
         skeleton, light = self.skeleton, None
         if given_weights is None:
@@ -201,8 +191,6 @@ class HumanScene(GaussianScene):
             posing, weights = frame_pose(self.clip, row), given_weights
         offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
-        if self.hold is not None and given_weights is None:
-            gaussians = draped(gaussians, self.learned, self.hold, posing, self.up, noise)
         return gaussians, posing
 
     def given_weights(self) -> Tensor:
@@ -216,7 +204,6 @@ class HumanScene(GaussianScene):
             anchors=self.anchors.select(edit.source),
             learned=self.learned.edited(Role.PER_GAUSSIAN, edit),
             seen=None if self.seen is None else self.seen[edit.source],
-            hold=None if self.hold is None else self.hold.select(edit.source),
         )
 
     def part(self, which: str) -> HumanScene:
@@ -250,7 +237,6 @@ class HumanScene(GaussianScene):
         if self.seen is not None:
             state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
         given = {f"clip.{name}": getattr(clip, name) for name in ("times", "poses", "trans", "scale")}
-        given |= {} if clip.past is None else {"clip.past": clip.past}
         given |= {"joints": skeleton.joints, "parents": torch.tensor(skeleton.parents, device="cpu")}
         if self.shapes is not None:
             given |= {"shapes.directions": self.shapes.directions.half(), "shapes.faces": self.shapes.faces.int()}
@@ -293,9 +279,6 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         require_tensor("learned.normals", state["learned.normals"], (n, 3))
     if "shapes.directions" in state:
         require_indices("anchors.face", state["anchors.face"], (n,), len(state["shapes.faces"]))
-    if "clip.past" in state:
-        require_tensor("clip.past", state["clip.past"], (f, PAST))
-    require_cloth({name: x for name, x in state.items() if name.startswith("learned.cloth_")}, "learned.")
     if "seen" in state:
         require_tensor("seen", state["seen"], (n,))
     if "near" in state:
@@ -309,17 +292,6 @@ def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: in
     if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
         raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
     check_tree(tuple(parents.tolist()))
-
-
-def require_cloth(state: Mapping[str, Tensor], prefix: str) -> None:
-    """Check what was learned of loose cloth, named as in ``first_cloth`` behind ``prefix``; KeyError or ValueError."""
-    if state:
-        nodes = state[f"{prefix}cloth_nodes"]
-        require_tensor(f"{prefix}cloth_nodes", nodes, (None, 3))
-        if not len(nodes):
-            raise ValueError("loose cloth has no nodes")
-        for name, x in first_cloth(nodes).items():
-            require_tensor(prefix + name, state[prefix + name], tuple(x.shape))
 
 
 def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:

@@ -19,7 +19,6 @@ from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
-from dyngs.human.avatar.loose import hold_of, nodes_on, training_noise
 from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
@@ -69,8 +68,7 @@ class HumanTraining(SceneTraining[HumanScene]):
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
         clip = subject.motion.clip
-        nodes = nodes_on(subject.anchors.points) if self.options.loose else None
-        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals, nodes)
+        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
             gaussians=gaussians,
             anchors=subject.anchors,
@@ -78,7 +76,6 @@ class HumanTraining(SceneTraining[HumanScene]):
             clip=clip,
             learned=learned,
             shapes=subject.shapes,
-            hold=None if nodes is None else hold_of(subject.anchors.points, nodes),
         )
 
     def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
@@ -91,8 +88,7 @@ class HumanTraining(SceneTraining[HumanScene]):
             raise DyngsError(f"view {image.name!r}: no body parameters for frame {image.frame}")
         penalties = self._penalties(scene)
         row = min(row, len(scene.clip) - 1)  # who never moves has one row
-        noise = None if scene.hold is None else training_noise(step, scene.skeleton.joints)
-        gaussians, posing = self._in_frame(scene, row, step, noise)
+        gaussians, posing = self._in_frame(scene, row, step)
         if self._refines(step):
             penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
@@ -164,12 +160,10 @@ class HumanTraining(SceneTraining[HumanScene]):
             kept["poses_stay"] = torch.ones(1, device="cpu")
         return with_role(kept, Role.TRAINING)
 
-    def _in_frame(
-        self, scene: HumanScene, row: int, step: int, noise: Tensor | None = None
-    ) -> tuple[Gaussians, BodyPose]:
+    def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in row ``row`` of the clip as ``step`` draws them, and the pose."""
         if self._refines(step):
-            return scene.in_frame(row, noise=noise)
+            return scene.in_frame(row)
         if self._given_weights is None:
             self._given_weights = scene.given_weights()
         return scene.in_frame(row, self._given_weights)

@@ -1,4 +1,4 @@
-"""What a detector of people returns, whoever made it, and which one is asked.
+"""Interface of detectors of people, and what they return.
 
 Local letters: H height, W width of an image.
 """
@@ -58,21 +58,3 @@ class Detector(Protocol):
         Raises DyngsError: it cannot be started, or fails.
         """
         ...
-
-
-def chosen_detector(weights: Sequence[Path], mediapipe: Path | None) -> Detector:
-    """Return torchvision's R-CNN where weights are given, else MediaPipe.
-
-    Raises DyngsError: neither is there; says how to get one.
-
-    Args:
-        weights: files of the user's own download: Keypoint R-CNN, and Mask R-CNN for silhouettes.
-        mediapipe: Python interpreter of an environment with MediaPipe; None: ``$DYNGS_MEDIAPIPE``.
-    """
-    if weights:
-        from dyngs.human.detection.rcnn import Rcnn
-
-        return Rcnn(weights)
-    from dyngs.human.detection.mediapipe import MediaPipe
-
-    return MediaPipe(mediapipe)

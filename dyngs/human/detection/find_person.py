@@ -23,13 +23,14 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, counted, show
 from dyngs.files.lock import make_once
 from dyngs.files.outputs import note_sources, require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import write_image, write_text
-from dyngs.human.detection.detector import Detection, Detector, chosen_detector
+from dyngs.human.detection.detector import Detection, Detector
 from dyngs.human.detection.following import followed, with_sides
+from dyngs.human.detection.mediapipe import MediaPipe
 from dyngs.human.detection.warnings import warnings_of
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 
@@ -54,7 +55,7 @@ def find_person(
     detector: Detector,
     folder: Path,
     report: ReportProgress,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = show,
     number: int = 1,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they are.
@@ -128,7 +129,7 @@ def _write_masks(camera: _Camera, person: Sequence[Detection | None], folder: Pa
     """Write the masks of all views at their size; nothing where the detector makes no masks."""
     seen = [x for x in person if x is not None]
     if any(x.mask is None for x in seen):
-        raise DyngsError("no silhouettes without weights of Mask R-CNN; give both files, as in docs/person.md")
+        raise DyngsError("the detector returns no silhouettes, which the fit needs; use another detector")
     size = camera.images.shape[1:3]
     masks = np.stack([np.zeros(size, bool) if x is None or x.mask is None else x.mask > 127 for x in person])
     better = outlined(camera.images, masks)
@@ -159,7 +160,7 @@ def write_found_person(
     out: Path,
     detector: Detector,
     report: ReportProgress = report_nothing,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = show,
     number: int = 1,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the new folder ``out``.
@@ -179,7 +180,7 @@ def write_found_person(
 
 
 def with_found_person(
-    data: DataConfig, *, say: Callable[[str], None] = print, report: ReportProgress = report_nothing
+    data: DataConfig, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is looked at once.
 
@@ -190,7 +191,7 @@ def with_found_person(
     folder = cache_folder("people") / f"{name}.{digest_of(data.root)}{chosen}"
 
     def find() -> None:
-        detector = chosen_detector((), None)
+        detector = MediaPipe()
         say(f"person:  found first, as by `dyngs data people`, into {folder}")
         say(write_found_person(data, folder, detector, report, say).summary())
 

@@ -27,7 +27,7 @@ INSTALL = (
     f"`python -m venv ENV && ENV/bin/pip install {PACKAGE}` (Python 3.9 to 3.12), then give --mediapipe ENV/bin/python "
     f"or set {VARIABLE} to it"
 )
-OTHERS = "or give --weights of R-CNN, or masks of another program to `dyngs data fit` (docs/person.md)"
+OTHERS = "or give masks of another program to `dyngs data fit` (docs/person.md)"
 LANDMARKS = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 """Rows of MediaPipe's landmarks that are the key points of COCO, in their order."""
 _SECONDS_PER_IMAGE, _SECONDS_TO_START = 10.0, 120.0

@@ -26,7 +26,7 @@ from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, counted, reading
+from dyngs.errors import DyngsError, counted, reading, show
 from dyngs.files.lock import make_once
 from dyngs.files.outputs import new_folder
 from dyngs.files.temporary import cache_folder
@@ -74,7 +74,7 @@ def has_guessed_lens(capture: Capture) -> bool:
     return capture.format == FORMAT
 
 
-def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = print) -> Capture:
+def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = show) -> Capture:
     """Return a capture with silhouettes: of a capture, or a video or a folder of images of one fixed camera.
 
     Masks of ``given`` take the place of those of the capture; without any they are made from the background, in the
@@ -387,7 +387,7 @@ def with_fitted_body(
     model: HumanModel | None = None,
     *,
     only_if_needed: bool = False,
-    say: Callable[[str], None] = print,
+    say: Callable[[str], None] = show,
     report: ReportProgress = report_nothing,
 ) -> DataConfig:
     """Return the options with a fit of a template to the capture; the same capture is fitted once.

@@ -15,11 +15,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
-from dyngs.files.limits import require_at_most
+from dyngs.files.limits import read_limited, require_at_most
 from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, require_frame_rate
 
 _END_SITE = -1
 _MOST_JOINTS = 4096
+_MOST_BYTES = 1 << 28
 _LONGEST_NAME = 200
 _CHARACTERS = 1 << 16  # characters of MOTION that are parsed at once
 _GAP = re.compile(r"\s")
@@ -78,7 +79,7 @@ def _halves(path: Path) -> tuple[str, str]:
     if path.exists() and not path.is_file():
         raise DyngsError(f"{path}: is not a file; name a .bvh")
     try:
-        text = path.read_bytes().decode("utf-8-sig", errors="replace")
+        text = read_limited(path, _MOST_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({error.strerror})") from error
     halves = re.split(r"(?im)^[^\S\n]*MOTION[^\S\n]*$", text, maxsplit=1)

@@ -175,8 +175,6 @@ class MotionClip:
     poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
     trans: Tensor  # (F, 3) world units, added last
     scale: Tensor  # (F,) world units per metre of the template
-    # (F, P) how the body has moved until then, for loose cloth (``past_motion``); None: that does not count
-    past: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.times)
@@ -192,8 +190,7 @@ class MotionClip:
 
     def select(self, rows: Tensor) -> MotionClip:
         """Return the frames at ``rows`` (long, on the CPU, ascending)."""
-        past = None if self.past is None else self.past[rows]
-        return MotionClip(self.times[rows], self.poses[rows], self.trans[rows], self.scale[rows], past)
+        return MotionClip(self.times[rows], self.poses[rows], self.trans[rows], self.scale[rows])
 
     def at(self, time: float | None) -> MotionClip:
         """Return a clip of one frame at ``time``, clamped to the clip; None: the first frame.
@@ -212,7 +209,6 @@ class MotionClip:
             poses=interpolate_rotations(self.poses[before:after], self.poses[after : after + 1], np.array([fraction])),
             trans=torch.lerp(self.trans[before], self.trans[after], fraction)[None],
             scale=torch.lerp(self.scale[before], self.scale[after], fraction)[None],
-            past=None if self.past is None else torch.lerp(self.past[before], self.past[after], fraction)[None],
         )
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from dyngs.config import HumanModel
 from dyngs.data.capture import BodyFrames
 from dyngs.errors import DyngsError, reading, reason
-from dyngs.files.limits import require_at_most
+from dyngs.files.limits import read_limited, require_at_most
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.pickles import read_pickle
 from dyngs.human.template.body import BodyTemplate, apply_shape, bone_shapes
@@ -47,7 +47,7 @@ def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> _Coordinates:
     if path.exists() and not path.is_file():
         raise DyngsError(f"{path}: is not a file; name the .obj made for this body")
     try:
-        lines = io.StringIO(path.read_text("latin-1"))
+        lines = io.StringIO(read_limited(path).decode("latin-1"))
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({reason(error)})") from error
     count, uv, corners = 0, [], []

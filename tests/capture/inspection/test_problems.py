@@ -113,6 +113,12 @@ def test_masks_that_ignore_nearly_everything(tmp_path: Path, mask: np.ndarray, l
     assert problem in report_on(capture).problems
 
 
+def test_what_masks_do_is_said_before_training(tmp_path: Path) -> None:
+    line = "masks of 5 of 6 images; white counts, black is ignored: 25% of the pixels in 4 that were read"
+    assert line in before_training(capture_with(tmp_path, mask_of(6)))
+    assert not any("masks" in line for line in before_training(capture_with(tmp_path, None)))
+
+
 def test_what_cannot_be_read_is_left_to_others(tmp_path: Path) -> None:
     capture = capture_with(tmp_path, mask_of(1))
     (tmp_path / "mask1.png").write_text("no image")
@@ -120,7 +126,7 @@ def test_what_cannot_be_read_is_left_to_others(tmp_path: Path) -> None:
 
 
 def test_the_report_says_which_value_counts(tmp_path: Path) -> None:
-    assert "5 of 6 images; white counts, black is ignored" in format_report(
+    assert "5 of 6 images; white counts, black is ignored: 25% of the pixels in 4 that were read" in format_report(
         report_on(capture_with(tmp_path, mask_of(6)))
     )
 

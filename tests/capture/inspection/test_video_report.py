@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 from stage_videos import camera, corner, write_videos
 
 from dyngs.capture.inspection.video_report import video_facts, video_report
@@ -31,6 +32,12 @@ def test_a_camera_that_moves(tmp_path: Path) -> None:
     assert "1 blurred frame" in facts["sharpness"]
     assert "moves" in facts["camera"]
     assert f"dyngs train static data.root={tmp_path / 'walk.mp4'}" in video_report(tmp_path / "walk.mp4")
+
+
+def test_conversion_of_colours(tmp_path: Path) -> None:
+    write_clip(tmp_path / "a.mp4", encoded(patches(), BT2020, HLG), (BT2020, HLG, BT2020))
+    assert "HLG is tone-mapped to SDR" in dict(video_facts(tmp_path / "a.mp4").facts)["colours"]
+    assert "colours" not in dict(video_facts(_turning(tmp_path / "walk.mp4")).facts)
 
 
 def test_a_camera_that_stands_and_a_folder_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

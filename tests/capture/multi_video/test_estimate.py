@@ -26,15 +26,25 @@ STARTS = {"left": 0.03, "middle": 0.0, "phone": 0.37, "right": 0.16}
 def capture_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("several")
     write_videos(folder / "rig", AZIMUTHS, STARTS, 10.0, 24)
+    (folder / "rig" / "videos.json").write_text(json.dumps({"starts": STARTS}))
     said = poses_of_videos(folder / "rig", folder / "out", SfmOptions(num_threads=1))
     assert "4 of 4 cameras have a pose" in said
-    assert "by the motion seen" in said
+    assert "as given" in said
     return folder / "out"
 
 
-def test_offsets_are_found_from_the_motion(capture_root: Path) -> None:
+def test_the_offsets_are_written(capture_root: Path) -> None:
     found = json.loads((capture_root / "videos.json").read_text())["starts"]
-    assert {name: start - found["middle"] for name, start in found.items()} == pytest.approx(STARTS, abs=0.04)
+    assert {name: start - found["middle"] for name, start in found.items()} == pytest.approx(STARTS, abs=1e-5)
+
+
+def test_silent_videos_without_offsets_are_refused(tmp_path: Path) -> None:
+    write_videos(tmp_path / "rig", {"a": 40.0, "b": 50.0}, {"a": 0.0, "b": 0.2}, 10.0, 6)
+    with pytest.raises(
+        DyngsError, match=r'there is no sound; give the second .* in videos\.json beside them, {"starts"'
+    ):
+        poses_of_videos(tmp_path / "rig", tmp_path / "out", SfmOptions(num_threads=1))
+    assert not (tmp_path / "out").exists()
 
 
 def test_cameras_stand_where_they_did(capture_root: Path) -> None:

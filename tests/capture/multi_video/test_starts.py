@@ -53,8 +53,8 @@ def test_offsets_of_recordings_with_noise_of_their_own(tmp_path: Path) -> None:
     parts = [clatter[int(start * HERTZ) :][: 4 * HERTZ] for start in starts]
     noisy = [gain * part + 0.01 * rng.normal(size=len(part)) for gain, part in zip((1.0, 0.3, 0.6), parts, strict=True)]
     films = [open_film(_write(tmp_path / f"{i}.mp4", sound)) for i, sound in enumerate(noisy)]
-    seconds, line = found_starts(films, [])
-    assert seconds == pytest.approx(starts, abs=0.015)
+    seconds, line = found_starts(films)
+    assert list(seconds.values()) == pytest.approx(starts, abs=0.015)
     assert "by the sound (3 of 3 pairs agree" in line
 
 

@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from hypothesis import given, settings
@@ -17,6 +18,7 @@ from tiny_captures import random_pixels, write_image
 
 from dyngs.capture.photos import gather_photos, lay_out
 from dyngs.data.images import images
+from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,
@@ -25,6 +27,7 @@ from dyngs.data.images.images import (
     read_header,
     read_image,
     read_mask,
+    read_raw,
     straight_uint8,
     target_size,
 )
@@ -93,6 +96,156 @@ def test_truncated_image_is_named_by_check_and_by_read(tmp_path: Path, name: str
             refuse(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kept", [0.5, 1.0])
+@pytest.mark.parametrize(("content", "name"), [("jpg", "a.png"), ("png", "a.jpg"), ("webp", "a.jpg"), ("tif", "a.png")])
+def test_files_are_read_and_checked_by_content(tmp_path: Path, content: str, name: str, kept: float) -> None:
+    pixels = np.full((40, 50, 3), (200, 90, 30), np.uint8)
+    write_image(tmp_path / f"b.{content}", pixels)
+    data = (tmp_path / f"b.{content}").read_bytes()
+    path = tmp_path / name
+    path.write_bytes(data[: int(kept * len(data))])
+    if kept == 1.0:
+        assert check_image(path).size == (50, 40)
+        assert np.abs(read_image(path).numpy().astype(int) - pixels).max() <= 3
+    else:
+        with pytest.raises(DyngsError, match=name):
+            read_image(path)
+
+
+def write_exr(
+    path: Path, parts: Sequence[tuple[str, dict[str, float]]], window: tuple[int, int, int, int] = (0, 0, 4, 3)
+) -> None:
+    """An EXR of parts (name, channels with their value), data in ``window`` (x, y, width, height) of 4x3 pixels."""
+    specs = []
+    for name, channels in parts:
+        spec = oiio.ImageSpec(window[2], window[3], len(channels), "half")
+        spec.x, spec.y = window[:2]
+        spec.full_width, spec.full_height = 4, 3
+        spec.channelnames = list(channels)
+        if name:
+            spec.attribute("oiio:subimagename", name)
+        specs.append(spec)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), tuple(specs))
+    for index, (spec, (_, channels)) in enumerate(zip(specs, parts, strict=True)):
+        if index:
+            assert output.open(str(path), spec, "AppendSubimage")
+        values = np.array(list(channels.values()), np.float32)
+        assert output.write_image(np.tile(values, (window[3], window[2], 1)))
+    output.close()
+
+
+RGB = {"R": 1.0, "G": 0.5, "B": 0.0}
+OTHER = {"R": 0.1, "G": 0.1, "B": 0.1}
+SHOWN = [255, 188, 0]
+
+
+@pytest.mark.parametrize("name", ["rgb", "RGBA", "C", "beauty", "Combined", "ViewLayer.Combined"])
+def test_the_beauty_pass_of_several_parts_is_found_by_name(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, [("N", OTHER), (name, RGB), ("albedo", OTHER), ("depth", {"Z": 3.0})])
+    assert read_image(path)[1, 1].tolist() == SHOWN
+    assert read_header(path).layer == name
+    assert check_image(path).size == (4, 3)
+
+
+@pytest.mark.parametrize("prefix", ["View Layer.Combined.", "Image.", "beauty.", ""])
+def test_the_beauty_pass_of_several_layers_is_found_by_name(tmp_path: Path, prefix: str) -> None:
+    path = tmp_path / "a.exr"
+    others = {"A.R": 0.1, "A.G": 0.1, "A.B": 0.1, "N.X": 0.2, "N.Y": 0.2, "N.Z": 0.2, "Z": 3.0}
+    own = {f"{prefix}{channel}": 0.5 * value for channel, value in {**RGB, "A": 1.0}.items()}
+    write_exr(path, [("", {**others, **own})])
+    assert read_image(path)[1, 1].tolist() == [*SHOWN, 128], "colours are multiplied by the layer's own alpha"
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [("N", OTHER), ("albedo", RGB)],
+        [("", {"A.Combined.R": 1.0, "A.Combined.G": 1.0, "A.Combined.B": 1.0, "B.Combined.Y": 0.2})],
+    ],
+)
+def test_layers_that_are_not_clear_are_listed(tmp_path: Path, parts: list[tuple[str, dict[str, float]]]) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, parts)
+    names = [name for name, _ in parts if name] or ["A.Combined", "B.Combined"]
+    with pytest.raises(DyngsError, match=rf"a\.exr: which layer .*The file has .*{names[0]} .*{names[1]} \("):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("channels", "shown"),
+    [
+        ({"Y": 0.5}, [188] * 3),
+        ({"Y": 0.25, "A": 0.5}, [188] * 3 + [128]),
+        ({"Odd.R": 1.0, "Odd.G": 0.5, "Odd.B": 0.0}, SHOWN),
+    ],
+)
+def test_an_exr_with_one_layer_of_any_name(tmp_path: Path, channels: dict[str, float], shown: list[int]) -> None:
+    write_exr(tmp_path / "a.exr", [("", channels)])
+    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == shown
+
+
+@pytest.mark.parametrize(
+    ("window", "covered"),
+    [
+        ((1, 1, 2, 2), (slice(1, 3), slice(1, 3))),
+        ((-2, -1, 9, 9), (slice(0, 3), slice(0, 4))),
+        ((2, -3, 5, 5), (slice(0, 2), slice(2, 4))),
+        ((9, 9, 2, 2), (slice(0, 0), slice(0, 0))),
+    ],
+)
+def test_an_exr_is_read_in_its_display_window(
+    tmp_path: Path, window: tuple[int, int, int, int], covered: tuple[slice, slice]
+) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, [("", {**RGB, "A": 1.0})], window)
+    expected = np.zeros((3, 4, 4), np.uint8)
+    expected[covered] = [*SHOWN, 255]
+    assert read_header(path).size == (4, 3)
+    assert np.array_equal(read_image(path).numpy(), expected)
+    assert np.array_equal(read_raw(path)[0][..., 3], expected[..., 3] / 255)
+
+
+def test_a_deep_exr_is_refused(tmp_path: Path) -> None:
+    spec = oiio.ImageSpec(4, 4, 4, "float")
+    spec.channelnames = ["R", "G", "B", "A"]
+    spec.deep = True
+    data = oiio.DeepData()
+    data.init(16, 4, "float", spec.channelnames)
+    output = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
+    assert output.open(str(tmp_path / "a.exr"), spec)
+    assert output.write_deep_image(data)
+    output.close()
+    for read in (read_header, read_image):
+        with pytest.raises(DyngsError, match=r"a\.exr: the image is deep.*flatten it"):
+            read(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("is_associated", [True, False])
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "float"])
+@pytest.mark.parametrize("names", [("R", "G", "B", "A"), ("Y", "A")])
+def test_alpha_of_tiff_is_as_the_file_says(
+    tmp_path: Path, is_associated: bool, kind: str, names: tuple[str, ...]
+) -> None:
+    """Orange that fades out; floats are linear."""
+    alpha = np.linspace(0.25, 1, 16)[None, :, None].repeat(3, 0)
+    colour = np.broadcast_to([0.8, 0.4, 0.2][: len(names) - 1], (3, 16, len(names) - 1))
+    spec = oiio.ImageSpec(16, 3, len(names), kind)
+    spec.channelnames = names
+    spec.alpha_channel = len(names) - 1
+    spec["oiio:UnassociatedAlpha"] = int(not is_associated)
+    output = oiio.ImageOutput.create(str(tmp_path / "a.tif"))
+    assert output.open(str(tmp_path / "a.tif"), spec)
+    stored = np.dstack([colour * alpha if is_associated else colour, alpha])
+    assert output.write_image(np.ascontiguousarray(stored, np.float32))
+    output.close()
+    image = read_image(tmp_path / "a.tif").numpy().astype(float)
+    shown = 255 * (srgb_encoded(colour) if kind == "float" else colour)
+    assert np.abs(image[..., :3] - shown).max() <= (2.5 if kind == "uint8" else 0.6)
+    assert np.abs(image[..., 3:] - 255 * alpha).max() <= 0.6
 
 
 def test_missing_image(tmp_path: Path) -> None:

@@ -9,10 +9,23 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from hdr_clips import (
+    BT601,
+    BT709,
+    BT2020,
+    DISPLAY_P3,
+    HLG,
+    PQ,
+    UNSPECIFIED,
+    add_colour_box,
+    encoded,
+    patches,
+    write_clip,
+)
 from tiny_captures import level_of, packet_places, truncate_video, write_video
 
 from dyngs.data.images import video as video_module
-from dyngs.data.images.video import VideoInfo, probe_video, read_frames, read_numbered_frames
+from dyngs.data.images.video import VideoInfo, colour_notes, probe_video, read_frames, read_numbered_frames
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
 
@@ -168,3 +181,105 @@ def test_display_matrices_rotate_and_mirror(tmp_path: Path, orientation: int) ->
     assert frame.shape[:2] == shown.shape
     assert np.abs(frame[..., 1].astype(int) - shown).max() < 30, "but for the edges of a compressed image"
     assert (probe_video(path).width, probe_video(path).height) == shown.shape[::-1]
+
+
+def levels_off(path: Path, rgb: np.ndarray) -> float:
+    """Root of the mean squared difference of the frames of a clip from an sRGB image in [0, 1], in levels."""
+    frames = [*read_frames(path), *(frame for _, frame in read_numbered_frames(path, [1]))]
+    assert len(frames) == 3
+    return max(float(np.sqrt(np.mean((frame - 255 * rgb) ** 2))) for frame in frames)
+
+
+@pytest.mark.parametrize("is_full_range", [False, True])
+@pytest.mark.parametrize(
+    ("primaries", "transfer", "matrix"),
+    [
+        (BT2020, HLG, BT2020),
+        (BT2020, HLG, BT709),
+        (BT2020, HLG, BT601),
+        (BT709, HLG, BT709),
+        (BT2020, PQ, BT2020),
+        (DISPLAY_P3, PQ, BT601),
+        (BT2020, BT709, BT2020),
+        (DISPLAY_P3, BT709, BT709),
+        (BT709, BT709, BT2020),
+    ],
+)
+def test_colours_come_back(tmp_path: Path, primaries: int, transfer: int, matrix: int, is_full_range: bool) -> None:
+    path = tmp_path / "a.mp4"
+    rgb = patches()
+    signal = encoded(rgb, primaries, transfer)
+    tags = (primaries, transfer, matrix)
+    write_clip(path, signal, tags, matrix=matrix, is_full_range=is_full_range)
+    assert levels_off(path, rgb) < 2.5
+    kinds = {HLG: "HLG is tone-mapped", PQ: "PQ is tone-mapped"}
+    sdr = {BT2020: "from BT.2020 to BT.709", DISPLAY_P3: "from Display P3 to BT.709", BT709: ""}[primaries]
+    assert kinds.get(transfer, sdr) in probe_video(path).colours
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+@pytest.mark.parametrize("is_full_range", [False, True])
+def test_tags_of_the_container_alone(tmp_path: Path, codec: str, is_full_range: bool) -> None:
+    """FFmpeg's decoder of HEVC overwrites them by "unspecified"."""
+    path = tmp_path / "a.mp4"
+    rgb = patches()
+    untagged = (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED)
+    signal = encoded(rgb, BT2020, HLG)
+    write_clip(path, signal, untagged, codec=codec, is_full_range=is_full_range)
+    assert "HLG" not in probe_video(path).colours
+    add_colour_box(path, BT2020, HLG, BT2020, is_full_range)
+    assert levels_off(path, rgb) < 2.5
+    assert "HLG is tone-mapped" in probe_video(path).colours
+
+
+def test_hdr_in_8_bits_without_primaries_and_matrix(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    rgb = patches()
+    write_clip(path, encoded(rgb, BT2020, HLG), (UNSPECIFIED, HLG, UNSPECIFIED), bits=8)
+    assert levels_off(path, rgb) < 3
+
+
+def test_brighter_than_white_is_clipped(tmp_path: Path) -> None:
+    """Black, diffuse white, the brightest signal of HLG."""
+    path = tmp_path / "a.mp4"
+    signal = np.zeros((48, 64, 3))
+    signal[:, 32:48] = 0.75
+    signal[:, 48:] = 1.0
+    write_clip(path, signal, (BT2020, HLG, BT2020))
+    (frame, _) = read_frames(path)
+    assert frame[:, :30].max() <= 1
+    assert frame[:, 34:].min() >= 254
+
+
+@pytest.mark.parametrize(("size", "matrix"), [((576, 64), BT601), ((720, 64), BT709), ((64, 1280), BT709)])
+@pytest.mark.parametrize("bits", [8, 10])
+def test_untagged_video_is_bt601_in_sd_and_bt709_in_hd(
+    tmp_path: Path, size: tuple[int, int], matrix: int, bits: int
+) -> None:
+    path = tmp_path / "a.mp4"
+    rgb = np.full((*size, 3), (0.2, 0.7, 0.3))
+    write_clip(path, rgb, (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED), matrix=matrix, bits=bits)
+    assert levels_off(path, rgb) < 2.5
+    note = "HD without colour tags is read as BT.709" if matrix == BT709 else ""
+    assert probe_video(path).colours == note
+
+
+def test_tagged_hd_follows_its_tags(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    rgb = np.full((720, 64, 3), (0.2, 0.7, 0.3))
+    write_clip(path, rgb, (UNSPECIFIED, UNSPECIFIED, BT601), matrix=BT601, bits=8)
+    assert levels_off(path, rgb) < 2.5
+    assert probe_video(path).colours == ""
+
+
+def test_a_matrix_that_cannot_be_converted_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    ictcp = 14
+    write_clip(path, patches(), (BT2020, PQ, ictcp))
+    with pytest.raises(DyngsError, match=r"a\.mp4: its colours have the matrix 14 .* export .*HDR10"):
+        probe_video(path)
+
+
+def test_colour_notes_count_the_videos_of_each_kind() -> None:
+    videos = [VideoInfo(4, 4, 1, 30.0, colours) for colours in ("PQ", "", "HLG", "PQ", "PQ")]
+    assert colour_notes(videos) == ["3 videos: PQ", "1 video: HLG"]

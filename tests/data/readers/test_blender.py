@@ -13,7 +13,7 @@ from tiny_captures import edit_json, opengl_pose, pixel_of, random_pixels, write
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
-from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View
+from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View, all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.readers.blender import BODY_FORMAT, FORMAT, read_blender, read_body_json, read_nerfstudio
 from dyngs.data.readers.transforms import view_name
@@ -238,6 +238,28 @@ def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
     assert view.name == "images/03"
     assert view.mask_path == nerfstudio_root / "masks/03.png"
     assert view.silhouette == Silhouette(nerfstudio_root / "masks/a.png", "white")
+
+
+@pytest.mark.parametrize("name", ["03.jpg.png", "03.png", "03.mask.png", "03.JPG.PNG"])
+@pytest.mark.parametrize("form", ["nerfstudio", "blender"])
+def test_masks_that_no_frame_names(nerfstudio_root: Path, name: str, form: str) -> None:
+    """As nerfstudio, COLMAP and Brush name the masks of ``images/03.jpg``."""
+    write_image(nerfstudio_root / "masks" / name, random_pixels(8, 12, 1))
+    if form == "blender":
+        (nerfstudio_root / "transforms.json").rename(nerfstudio_root / "transforms_train.json")
+    capture = {"nerfstudio": read_nerfstudio, "blender": read_blender}[form](nerfstudio_root)
+    masks = {view.name: view.mask_path for view in capture.splits["train"] if view.mask_path is not None}
+    assert masks == {"images/03": nerfstudio_root / "masks" / name}
+    count = len(all_views(capture.splits)) - 1
+    assert any(line.startswith(f"{count} images have no mask") for line in capture.warnings)
+
+
+def test_masks_beside_named_ones_are_not_read(nerfstudio_root: Path) -> None:
+    write_image(nerfstudio_root / "masks/03.png", random_pixels(8, 12, 1))
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][1].update(mask_path="other/1.png"))
+    capture = read_nerfstudio(nerfstudio_root)
+    masks = {view.name: view.mask_path for view in capture.splits["train"] if view.mask_path is not None}
+    assert masks == {"images/01": nerfstudio_root / "other/1.png"}
 
 
 @pytest.mark.parametrize("width", [24, 6])

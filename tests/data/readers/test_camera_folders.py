@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hdr_clips import BT2020, PQ, encoded, patches, write_clip
 from tiny_captures import (
     SIDE_PIXELS,
     cached,
@@ -160,6 +161,14 @@ def test_videos(tmp_path: Path, described: tuple[int, int] | None) -> None:
     for view in capture.splits["train"][:3]:
         level = level_of(view.frame or 0)
         assert np.abs(read_image(view.image_path).numpy().astype(int) - level).max() <= 6
+
+
+def test_hdr_videos_are_named_in_one_line(tmp_path: Path) -> None:
+    write_cameras_json(tmp_path, NAMES[:2], fps=25)
+    for name in NAMES[:2]:
+        write_clip(tmp_path / f"{name}.mp4", encoded(patches(), BT2020, PQ), (BT2020, PQ, BT2020))
+    warnings = read_camera_folders(tmp_path).warnings
+    assert sum("2 videos: PQ is tone-mapped to SDR" in line for line in warnings) == 1
 
 
 def test_other_rates_and_lengths_of_videos(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,35 @@ def test_which_file_is_read(tmp_path: Path, files: list[str], named: str | None,
     assert points is not None
     assert (path, len(points.xyz)) == (tmp_path / read, 1 + files.index(read))
     np.testing.assert_array_equal(points.rgb, np.full_like(points.rgb, 128))
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "images\\Gärten 1.png",
+        ".\\images\\Gärten 1",
+        "C:\\scan\\images\\Gärten 1.png",
+        "/elsewhere/images/Gärten 1.png",
+        unicodedata.normalize("NFD", "images/Gärten 1.png"),
+        "images/gärten 1.PNG",
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_names_as_other_programs_write_them(tmp_path: Path, written: str, encoding: str) -> None:
+    image = tmp_path / "images" / "Gärten 1.png"
+    write_image(image, random_pixels(8, 12, 3))
+    (tmp_path / "points").mkdir()
+    write_ply(tmp_path / "points" / "cloud.ply", 3)
+    folder = written.rpartition("images")[0]
+    mask = folder + "masks\\a.png"
+    write_image(tmp_path / "masks/a.png", random_pixels(8, 12, 1))
+    frame = {"file_path": written, "mask_path": mask, "transform_matrix": np.eye(4).tolist()}
+    fields = {"w": 12, "h": 8, "fl_x": 10.0, "ply_file_path": folder + "points\\cloud.ply", "frames": [frame]}
+    (tmp_path / "transforms.json").write_bytes(json.dumps(fields, ensure_ascii=False).encode(encoding))
+    capture = read_nerfstudio(tmp_path)
+    (view,) = capture.splits["train"]
+    assert (view.image_path, view.mask_path) == (image, tmp_path / "masks/a.png")
+    assert capture.points_file == tmp_path / "points/cloud.ply"
 
 
 def test_a_named_file_must_be_there_and_a_found_one_may_be_broken(tmp_path: Path) -> None:

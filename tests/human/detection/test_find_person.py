@@ -152,7 +152,7 @@ def test_a_capture_of_the_person_comes_out(
 
 def test_a_clip_is_looked_at_once(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(module, "chosen_detector", lambda *_: Rough())
+    monkeypatch.setattr(module, "MediaPipe", Rough)
     made: list[Path] = []
 
     def write(options: DataConfig, out: Path, *_: object) -> SimpleNamespace:

@@ -11,7 +11,6 @@ import pytest
 
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
-from dyngs.human.detection.detector import chosen_detector
 from dyngs.human.detection.mediapipe import LANDMARKS, VARIABLE, MediaPipe
 
 SCRIPT = """#!{python}
@@ -87,11 +86,11 @@ def _has_mediapipe() -> bool:
 def test_without_an_interpreter_it_says_how_to_get_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     with pytest.raises(DyngsError, match="no detector finds the person: install MediaPipe with"):
-        chosen_detector((), None)
+        MediaPipe()
     with pytest.raises(DyngsError, match="no such Python interpreter"):
-        chosen_detector((), tmp_path / "python")
+        MediaPipe(tmp_path / "python")
     monkeypatch.setenv(VARIABLE, sys.executable)
-    assert chosen_detector((), None).name == "MediaPipe"
+    assert MediaPipe().name == "MediaPipe"
 
 
 @pytest.mark.skipif(VARIABLE not in os.environ, reason=f"{VARIABLE} names no environment with MediaPipe")

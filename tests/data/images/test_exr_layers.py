@@ -1,0 +1,46 @@
+"""Names of layers as renderers write them, and which of them is the image."""
+
+from __future__ import annotations
+
+import pytest
+
+from dyngs.data.images.exr_layers import beauty_pass, layers_of
+
+
+def channels(layer: str, names: str = "RGBA") -> list[str]:
+    return [f"{layer}.{name}" if layer else name for name in names]
+
+
+@pytest.mark.parametrize(
+    ("parts", "name"),
+    [
+        ([("", channels("N") + channels("ViewLayer.Combined") + ["ViewLayer.Depth.Z"])], "ViewLayer.Combined"),
+        ([("", channels("albedo") + channels("") + ["Z"])], ""),
+        ([("", channels("diffuse", "RGB") + channels("BEAUTY", "rgb"))], "BEAUTY"),
+        ([("N", channels("", "RGB")), ("C", channels(""))], "C"),
+        ([("first", channels("depth", "Z")), ("second", channels("beauty"))], "beauty"),
+        ([("", ["n.red", "n.green", "n.blue", "rgba.red", "rgba.green", "rgba.blue"])], "rgba"),
+        ([("", channels("RenderLayer.Combined") + channels("Composite.Combined"))], "Composite.Combined"),
+        ([("", channels("beauty", "Y") + channels("N", "RGB"))], "beauty"),
+    ],
+)
+def test_the_image_itself(parts: list[tuple[str, list[str]]], name: str) -> None:
+    layer = beauty_pass(layers_of(parts))
+    assert layer is not None
+    assert layer.name == name
+    names = parts[layer.part][1]
+    assert [names[index].rpartition(".")[2][0].upper() for index in layer.colours] in (["R", "G", "B"], ["Y"])
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [("N", channels("", "RGB")), ("albedo", channels("", "RGB"))],
+        [("left", channels("")), ("right", channels(""))],
+        [("", channels("A.Combined") + channels("B.Combined"))],
+        [("", channels("Combined", "XYZ") + channels("Depth", "Z"))],
+        [("", channels("Combined", "RG") + channels("N", "RGB"))],
+    ],
+)
+def test_names_that_do_not_say_which(parts: list[tuple[str, list[str]]]) -> None:
+    assert beauty_pass(layers_of(parts)) is None
