@@ -68,6 +68,32 @@ def test_frames_per_second_and_the_up_axis_are_passed_on(tmp_path: Path, capsys:
     np.testing.assert_allclose(found[4] - found[2], [0.0, 0.1, 0.0], atol=1e-6)
 
 
+def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is_said(
+    tmp_path: Path, capsys: PrintedOutput
+) -> None:
+    down = np.tile([np.pi, 0.0, 0.0], (4, 1))
+    shapes = np.linspace([0.0], [0.6], 4) * np.ones(10)
+    arrays = {
+        "global_orient": down,
+        "body_pose": np.zeros((4, 69)),
+        "smpl_betas": shapes,
+        "cam_trans": np.zeros((4, 3)),
+    }
+    np.savez(tmp_path / "romp.npz", **arrays)  # pyright: ignore[reportArgumentType]
+    words = ["data", "motion", str(tmp_path / "romp.npz"), str(tmp_path / "out.npz")]
+    assert main(words) == 2
+    assert "romp.npz: has no frame rate;" in capsys.readouterr().err
+    assert main([*words, "--fps", "20"]) == 0
+    printed = capsys.readouterr().out
+    assert "4 frames, 0.15 s at 20 frames per second" in printed
+    notes = [line for line in printed.splitlines() if line.startswith("note: ")]
+    assert len(notes) == 2
+    assert "'betas' differ between frames by up to 0.6: the mean is taken, but dropped" in notes[0]
+    assert "the file does not say what is up; -y is taken" in notes[1]
+    found = read_motion(tmp_path / "out.npz")
+    assert float(found.poses.abs().max()) < 1e-6, "upright, in the axes of the template"
+
+
 def test_the_clip_and_the_body_are_passed_on(tmp_path: Path) -> None:
     """A body of half the size, and one of two animations."""
     own, motion = skeleton(), random_motion(3, angle=0.2)
