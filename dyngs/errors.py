@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import stat
-import string
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -101,8 +101,8 @@ def quoted(text: str) -> str:
         name = os.fsencode(text)
     except UnicodeEncodeError:  # the system's encoding is ASCII
         name = text.encode("utf-8", "replace")
-    plain = frozenset(string.ascii_letters + string.digits + "/._-=+,@%")
-    return "$'" + "".join(chr(byte) if chr(byte) in plain else f"\\x{byte:02x}" for byte in name) + "'"
+    word = re.sub(rb"[^\w/.,=+-]", lambda byte: b"\\x%02x" % ord(byte[0]), name)
+    return f"$'{word.decode('ascii')}'"
 
 
 def counted(number: int, noun: str) -> str:

@@ -48,41 +48,39 @@ def as_document(found: object, file: Path) -> tuple[dict[str, Any], tuple[str, .
 def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     """Return the document of a camera_path.json; its fields of view are vertical, in degrees."""
     _require_flat(found, str(file), "camera_type")
-    views = _listed(found["camera_path"], file)
-    height, fps, seconds = found.get("render_height"), found.get("fps"), found.get("seconds")
+    height = found.get("render_height")
+    if not is_number(height) or not 1 <= height <= 65536:
+        raise DyngsError(f"{file}: 'render_height' must be a number from 1 to 65536; export the path again")
     frames = []
-    for i, view in enumerate(views):
+    for i, view in enumerate(_listed(found["camera_path"], file)):
         where = f"{file}: camera_path[{i}]"
         degrees = view.get("fov", found.get("default_fov"))
         if not is_number(degrees) or not 0.01 <= degrees <= 179:
             raise DyngsError(f"{where}: 'fov' is {printable(repr(degrees), 60)}; it must be 0.01 to 179 degrees")
-        if not is_number(height):
-            raise DyngsError(f"{file}: 'render_height' is missing; export the path again")
         frame = {"transform_matrix": view.get("camera_to_world")}
         frame["fl_x"] = 0.5 * height / math.tan(math.radians(degrees) / 2)
         if "render_time" in view:
             frame["time"] = view["render_time"]
         frames.append(frame)
-    if fps is None and is_number(seconds) and seconds > 0:
-        fps = len(frames) / seconds
-    document = {"width": found.get("render_width"), "height": height, "frames": frames}
-    return document if fps is None else document | {"fps": fps}
+    size = {"width": found.get("render_width"), "height": height}
+    return {**size, "fps": found.get("fps", 30.0), "frames": frames}
 
 
 def _of_3dgs(found: list[Any], file: Path) -> dict[str, Any]:
     """Return the document of a cameras.json; its positions and rotations are those of cameras in the world."""
-    frames = []
     views = _listed(found, file)
+    size = {key: views[0].get(key) for key in ("width", "height")}
+    frames = []
     for i, view in enumerate(views):
         where = f"{file}: [{i}]"
+        if any(view.get(key) != value for key, value in size.items()):
+            raise DyngsError(f"{where}: has another size than the first camera; all images of a path have one size")
         pose = np.eye(4)
         rotation = numbers_of(f"{where}: 'rotation'", view.get("rotation"), (3, 3))
         pose[:3, :3] = rotation.T
         pose[:3, 3] = -rotation.T @ numbers_of(f"{where}: 'position'", view.get("position"), (3,))
-        if (view.get("width"), view.get("height")) != (views[0].get("width"), views[0].get("height")):
-            raise DyngsError(f"{where}: has another size than the first camera; all images of a path have one size")
         frames.append({"cam_from_world": pose.tolist(), "fl_x": view.get("fx"), "fl_y": view.get("fy")})
-    return {"width": views[0].get("width"), "height": views[0].get("height"), "frames": frames}
+    return {**size, "frames": frames}
 
 
 def _size_of(found: dict[str, Any], file: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from dyngs.capture.looks import colours_at, small_image
-from dyngs.capture.plane_sweep import dense_points
+from dyngs.capture.plane_sweep import dense_points, points_of_depth_maps
 from dyngs.capture.sfm_work import ColmapError, feature_options, match_listed, matching_options, quiet_colmap
 from dyngs.capture.silhouettes import points_in_silhouettes
 from dyngs.config import DataConfig, PointsInit
@@ -196,11 +196,12 @@ def checked_points(capture: Capture, options: DataConfig) -> tuple[Capture, str 
 def with_first_points(capture: Capture, options: DataConfig, init: PointsInit) -> tuple[Capture, list[str]]:
     """Return the capture with the points that a scene begins with, None for random ones, and lines on the choice.
 
-    Points are triangulated where there are none: from the images of a time step that several cameras show, else from
-    those of a moving camera over the full clip. Not where it is published custom to begin with random points: in the
-    cube around the origin of Blender scenes that are still or show each time step from one side, if they lie there.
-    Those of still ones are drawn in the silhouettes, if there are any. To fewer than half of ``init.dense`` in still
-    captures points of depth maps are added; those in silhouettes do well without (`still` lost 0.1 dB by them).
+    Without points they are taken from depth maps that agree with the poses, else triangulated: from the images of a
+    time step that several cameras show, else from those of a moving camera over the full clip. Not where it is
+    published custom to begin with random points: in the cube around the origin of Blender scenes that are still or show
+    each time step from one side, if they lie there. Those of still ones are drawn in the silhouettes, if there are any.
+    To fewer than half of ``init.dense`` in still captures points of plane sweeps are added; those in silhouettes do
+    well without (`still` lost 0.1 dB by them).
     """
     capture, line = checked_points(capture, options)
     lines = [] if line is None else [line]
@@ -222,7 +223,11 @@ def with_first_points(capture: Capture, options: DataConfig, init: PointsInit) -
         return capture, lines
     moment = views_of_a_time_step(views, init.triangulate)
     points: PointCloud | None = None
-    if views[0].time is None or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES:
+    if views[0].time is None and views[0].depth_path is not None:
+        points = points_of_depth_maps(views, options, init.num_random)
+    if points is not None:
+        lines.append(f"{len(points.xyz):,} first points are from the depth maps")
+    elif views[0].time is None or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES:
         points = triangulated_points(moment, options)
     elif not is_in_cube:
         points = points_over_clip(views, options)

@@ -36,6 +36,7 @@ MIN_CORRELATION = 0.8
 AGREEMENT, MIN_AGREEING = 0.02, 2
 """Relative difference of depths up to which two maps agree on a point, and how many others must."""
 MIN_POINTS = 500  # with fewer the maps have found noise
+MIN_FRACTION = 0.5  # of the pixels of given depth maps; true ones of a room agree on 0.84, of twice its size on 0.09
 NEAR_ANGLE, BEST_ANGLE, FAR_ANGLE = 3.0, 12.0, 30.0
 """Degrees between the lines of sight of neighbours to the middle of the points: from, best, up to."""
 _ANGLE_SPREAD = 10.0  # degrees from the best one within which others are nearly as good
@@ -69,15 +70,39 @@ def dense_points(views: Sequence[View], options: DataConfig, sparse: np.ndarray,
     """
     groups = neighbours(views, sparse)
     needed = sorted({i for group in groups for i in group})
-    small = options.model_copy(update={"downscale": 1.0, "longest_side": SWEEP_SIDE, "cache_mb": 0.0})
-    loader = ImageLoader([views[i] for i in needed], small)
+    loader = ImageLoader([views[i] for i in needed], _small(options))
     shots = {i: _shot(loader, k) for k, i in enumerate(needed)}
     maps = [
         (shots[first], _depth_map(shots[first], [shots[i] for i in others], _depth_range(views[first], sparse)))
         for first, *others in groups
     ]
+    return _agreed_points(maps, count, MIN_POINTS)
+
+
+def points_of_depth_maps(views: Sequence[View], options: DataConfig, count: int) -> PointCloud | None:
+    """Return at most ``count`` points of the depth maps that belong to the images, where several of them agree.
+
+    None without such maps, or where less than ``MIN_FRACTION`` of them agree: they are in another unit than the poses.
+    """
+    chosen = [views[i] for i in evenly_spaced(len(views), MAPS)]
+    loader = ImageLoader(chosen, _small(options), with_maps=True)
+    maps: list[tuple[_Shot, np.ndarray]] = []
+    for i in range(len(loader)):
+        depth = loader[i].depth
+        if depth is not None:
+            shot = _shot(loader, i)
+            maps.append((shot, np.where(shot.counts & (depth > 0).numpy(), depth.numpy(), np.nan)))
+    known = sum(np.isfinite(depth).sum() for _, depth in maps)
+    return _agreed_points(maps, count, max(MIN_POINTS, MIN_FRACTION * known))
+
+
+def _small(options: DataConfig) -> DataConfig:
+    return options.model_copy(update={"downscale": 1.0, "longest_side": SWEEP_SIDE, "cache_mb": 0.0})
+
+
+def _agreed_points(maps: Sequence[tuple[_Shot, np.ndarray]], count: int, fewest: float) -> PointCloud | None:
     found = [_agreed(shot, depth, maps) for shot, depth in maps]
-    if not found or sum(len(xyz) for xyz, _ in found) < MIN_POINTS:
+    if sum(len(xyz) for xyz, _ in found) < fewest:
         return None
     xyz, rgb = (np.concatenate(x) for x in zip(*found, strict=True))
     chosen = np.sort(np.random.default_rng(0).permutation(len(xyz))[:count])

@@ -33,7 +33,7 @@ _UNFIT: dict[str, dict[str, str]] = {
         "sh_degree": "the page has the colours of the run",
     },
     "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES, "compress"), "the file has the rest pose, y up"),
-    "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface at its time"),
+    "surface": dict.fromkeys(("motion", *_PARTS, "sh_degree"), "the file has the surface at its time"),
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
     "network": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
@@ -329,8 +329,7 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
         )
         args.print_notes((), (warning,))
     else:
-        note = f"images change by {change:.2f} grey levels of 255 (root mean square over some training views)"
-        args.print_notes((note,))
+        args.print_notes((f"images change by {change:.2f} grey levels of 255 (rms over some training views)",))
     ratio = written.num_bytes_exact / written.num_bytes
     print(f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)")
     return 0
@@ -351,8 +350,8 @@ def _export_network(arguments: argparse.Namespace) -> int:
     from dyngs.runs.network_file import SUFFIX, write_network
 
     run: Path = arguments.run_dir
-    config = network_config(run)
-    args.print_written(write_network(run, config, latest_checkpoint(run), arguments.out or run / f"network{SUFFIX}"))
+    out = arguments.out or run / f"network{SUFFIX}"
+    args.print_written(write_network(run, network_config(run), latest_checkpoint(run), out))
     return 0
 
 
@@ -420,23 +419,24 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
 
 def _export_surface(arguments: argparse.Namespace) -> int:
     """Write the surface of a scene, at several times one file each."""
-    from dyngs.export.surface_file import Cut, write_surface
+    from dyngs.export.surface_file import Cut, upright_surface, write_surface
     from dyngs.gaussians.surface import num_holes
     from dyngs.runs.opened import open_scene
 
-    times = _times(arguments) or (0.0,)
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
     if arguments.times and out.suffix:
         raise DyngsError(f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one")
     opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
     cut = Cut(arguments.level, arguments.cells, arguments.segments)
-    for i, time in enumerate(times):
+    how, line = upright_surface(opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up)
+    args.print_notes((line,))
+    for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
-        surface = write_surface(opened, path, time=time, cut=cut)
+        surface = write_surface(opened, path, time=time, cut=cut, how=how)
         holes = num_holes(surface)
         closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
-        faces, vertices = counted(len(surface.faces), "triangle"), f"{len(surface.vertices):,}"
-        args.print_notes((f"{faces} with colours of {vertices} vertices, {closed}",))
+        faces = counted(len(surface.faces), "triangle")
+        args.print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
         args.print_written(path)
     return 0
 

@@ -79,7 +79,7 @@ class View:
         motion_mask_path: white = moves; if ``motion_mask_labels``, all but 0 does.
         flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
         exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one capture.
-        shrunk: how many times smaller the file is than the image of the capture that it is a copy of.
+        shrunk: how many times smaller the file is than the image that it is a copy of.
     """
 
     name: str

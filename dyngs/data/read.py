@@ -203,7 +203,7 @@ def _without_missing(capture: Capture) -> Capture:
 
 
 def require_images(capture: Capture) -> Capture:
-    """Return the capture. Raises DyngsError: images of it are missing; says how many."""
+    """Return the capture. Raises DyngsError with their number: images are missing."""
     for line in _missing(capture.splits):
         raise DyngsError(f"{line}; restore them, or train on the others with data.skip_missing=true")
     return capture

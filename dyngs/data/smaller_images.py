@@ -1,4 +1,4 @@
-"""Smaller copies of the images of a capture, in folders ``images_2``, ``images_4``, .., and sizes in training."""
+"""Smaller copies of a capture's images, in ``images_2``, ``images_4``, ...; sizes of images in training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ def view_size(view: View, options: DataConfig) -> tuple[int, int]:
 
 
 def with_smaller_images(root: Path, splits: Splits, options: DataConfig) -> tuple[Splits, list[str]]:
-    """Return views of the smallest copies that are large enough for training, and a line where there are copies."""
+    """Return views of the smallest copies that are large enough for training, and a line on what is read.
+
+    Copies are not read where an image has no copy or has a mask or depth map, which have its size.
+    """
     images = root / "images"
     copies = shrunk_folders(images)
     views = [view for view in all_views(splits) if view.image_path.is_relative_to(images)]
@@ -35,14 +38,14 @@ def with_smaller_images(root: Path, splits: Splits, options: DataConfig) -> tupl
             small[view.name] = copy
     if len(small) < len(views):
         names = ", ".join(copies[key].name for key in sorted(copies))
-        conditions = "in which every image must have its copy, and none a mask or a depth map"
-        return splits, [f"{names}: not read; data.downscale={number} reads {copies[number].name}, {conditions}"]
+        conditions = "if each image has its copy, and none a mask or a depth map"
+        return splits, [f"{names}: not read; data.downscale={number} reads {copies[number].name} {conditions}"]
     line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
     return each_view(splits, lambda view: small.get(view.name, view)), [line]
 
 
 def _shrunk(view: View, path: Path, factor: int) -> View | None:
-    """Return the view with a copy of its image that is ``factor`` times smaller, None where that does not do."""
+    """Return the view with a copy of its image, ``factor`` times smaller; None if that cannot be."""
     if view.mask_path or view.silhouette or view.depth_path or view.motion_mask_path:
         return None
     header = header_if_readable(path)

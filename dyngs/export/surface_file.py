@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
+from dyngs.export.splat_files import AS_THEY_ARE, Writing, writing_of
 from dyngs.fields import mesh as fields
 from dyngs.fields.keys import NgpModel
 from dyngs.fields.scene import FieldScene
@@ -27,7 +28,7 @@ from dyngs.ops.rays import Space
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.ply_header import double_ply
-from dyngs.splats.similarity import far_offset
+from dyngs.splats.similarity import Similarity, far_offset
 from dyngs.triangles import mesh as triangles
 from dyngs.triangles.scene import TriangleScene
 
@@ -64,11 +65,22 @@ class Cut:
             raise DyngsError(f"--cells {self.cells}: give 8 to {MOST_CELLS}")
 
 
-def write_surface(opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | None = None) -> Surface:
-    """Write the surface of a scene at ``time`` in the coordinates of its capture or its edit, and return it.
+def upright_surface(opened: Opened, suffix: str, up: str | None, from_up: str | None) -> tuple[Writing, str]:
+    """Return how the mesh of a scene is turned, and a line about it, as of ``writing_of``.
 
-    Raises DyngsError: a person, a suffix of no mesh, an option of another kind, no capture where that is needed, or no
-    surface is there.
+    Viewers take y for up in .glb and .obj; those of .ply have no convention, so it stays in the axes of the capture.
+    """
+    usual = "keep" if suffix.lower() == ".ply" else None
+    return writing_of(opened, "y", up or usual, from_up)
+
+
+def write_surface(
+    opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | None = None, how: Writing = AS_THEY_ARE
+) -> Surface:
+    """Write the surface of a scene at ``time`` and return it.
+
+    The file is in the coordinates of the capture or of the edit, turned by ``how``. Raises DyngsError: a person, a
+    suffix of no mesh, an option of another kind, no capture where that is needed, or no surface is there.
     """
     cut = cut or Cut()
     cut.require_fitting(opened.renderable)
@@ -76,7 +88,7 @@ def write_surface(opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | No
         raise DyngsError(f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}")
     inputs_of(opened).require_output(out)
     surface = _surface(opened, time, cut)
-    vertices = opened.world.points(surface.vertices)
+    vertices = Similarity(how.turn).points(opened.world.points(surface.vertices))
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
     data = _mesh_bytes(out.suffix.lower(), vertices, surface.faces, colours)
     with atomic_file(out) as temporary:

@@ -1,4 +1,4 @@
-"""Files by the names that other programs wrote: other separators, case or Unicode form, paths of another machine."""
+"""Files by the names that other programs wrote: other separators, case, Unicode form, machine."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ def folded(name: str) -> str:
 
 
 class FileFinder:
-    """Finds files below ``root`` by the names in a capture. Each folder is listed once, and only where it must be."""
+    """Finds files below ``root`` by the names in a capture; lists a folder once, if a name differs."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self._listings: dict[Path, dict[str, list[str]]] = {}
 
     def find(self, written: str) -> Path:
-        """Return the file that ``written`` names from ``root`` on, or the path that it should have where there is none.
+        """Return the file that ``written`` names, relative to ``root``; if it is missing, its path.
 
-        Backslashes separate folders, too. Case and Unicode form may differ if a single file fits. Of an absolute path
-        that this machine does not have, the longest end that is a file below ``root`` is taken.
+        Backslashes separate folders, too. Case and Unicode form may differ if a single file fits. Of an
+        absolute path that does not exist, the longest end that is a file below ``root`` is taken.
         """
         for text in (written, written.replace("\\", "/")):
             path = Path(os.path.normpath(self.root / text))
@@ -52,7 +52,7 @@ class FileFinder:
         return path if path.is_file() else None
 
     def _entry(self, folder: Path, part: str) -> str | None:
-        """Return the entry of a folder that ``part`` means: the one of this spelling, else the only one alike."""
+        """Return the entry of a folder with this name, else the only one with this key, else None."""
         if folder not in self._listings:
             entries: dict[str, list[str]] = {}
             for name in os.listdir(folder) if inside(folder).is_dir() else ():
@@ -66,14 +66,14 @@ class FileFinder:
 
 
 def images_folder(root: Path) -> Path:
-    """Return the folder ``images`` below ``root``; where it is absent, the one of the least shrunk copies."""
+    """Return the folder ``images`` below ``root``; if it is absent, that of the largest copies."""
     images = root / "images"
     copies = {} if images.is_dir() else shrunk_folders(images)
     return copies[min(copies)] if copies else images
 
 
 def shrunk_folders(images: Path) -> dict[int, Path]:
-    """Map how many times smaller images are to their folders, such as ``images_4`` beside ``images``."""
+    """Map factors to the folders of copies that are so much smaller: 4 to ``images_4``."""
     beside = images.parent.glob(f"{glob.escape(images.name)}_*") if images.name else ()
     found = ((re.fullmatch(r"_(\d{1,3})", path.name[len(images.name) :]), path) for path in beside)
     return {int(match[1]): path for match, path in found if match and path.is_dir()}

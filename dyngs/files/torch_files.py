@@ -11,7 +11,6 @@ import math
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -23,13 +22,12 @@ from dyngs.files.pickles import Unpickler
 _REBUILD = "torch._utils._rebuild_tensor_v2"
 _PARAMETER = "torch._utils._rebuild_parameter"
 _TYPES = {"torch.FloatStorage": "<f4", "torch.HalfStorage": "<f2", "torch.DoubleStorage": "<f8"}
-_OTHER_TYPES = {f"torch.{name}Storage" for name in ("BFloat16", "Long", "Int", "Short", "Char", "Byte", "Bool")}
 _MOST_PICKLE_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """Where a tensor lies in its file: the member and type of its storage, and the numbers of it."""
+    """Where a tensor lies in its file, as that says: the member and type of its storage, and the numbers of it."""
 
     member: str
     kind: str
@@ -97,15 +95,14 @@ class _Tensors(Arrays):
 
     def named(self, module: object, name: object) -> Name:
         key = f"{module!s:.200}.{name!s:.200}"
-        if key in (_REBUILD, _PARAMETER, *_TYPES, *_OTHER_TYPES):
-            return Name(key)
-        return super().named(module, name)
+        is_storage = module == "torch" and key.endswith("Storage")
+        return Name(key) if is_storage or key in (_REBUILD, _PARAMETER) else super().named(module, name)
 
     def called(self, name: object, arguments: object) -> object:
         match name, arguments:
-            case Name(text="torch._utils._rebuild_tensor_v2"), ((kind, member), first, shape, strides, *_):
-                return StoredTensor(str(member), str(kind), _whole(first), _all_whole(shape), _all_whole(strides))
-            case Name(text="torch._utils._rebuild_parameter"), (StoredTensor() as tensor, *_):
+            case Name(text=text), ((str() as kind, str() as member), first, shape, strides, *_) if text == _REBUILD:
+                return StoredTensor(member, kind, first, shape, strides)
+            case Name(text=text), (StoredTensor() as tensor, *_) if text == _PARAMETER:
                 return tensor
         return super().called(name, arguments)
 
@@ -113,15 +110,3 @@ class _Tensors(Arrays):
         """Leave out the state of a dictionary, which holds the versions of modules."""
         if not isinstance(target, dict):
             super().build(target, state)
-
-
-def _whole(value: Any) -> int:
-    if type(value) is not int or not 0 <= value < 1 << 48:
-        raise ValueError("a tensor of it has no proper shape")
-    return value
-
-
-def _all_whole(values: Any) -> tuple[int, ...]:
-    if not isinstance(values, tuple) or len(values) > 8:
-        raise ValueError("a tensor of it has no proper shape")
-    return tuple(_whole(value) for value in values)

@@ -11,7 +11,7 @@ import torch
 
 from dyngs.capture import plane_sweep
 from dyngs.capture.first_points import with_first_points
-from dyngs.capture.plane_sweep import MIN_NEIGHBOURS, NEIGHBOURS, dense_points, neighbours
+from dyngs.capture.plane_sweep import MIN_NEIGHBOURS, NEIGHBOURS, dense_points, neighbours, points_of_depth_maps
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import projected
@@ -30,8 +30,8 @@ def _colour(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack([grey, 0.8 * grey, 0.5 * grey + 0.2], axis=-1)
 
 
-def _views(folder: Path, count: int = 7, contrast: float = 1.0) -> list[View]:
-    """Cameras on an arc of 8 degrees each around the plane's middle."""
+def _views(folder: Path, count: int = 7, contrast: float = 1.0, unit: float = 1.0) -> list[View]:
+    """Cameras on an arc of 8 degrees each around the plane's middle, with depth maps in a unit."""
     views = []
     down, across = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(INTRINSICS).T
@@ -45,7 +45,8 @@ def _views(folder: Path, count: int = 7, contrast: float = 1.0) -> list[View]:
         x, y = (center[k] + depth * lines[..., k] for k in (0, 1))
         path = folder / f"{i}.png"
         write_image(path, (0.5 + contrast * (_colour(x, y) - 0.5)).astype(np.float32))
-        views.append(View(path.stem, path, pose, INTRINSICS, WIDTH, HEIGHT))
+        np.save(path.with_suffix(".npy"), depth / unit)
+        views.append(View(path.stem, path, pose, INTRINSICS, WIDTH, HEIGHT, depth_path=path.with_suffix(".npy")))
     return views
 
 
@@ -62,6 +63,37 @@ def test_points_lie_on_the_plane_in_its_colours(tmp_path: Path) -> None:
     few = dense_points(views, options, SPARSE, 50)
     assert few is not None
     assert len(few.xyz) == 50
+
+
+def test_given_depth_maps_have_points_where_they_agree(tmp_path: Path) -> None:
+    views, options = _views(tmp_path), DataConfig(root=tmp_path)
+    wrong = np.load(tmp_path / "3.npy")
+    wrong[:, : WIDTH // 2] *= 1.2
+    np.save(tmp_path / "3.npy", wrong)
+    found = points_of_depth_maps(views, options, 100_000)
+    assert found is not None
+    assert len(found.xyz) > 0.7 * len(views) * WIDTH * HEIGHT
+    x, y, z = found.xyz.T
+    np.testing.assert_allclose(z, SLOPE * x, atol=1e-5 * DISTANCE)
+    assert np.abs(found.rgb - 255 * _colour(x, y)).max() < 3
+    few = points_of_depth_maps(views, options, 1000)
+    assert few is not None
+    assert len(few.xyz) == 1000
+
+
+def test_depth_maps_in_another_unit_have_none(tmp_path: Path) -> None:
+    options = DataConfig(root=tmp_path)
+    assert points_of_depth_maps(_views(tmp_path, unit=2.0), options, 1000) is None
+    plain = [replace(view, depth_path=None) for view in _views(tmp_path)]
+    assert points_of_depth_maps(plain, options, 1000) is None
+
+
+def test_a_still_capture_without_points_begins_with_those_of_its_depth_maps(tmp_path: Path) -> None:
+    capture = Capture(tmp_path, "polycam", {"train": tuple(_views(tmp_path))})
+    begun, lines = with_first_points(capture, DataConfig(root=tmp_path), PointsInit(num_random=2000, dense=0))
+    assert lines == ["2,000 first points are from the depth maps"]
+    assert begun.points is not None
+    assert np.abs(begun.points.xyz[:, 2] - SLOPE * begun.points.xyz[:, 0]).max() < 1e-4
 
 
 def test_points_beside_the_images_do_not_say_how_deep_to_look(tmp_path: Path) -> None:

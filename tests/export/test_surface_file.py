@@ -38,12 +38,42 @@ def test_a_mesh_far_from_the_origin_is_the_mesh_moved(tmp_path: Path, suffix: st
         (tmp_path / name).mkdir()
         run = write_moving_run(tmp_path / name, moves=False, offset=where)
         out = tmp_path / f"{name}{suffix}"
-        assert main(["export", str(run), "--format", "mesh", "--cells", "32", "--out", str(out)]) == 0
+        command = ["export", str(run), "--format", "mesh", "--cells", "32", "--up", "keep", "--out", str(out)]
+        assert main(command) == 0
         found.append(mesh_of(out))
     near, far = found
     np.testing.assert_array_equal(far.faces, near.faces)
     np.testing.assert_allclose(far.vertices - offset, near.vertices, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(far.visual.vertex_colors, near.visual.vertex_colors)
+
+
+UP_IN = {".ply": "keep", ".glb": "y", ".obj": "y"}
+"""What points up in the files, by their suffix."""
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("up", [None, "-y", "z"])
+def test_up_is_what_programs_take_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str, up: str | None
+) -> None:
+    """The capture has z up; colours stay, and triangles look outwards as before."""
+    run = write_moving_run(tmp_path, moves=False, offset=(1.0, 2.0, 3.0))
+    command = ["export", str(run), "--format", "mesh", "--cells", "32", "--from-up", "z"]
+    meshes = []
+    for name, options in (("kept", ["--up", "keep"]), ("turned", [] if up is None else [f"--up={up}"])):
+        out = tmp_path / f"{name}{suffix}"
+        assert main([*command, "--out", str(out), *options]) == 0
+        meshes.append(mesh_of(out))
+    kept, turned = meshes
+    x, y, z = kept.vertices.T
+    wanted = {"y": (x, z, -y), "-y": (x, -z, y), "z": (x, y, z), "keep": (x, y, z)}[up or UP_IN[suffix]]
+    np.testing.assert_allclose(turned.vertices, np.stack(wanted, 1), atol=1e-5)
+    np.testing.assert_array_equal(turned.faces, kept.faces)
+    np.testing.assert_array_equal(turned.visual.vertex_colors, kept.visual.vertex_colors)
+    assert turned.volume == pytest.approx(kept.volume, rel=1e-3)
+    said = capsys.readouterr().out
+    assert "axes are those of the capture" in said
+    assert (f"up is {up or 'y'} in the file" in said) == (up is not None or suffix != ".ply")
 
 
 def test_a_moving_scene_has_a_mesh_for_each_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,7 +88,12 @@ def test_tensors_beyond_their_numbers_are_refused(tmp_path: Path) -> None:
     file = TorchFile(path)
     good = StoredTensor("0", "torch.FloatStorage", 0, (4, 4), (4, 1))
     assert file.numbers(good).shape == (4, 4)
-    for shape, strides, first in (((1 << 40, 4), (0, 1), 0), ((4, 4), (4, 1), 1), ((4, 4), (40, 1), 0)):
+    for shape, strides, first in (
+        ((1 << 40, 4), (0, 1), 0),
+        ((4, 4), (4, 1), 1),
+        ((4, 4), (40, 1), 0),
+        ((4, 4), (4, -1), 0),
+    ):
         with pytest.raises(DyngsError, match=r"a\.pt: cannot be read"):
             file.numbers(StoredTensor("0", "torch.FloatStorage", first, shape, strides))
     with pytest.raises(DyngsError, match=r"a\.pt: cannot be read"):

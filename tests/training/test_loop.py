@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 from steps import Counting
@@ -143,8 +144,11 @@ def test_the_watch_leaves_pauses_out() -> None:
 
 
 @pytest.mark.parametrize("which", SIGNALS)
-def test_a_signal_is_only_noted(which: signal.Signals) -> None:
-    before = signal.getsignal(which)
+def test_a_signal_is_only_noted(which: signal.Signals, request: pytest.FixtureRequest) -> None:
+    # nohup pytest: SIGHUP is ignored, as in programs that it starts
+    request.addfinalizer(partial(signal.signal, which, signal.getsignal(which)))
+    before = signal.default_int_handler if which is signal.SIGINT else signal.SIG_DFL
+    signal.signal(which, before)
     with Interrupts() as interrupts:
         assert not interrupts.requested
         signal.raise_signal(which)

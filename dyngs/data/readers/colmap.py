@@ -1,4 +1,4 @@
-"""Reader for COLMAP captures: views from the model, with masks and times that lie beside the images."""
+"""Reader for COLMAP captures: views from the model, masks and times from beside the images."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
 
 
 def model_folders(root: Path) -> list[Path]:
-    """Return the folders of the models of a capture: parts of one reconstruction, or one; none if there is none."""
+    """Return the folders of the models of a capture: several are parts that are not connected."""
     for name in MODEL_FOLDERS:
         base = root / name
         numbered = [path for path in base.iterdir() if re.fullmatch(r"\d{1,9}", path.name)] if base.is_dir() else []
@@ -57,7 +57,7 @@ def model_folders(root: Path) -> list[Path]:
 
 
 def find_model(root: Path) -> tuple[Path | None, list[str]]:
-    """Return the folder of the model that is read, that with the most images, and a warning if there are others."""
+    """Return the folder of the model with the most images, and a warning if there are others."""
     folders = model_folders(root)
     if len(folders) < 2:
         return (folders or [None])[0], []
@@ -65,8 +65,9 @@ def find_model(root: Path) -> tuple[Path | None, list[str]]:
     largest = max(folders, key=lambda folder: counts[folder])
     others = ", ".join(f"{folder.name} ({counts[folder]})" for folder in folders if folder != largest)
     line = (
-        f"{largest.parent}: of {len(folders)} models that are not connected, {largest.name} is read, which has most "
-        f"images ({counts[largest]}), not {others}; to read another one, move the larger ones out of the capture"
+        f"{largest.parent}: of {len(folders)} models that are not connected, {largest.name} is read, "
+        f"which has the most images ({counts[largest]}), not {others}; "
+        "to read another one, move the larger ones out of the capture"
     )
     return largest, [line]
 
@@ -77,7 +78,7 @@ def is_colmap(root: Path) -> bool:
 
 
 def _is_chosen(root: Path) -> bool:
-    """Whether a capture is read through its COLMAP model: nerfstudio keeps the one that its JSON file was made from."""
+    """Whether a folder is a COLMAP capture; nerfstudio's keep the model that their JSON is made from."""
     folders = model_folders(root)
     return bool(folders) and not ((root / "transforms.json").is_file() and folders[0].is_relative_to(root / "colmap"))
 
@@ -126,7 +127,7 @@ def read_colmap(root: Path) -> Capture:
 
 
 def _images_of(root: Path, model: Path) -> Path:
-    """Return the folder of the images; of a distorted model those that COLMAP was given, as 3DGS has them."""
+    """Return the folder of the images; 3DGS has those of its distorted model in ``input``."""
     if model.is_relative_to(root / "distorted") and (root / "input").is_dir():
         return root / "input"
     folder = images_folder(root)

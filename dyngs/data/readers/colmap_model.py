@@ -1,7 +1,7 @@
-"""The files of a COLMAP model, binary or text: cameras, poses of images, points; without what the images observed.
+"""The files of a COLMAP model, binary or text: cameras, poses of images, points; no observations.
 
-pycolmap is not used: it cuts names at spaces, refuses tracks of images that are not there, needs the second lines of
-images.txt, and trusts the counts in binary files, so that a truncated one can hang or abort the process.
+pycolmap is not used: it cuts names at spaces, refuses tracks of absent images, needs the second lines
+of images.txt, and trusts the counts in binary files: a truncated one can hang or abort the process.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ NUM_PARAMS = {
 EXTENSIONS = (".bin", ".txt")
 Entry = TypeVar("Entry")
 _NOT_UTF8 = "names of images must be UTF-8; rename the images and export the model again"
-# A line of 2D points: x, y and the id of a 3D point, again and again. A line of a pose ends in a name.
+# A line of 2D points: x, y and the id of a 3D point, repeated. A line of a pose ends in a name.
 _POINTS_2D = re.compile(r"(?:[-+.\deEnaif]+\s+[-+.\deEnaif]+\s+-?\d+(?:\s+|$))+")
 
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """A camera: its COLMAP model, the (width, height) of its images in pixels, and the parameters of its lens."""
+    """A camera: COLMAP's model, (width, height) of its images in pixels, parameters of the lens."""
 
     number: int
     model: str
@@ -47,7 +47,7 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image: its name as written, its camera, and (7,) quaternion wxyz and translation to the camera."""
+    """A registered image: name as written, camera, and its ``cam_from_world``: wxyz, translation."""
 
     name: str
     camera: int
@@ -158,7 +158,7 @@ def _point_of(line: str) -> array[float]:
 
 
 def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
-    """Return the entries of a text file, as many as its header says or more: ``# Number of images: N, mean ...``.
+    """Return the entries of a text file, at least as many as its header ``# Number of ..: N`` says.
 
     In images.txt the second line of an image, its 2D points, may be empty or missing.
     """
@@ -186,7 +186,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
 
 
 class _Binary:
-    """A binary file of a model that is read from its start; the end of the block must be the end of the file."""
+    """A binary model file, read from its start; the end of the block must be the end of the file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -19,9 +19,9 @@ _POLYCAM = (
     ("keyframes/images", "keyframes/cameras"),
 )
 _RECORD3D = (
-    ("EXR_RGBD/metadata.json", "EXR_RGBD/rgb"),
-    ("metadata.json", "rgb"),
-    ("metadata", "rgbd"),  # of an unpacked .r3d
+    ("EXR_RGBD/rgb", "EXR_RGBD/metadata.json"),
+    ("rgb", "metadata.json"),
+    ("rgbd", "metadata"),  # of an unpacked .r3d
 )
 _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 """Keys of transforms files, and those of Polycam."""
@@ -48,10 +48,10 @@ def _depth_of(path: Path) -> dict[str, object]:
     return {"depth_file_path": str(path)} if path.is_file() else {}
 
 
-def _existing(root: Path, files: Sequence[tuple[str, str]]) -> list[tuple[Path, Path]]:
-    """Return the pairs of files or folders that both exist, in their order."""
-    pairs = [(root / first, root / second) for first, second in files]
-    return [(first, second) for first, second in pairs if first.exists() and second.exists()]
+def _existing(root: Path, places: Sequence[tuple[str, str]]) -> list[tuple[Path, Path]]:
+    """Return the folders that hold images, each with its file or folder of cameras, in the order of ``places``."""
+    pairs = [(root / images, root / cameras) for images, cameras in places]
+    return [(images, cameras) for images, cameras in pairs if cameras.exists() and files_in(images, SUFFIXES)]
 
 
 POLYCAM_FORMAT = CaptureFormat(
@@ -66,7 +66,7 @@ def read_record3d(root: Path) -> Capture:
     """
     from scipy.spatial.transform import Rotation  # late: other captures do not need it
 
-    path, images = _existing(root, _RECORD3D)[0]
+    images, path = _existing(root, _RECORD3D)[0]
     fields = read_json_object(path)
     poses = numbers_of(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
     fx, _, _, _, fy, _, cx, cy, _ = numbers_of(f"{path}: K", entry(path, fields, "K"), (9,))

@@ -443,7 +443,8 @@ def _digest(data: DataConfig) -> str:
     root = data.root.resolve()
     with reading(root):
         files = sorted(path for path in root.rglob("*") if path.is_file() and path.stat().st_size < _LARGEST)
-    names = {"format", "frames", "pose_frames", "train_cameras", "times", "frames_per_second", "test_every"}
+    chosen_by = {"format", "frames", "pose_frames", "train_cameras", "times", "frames_per_second"}
+    names = chosen_by | {"test_every", "skip_missing"}
     options = data.model_dump(mode="json", include=names)
     chosen = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]
     return f"{digest_of(root, files)}{chosen}"
