@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from dyngs.errors import DyngsError
+from dyngs.files.limits import read_limited
 from dyngs.files.temporary import remove_quietly, temporary_folder_beside
 from dyngs.files.write import require_replaceable, write_text
 
@@ -38,11 +39,12 @@ class Inputs:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
         Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is
-        read; it is a folder that holds a link to an input, a device, a pipe or the like; or a link leads it out of
-        its run folder. A run folder in a capture, an empty folder, and a folder around a capture may be written to.
+        read; it is a folder that holds a link to an input; a link leads it out of its run folder; or it is a device,
+        a pipe or the like. A run folder in a capture, an empty folder, and a folder around a capture may be written
+        to.
         """
-        require_replaceable(out)
         require_within_run(out)
+        require_replaceable(out)
         if not os.path.lexists(out):
             return
         for folder in self._folders:
@@ -141,13 +143,10 @@ def _sources(paths: Iterable[Path]) -> list[Path]:
 
 
 def _read_sources(capture: Path) -> list[str]:
-    path = capture / SOURCES_NAME
     try:
-        if not path.is_file() or path.stat().st_size > _MAX_SOURCES_BYTES:
-            return []
-        names = json.loads(path.read_text(encoding="utf-8"))["sources"]
+        names = json.loads(read_limited(capture / SOURCES_NAME, _MAX_SOURCES_BYTES))["sources"]
         return [name for name in names if isinstance(name, str) and "\0" not in name]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # costs no more than this protection
+    except (DyngsError, OSError, ValueError, KeyError, TypeError, RecursionError):  # costs no more than this protection
         return []
 
 
