@@ -93,7 +93,7 @@ def as_word(path: str | os.PathLike[str]) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return ``text`` as a word for a shell; with escapes ($'...') where it does not show on one line of stdout."""
+    """Return ``text`` as a word for a shell, with escapes ($'...') where stdout cannot show it."""
     encoding = getattr(sys.stdout, "encoding", None) or "ascii"
     if printable(text) == text and text == text.encode(encoding, "replace").decode(encoding, "replace"):
         return shlex.quote(text)

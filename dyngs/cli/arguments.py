@@ -161,7 +161,7 @@ def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> 
 
 
 def add_data_root(parser: argparse.ArgumentParser) -> None:
-    """Add ``data.root=FOLDER`` and ``data.follow_links=true`` to a command that reads the capture of a run."""
+    """Add the overrides of a command that reads the capture of a run."""
     about = "where the capture of the run lies by now; data.follow_links=true: its files may lie elsewhere"
     add_overrides(parser, "data.root=FOLDER", about)
     parser.set_defaults(takes_root=True)

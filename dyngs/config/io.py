@@ -79,7 +79,10 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
     given = layers.add_overrides(overrides)
     if layers.value_at(_FOLLOW_LINKS) and _FOLLOW_LINKS not in given:
         where = layers.origin_of(_FOLLOW_LINKS)
-        raise DyngsError(f"{where}: no file may allow links; if you trust the capture, give data.follow_links=true")
+        raise DyngsError(
+            f"{where}: only the command line may set data.follow_links; remove it here and, if you "
+            "trust the capture, give data.follow_links=true there"
+        )
     own |= given
     config = _validate(layers)
     _note_requested(config, (), own)
@@ -93,8 +96,8 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     """Return the configuration of a finished or interrupted run.
 
     Args:
-        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one next to the file, and
-            ``data.follow_links`` has no effect there: see ``dyngs.files.containment.following_links_of_runs``.
+        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one next to
+            the file. ``data.follow_links`` has no effect there, see ``following_links_of_runs``.
         overrides: as in ``load_config``.
         data_root: where the capture lies by now, if it was moved.
     """

@@ -1,4 +1,4 @@
-"""Python processes that dyngs starts: they find the packages of this process, but none in the current folder."""
+"""Python processes that dyngs starts. They find the packages of this process, none in its folder."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ _START = (
 
 
 def python_command(module: str, *arguments: str) -> list[str]:
-    """Return the command that runs a module of dyngs in a Python process of its own.
+    """Return the command that runs a module of dyngs in another Python process.
 
-    Python's -m would import modules from the current folder, which may hold the downloads of somebody else. With -I it
-    does not, but then it ignores PYTHONPATH and the packages of ``pip install --user``, which are passed on here.
+    ``python -m`` imports modules from the current folder, which may hold files of strangers.
+    ``python -I`` does not, but ignores PYTHONPATH and ``pip install --user``: they are passed on.
     """
     places = [os.path.abspath(place) for place in sys.path if place and not _is_current_folder(place)]
     start = _START.format(
         user_sites=ascii([site.getusersitepackages()] if site.ENABLE_USER_SITE else []),
         places=ascii(places),
-        home=ascii(str(home_of_dyngs())),  # last: in a checkout that is not installed, it is the current folder
+        # Last, because it is the current folder in a checkout that is not installed.
+        home=ascii(str(home_of_dyngs())),
         module=ascii(module),
     )
     return [sys.executable, "-I", "-c", start, *arguments]

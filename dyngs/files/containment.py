@@ -56,7 +56,10 @@ def staying_within(root: Path, follow_links: bool = False) -> Iterator[None]:
 
 @contextmanager
 def following_links_of_runs(allowed: bool) -> Iterator[None]:
-    """Set whether captures of runs that are opened in the block may name files elsewhere; no run may say so itself."""
+    """Set whether ``data.follow_links`` holds for runs that are opened in the block.
+
+    The user decides this on the command line: the config.yaml of a run may be that of a stranger.
+    """
     token = _links_of_runs.set(allowed)
     try:
         yield

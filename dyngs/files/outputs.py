@@ -77,7 +77,7 @@ class Inputs:
 
 
 def require_within_run(out: Path) -> None:
-    """Check that no link, as in the run of a stranger, leads an output that lies in a run folder out of it."""
+    """Check that no link leads an output in a run folder, perhaps a stranger's, out of it."""
     for run in out.absolute().parents:
         if (run / _RUN_MARK).is_file() and any((run / name).exists() for name in _OF_RUNS):
             place = out if out.is_dir() else out.parent

@@ -23,13 +23,14 @@ _NAME = re.compile(
 
 
 def temporary_beside(path: Path) -> Path:
-    """Create a hidden empty file next to ``path``, with its suffix; the folder is created if missing.
+    """Create a hidden empty file next to ``path``, with its suffix, and the folder if missing.
 
-    In a shared folder nobody can guess its name and plant a link there. Temporary files that killed processes left in
-    that folder are removed, once per folder and process.
+    Its name cannot be guessed: in a shared folder nobody can plant a link there. Temporary files
+    that killed processes left in that folder are removed, once per folder and process.
     """
     temporary = _unused_name(path)
-    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0), 0o666))
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
+    os.close(os.open(temporary, flags, 0o666))
     return temporary
 
 

@@ -49,7 +49,7 @@ def done_in_turn(
     except ImportError:
         raise DyngsError("--ray needs the package ray; run pip install 'dyngs[ray]'") from None
     here = os.getcwd()
-    os.chdir(home_of_dyngs())  # Ray's processes import modules from the folder that is the current one here
+    os.chdir(home_of_dyngs())  # Ray's processes import modules from the current folder of ray.init
     try:
         ray.init()
     finally:
@@ -66,7 +66,7 @@ def done_in_turn(
 
 
 def _attempted_in(folder: str, links: bool, do: Callable[[T], R], task: T) -> R | DyngsError:
-    """Attempt a task in another process, with the current folder and permissions of that which asks for it."""
+    """Attempt a task in a process of Ray, with the current folder and permissions of ours."""
     os.chdir(folder)
     with following_links_of_runs(links):
         return _attempted(do, task)

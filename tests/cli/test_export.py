@@ -285,7 +285,7 @@ def test_export_accepts_every_suffix_that_its_help_names(capsys: pytest.CaptureF
     text = capsys.readouterr().out
     motions = re.search(r"motion for a person: (.*?)--max", text, re.DOTALL)
     assert motions is not None
-    others = {".kind", ".js", ".root"}  # model.kind, three.js, data.root
+    others = {".kind", ".js", ".root", ".follow_links"}  # model.kind, three.js, data.root
     found = set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
     assert {".ply", ".spz", ".4dgs", ".safetensors", ".html"} <= found
     for suffix in found:
