@@ -237,10 +237,6 @@ class Unpickler:
         state = self.pop()
         self._arrays.build(self.top(), state)
 
-    def persistent(self, key: object) -> object:
-        """BINPERSID: return what a key of another program stands for."""
-        raise ValueError("it names something outside of it")
-
     def check_protocol(self) -> None:
         """PROTO."""
         if (protocol := self.read(1)[0]) > 5:
@@ -406,7 +402,6 @@ _STEPS: dict[bytes, Callable[[Unpickler], object]] = {
     b"R": Unpickler.call_top,
     b"\x81": Unpickler.call_top,
     b"b": Unpickler.build,
-    b"Q": lambda m: m.push(m.persistent(m.pop())),
     b"\x80": Unpickler.check_protocol,
     b"\x95": lambda m: m.read(8),
 }

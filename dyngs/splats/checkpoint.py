@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
-from dyngs.files.torch_files import StoredTensor, TorchFile
 from dyngs.gaussians import Gaussians
 from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
 
@@ -22,8 +24,7 @@ _GSPLAT = "sh0", "shN"
 
 def read_checkpoint(path: Path) -> SplatFile:
     """Read the Gaussians of a checkpoint of torch. Raises DyngsError: it holds none, or is damaged."""
-    file = TorchFile(path)
-    found = _tensors_of(file.contents)
+    found = _tensors_of(_load(path))
     names = _NERFSTUDIO if _NERFSTUDIO[0] in found else _GSPLAT
     if not {*_SHAPES, *names} <= found.keys():
         raise DyngsError(f"{path}: holds no Gaussians as nerfstudio's splatfacto and gsplat store them; {_HINT}")
@@ -31,10 +32,10 @@ def read_checkpoint(path: Path) -> SplatFile:
     require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
 
     def numbers(name: str, width: int) -> np.ndarray:
-        values = file.numbers(found[name])
-        if values.size != count * width:
-            raise DyngsError(f"{path}: {name} should hold {count:,} x {width} numbers; {_HINT}")
-        return values.reshape(count, width)
+        tensor = found[name]
+        if tensor.numel() != count * width or not tensor.is_floating_point():
+            raise DyngsError(f"{path}: {name} should hold {count:,} x {width} floats; {_HINT}")
+        return tensor.detach().float().reshape(count, width).numpy()
 
     values = {name: torch.from_numpy(numbers(name, width)) for name, width in _SHAPES.items()}
     base, shape = numbers(names[0], 3), found[names[1]].shape
@@ -58,15 +59,31 @@ def read_checkpoint(path: Path) -> SplatFile:
     return SplatFile(gaussians, notes=tuple(notes))
 
 
-def _tensors_of(contents: object) -> dict[str, StoredTensor]:
+def _load(path: Path) -> object:
+    """Load a file of ``torch.save`` without executing code in it. Raises DyngsError: it is damaged, or needs code."""
+    if not zipfile.is_zipfile(path):
+        raise DyngsError(f"{path}: is no file of torch.save (a zip, since torch 1.6), or is cut off; copy it again")
+    try:
+        return torch.load(path, map_location="cpu", mmap=True, weights_only=True)
+    except OSError:
+        raise
+    except Exception as error:  # a damaged pickle may raise any
+        raise DyngsError(f"{path}: is damaged, or holds objects that only code could restore; {_HINT}") from error
+
+
+def _tensors_of(contents: object) -> dict[str, Tensor]:
     """Return the tensors beside that called ``means``, by their names without what stands before that one."""
     for key in ("pipeline", "splats"):
-        if isinstance(contents, dict) and isinstance(contents.get(key), dict):
+        if isinstance(contents, Mapping) and isinstance(contents.get(key), Mapping):
             contents = contents[key]
-    if not isinstance(contents, dict):
+    if not isinstance(contents, Mapping):
         return {}
-    tensors = {name: value for name, value in contents.items() if isinstance(value, StoredTensor)}
-    prefixes = [name.removesuffix("means") for name in tensors if name == "means" or str(name).endswith(".means")]
+    tensors = {
+        str(name): value
+        for name, value in contents.items()
+        if isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
+    }
+    prefixes = [name.removesuffix("means") for name in tensors if name == "means" or name.endswith(".means")]
     if len(prefixes) != 1:
         return {}
     return {name.removeprefix(prefixes[0]): tensor for name, tensor in tensors.items() if name.startswith(prefixes[0])}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +88,51 @@ def test_a_checkpoint_is_converted_upright(tmp_path: Path, capsys: pytest.Captur
     torch.testing.assert_close(found, torch.stack([x, -z, y], 1), rtol=0, atol=1e-6)
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.pt")]) == 2
     assert "names no format of Gaussians" in capsys.readouterr().err
+
+
+class Attack:
+    """Pickled, it is a call of ``os.system``."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return os.system, (f"touch {self.mark}",)
+
+
+@pytest.mark.parametrize("place", ["beside", "within"])
+def test_code_in_a_file_is_not_run(place: str, tmp_path: Path) -> None:
+    attack = Attack(tmp_path / "attacked")
+    whole = parameters(cloud(5, 1), False).state_dict()
+    torch.save({"splats": whole, "x": attack if place == "beside" else {"z": [attack]}}, tmp_path / "a.pt")
+    with pytest.raises(DyngsError, match=r"a\.pt: is damaged, or holds objects that only code could restore; export"):
+        read_splats(tmp_path / "a.pt")
+    assert not (tmp_path / "attacked").exists()
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    torch.save({"splats": parameters(cloud(50, 1), False).state_dict()}, path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(DyngsError, match=r"a\.pt: is no file of torch\.save"):
+        read_splats(path)
+    for content in (b"\x80\x02X", b"", pickle.dumps(torch.ones)):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("a/data.pkl", content)
+        with pytest.raises(DyngsError, match=r"a\.pt: (is damaged|holds no Gaussians)"):
+            read_splats(path)
+
+
+def test_tensors_that_share_numbers_are_not_written_out(tmp_path: Path) -> None:
+    """An expanded tensor is a few bytes of a file, whatever its shape."""
+    whole = parameters(cloud(5, 1), False).state_dict()
+    torch.save({"splats": {**whole, "means": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt")
+    with pytest.raises(DyngsError, match=r"asks for 1,099,511,627,776 Gaussians"):
+        read_splats(tmp_path / "a.pt")
+    torch.save({"splats": {**whole, "scales": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt")
+    with pytest.raises(DyngsError, match=r"scales should hold 5 x 3 floats"):
+        read_splats(tmp_path / "a.pt")
 
 
 def test_other_checkpoints_are_refused(tmp_path: Path) -> None:
