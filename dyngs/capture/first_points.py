@@ -200,8 +200,8 @@ def with_first_points(capture: Capture, options: DataConfig, init: PointsInit) -
     time step that several cameras show, else from those of a moving camera over the full clip. Not where it is
     published custom to begin with random points: in the cube around the origin of Blender scenes that are still or show
     each time step from one side, if they lie there. Those of still ones are drawn in the silhouettes, if there are any.
-    To fewer than half of ``init.dense`` in still captures points of plane sweeps are added; those in silhouettes do
-    well without (`still` lost 0.1 dB by them).
+    To fewer than half of ``init.dense`` in still captures points of plane sweeps are added, which also replace random
+    ones where nothing could be triangulated; those in silhouettes do well without (`still` lost 0.1 dB by them).
     """
     capture, line = checked_points(capture, options)
     lines = [] if line is None else [line]
@@ -240,8 +240,15 @@ def _with_dense_points(
     capture: Capture, options: DataConfig, count: int, lines: list[str]
 ) -> tuple[Capture, list[str]]:
     points, views = capture.points, capture.splits["train"]
-    if points is None or views[0].time is not None or 2 * len(points.xyz) >= count:
+    num_known = 0 if points is None else len(points.xyz)
+    if views[0].time is not None or 2 * num_known >= count:
         return capture, lines
+    if points is None:
+        candidates, _ = points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
+        points = dense_points(views, options, candidates, count, fill=True)
+        if points is not None:
+            lines = [*lines, f"{len(points.xyz):,} first points are from depth maps by plane sweep (init.dense)"]
+        return capture.replace(points=points), lines
     dense = dense_points(views, options, points.xyz, count)
     if dense is None:
         return capture, lines

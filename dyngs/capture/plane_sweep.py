@@ -14,6 +14,7 @@ from operator import add
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -35,6 +36,9 @@ WINDOW = 2  # pixels on each side of the middle
 MIN_CORRELATION = 0.8
 AGREEMENT, MIN_AGREEING = 0.02, 2
 """Relative difference of depths up to which two maps agree on a point, and how many others must."""
+FILLED = 0.4
+"""Fraction of filled points. A ray-traced room without points (96 px, 400 steps, mean of three seeds): 24.8 dB without
+them, 27.2 with 0.2, 27.9 with 0.4. The fox (135 px, 1,000 steps): 32.2 dB with 0.2 or 0.4; from random points 25.6."""
 MIN_POINTS = 500  # with fewer the maps have found noise
 MIN_FRACTION = 0.5  # of the pixels of given depth maps; true ones of a room agree on 0.84, of twice its size on 0.09
 NEAR_ANGLE, BEST_ANGLE, FAR_ANGLE = 3.0, 12.0, 30.0
@@ -61,11 +65,20 @@ class _Shot:
         down, across = np.mgrid[:height, :width] + 0.5
         return np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(self.intrinsics).T
 
+    def points_at(self, depth: np.ndarray) -> np.ndarray:
+        """Return the points (P, 3) in the world of the finite depths (H, W), row by row."""
+        local = (self.rays * depth[..., None])[np.isfinite(depth)]
+        world_from_cam = inverse_rigid(self.cam_from_world)
+        return local @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
 
-def dense_points(views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int) -> PointCloud | None:
+
+def dense_points(
+    views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int, fill: bool = False
+) -> PointCloud | None:
     """Return at most ``count`` points of surfaces that several views show, at random of all that were found.
 
-    ``sparse`` (P, 3) points say how deep to look and which views show the same things. None where hardly any points
+    ``sparse`` (P, 3) points say how deep to look and which views show the same things. With ``fill``, ``FILLED`` of the
+    points are of pixels without texture, at the depth of the nearest pixel that has one. None where hardly any points
     are found: without texture, neighbours, or right poses.
     """
     groups = neighbours(views, sparse)
@@ -76,7 +89,7 @@ def dense_points(views: Sequence[View], options: DataConfig, sparse: np.ndarray,
         (shots[first], _depth_map(shots[first], [shots[i] for i in others], _depth_range(views[first], sparse)))
         for first, *others in groups
     ]
-    return _agreed_points(maps, count, MIN_POINTS)
+    return _agreed_points(maps, count, MIN_POINTS, fill)
 
 
 def points_of_depth_maps(views: Sequence[View], options: DataConfig, count: int) -> PointCloud | None:
@@ -100,13 +113,37 @@ def _small(options: DataConfig) -> DataConfig:
     return options.model_copy(update={"downscale": 1.0, "longest_side": SWEEP_SIDE, "cache_mb": 0.0})
 
 
-def _agreed_points(maps: Sequence[tuple[_Shot, np.ndarray]], count: int, fewest: float) -> PointCloud | None:
-    found = [_agreed(shot, depth, maps) for shot, depth in maps]
-    if sum(len(xyz) for xyz, _ in found) < fewest:
+def _agreed_points(
+    maps: Sequence[tuple[_Shot, np.ndarray]], count: int, fewest: float, fill: bool = False
+) -> PointCloud | None:
+    agreed = [np.where(_agreed(shot, depth, maps), depth, np.nan) for shot, depth in maps]
+    if sum(np.isfinite(depth).sum() for depth in agreed) < fewest:
         return None
+    shots = [shot for shot, _ in maps]
+    num_filled = round(FILLED * count) if fill else 0
+    xyz, rgb = _at_random(shots, agreed, count - num_filled)
+    if num_filled:
+        gaps = [_gaps_filled(shot, depth) for shot, depth in zip(shots, agreed, strict=True)]
+        more = _at_random(shots, gaps, num_filled)
+        xyz, rgb = np.concatenate([xyz, more[0]]), np.concatenate([rgb, more[1]])
+    return PointCloud(xyz, np.rint(255 * rgb).astype(np.uint8))
+
+
+def _at_random(shots: Sequence[_Shot], maps: Sequence[np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` random points (P, 3) of depth maps in the world, and their colours (P, 3)."""
+    found = [(shot.points_at(depth), shot.rgb[np.isfinite(depth)]) for shot, depth in zip(shots, maps, strict=True)]
     xyz, rgb = (np.concatenate(x) for x in zip(*found, strict=True))
     chosen = np.sort(np.random.default_rng(0).permutation(len(xyz))[:count])
-    return PointCloud(xyz[chosen], np.rint(255 * rgb[chosen]).astype(np.uint8))
+    return xyz[chosen], rgb[chosen]
+
+
+def _gaps_filled(shot: _Shot, depth: np.ndarray) -> np.ndarray:
+    """Return (H, W) the depth of the nearest known pixel for pixels that are unknown and count, NaN for others."""
+    is_unknown = np.isnan(depth)
+    if is_unknown.all():
+        return depth
+    nearest = distance_transform_edt(is_unknown, return_distances=False, return_indices=True)
+    return np.where(is_unknown & shot.counts, depth[tuple(nearest)], np.nan)
 
 
 def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
@@ -199,18 +236,17 @@ def _window_mean(x: Tensor) -> Tensor:
     return reduce(add, (rows[..., k : k + width] for k in range(size))) / size**2
 
 
-def _agreed(shot: _Shot, depth: np.ndarray, maps: Sequence[tuple[_Shot, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (P, 3) of a depth map that ``MIN_AGREEING`` others have as well, in the world, and colours."""
+def _agreed(shot: _Shot, depth: np.ndarray, maps: Sequence[tuple[_Shot, np.ndarray]]) -> np.ndarray:
+    """Return (H, W) bool: pixels of a depth map whose points ``MIN_AGREEING`` others have as well."""
     is_known = np.isfinite(depth)
-    local = (shot.rays * depth[..., None])[is_known]
-    world_from_cam = inverse_rigid(shot.cam_from_world)
-    xyz = local @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    xyz = shot.points_at(depth)
     agreeing = np.zeros(len(xyz), np.int64)
     for other, theirs in maps:
         if other is not shot:
             agreeing += _agrees(xyz, other, theirs)
-    keep = agreeing >= MIN_AGREEING
-    return xyz[keep], shot.rgb[is_known][keep]
+    agreed = np.zeros(depth.shape, bool)
+    agreed[is_known] = agreeing >= MIN_AGREEING
+    return agreed
 
 
 def _agrees(xyz: np.ndarray, other: _Shot, depth: np.ndarray) -> np.ndarray:

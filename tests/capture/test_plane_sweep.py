@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.capture import plane_sweep
+from dyngs.capture import first_points, plane_sweep
 from dyngs.capture.first_points import with_first_points
 from dyngs.capture.plane_sweep import MIN_NEIGHBOURS, NEIGHBOURS, dense_points, neighbours, points_of_depth_maps
 from dyngs.config import DataConfig, PointsInit
@@ -94,6 +94,24 @@ def test_a_still_capture_without_points_begins_with_those_of_its_depth_maps(tmp_
     assert lines == ["2,000 first points are from the depth maps"]
     assert begun.points is not None
     assert np.abs(begun.points.xyz[:, 2] - SLOPE * begun.points.xyz[:, 0]).max() < 1e-4
+
+
+def test_a_still_capture_without_any_points_is_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random candidates say how deep to look; pixels without texture take the depth of their neighbours."""
+    monkeypatch.setattr(first_points, "triangulated_points", lambda *_: None)
+    views = [replace(view, depth_path=None) for view in _views(tmp_path)]
+    capture = Capture(tmp_path, "nerfstudio", {"train": tuple(views)})
+    begun, lines = with_first_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
+    assert begun.points is not None
+    assert len(begun.points.xyz) == 2000
+    assert lines == ["2,000 first points are from depth maps by plane sweep (init.dense)"]
+    x, _, z = begun.points.xyz.T
+    error = np.abs(z - SLOPE * x)
+    assert np.median(error) < 0.01 * DISTANCE
+    assert np.quantile(error, 0.9) < 0.05 * DISTANCE
+    assert with_first_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points is None
+    timed = capture.replace(splits={"train": tuple(replace(view, time=0.1 * i) for i, view in enumerate(views))})
+    assert with_first_points(timed, DataConfig(root=tmp_path), PointsInit(dense=2000))[0].points is None
 
 
 def test_points_beside_the_images_do_not_say_how_deep_to_look(tmp_path: Path) -> None:
