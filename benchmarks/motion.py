@@ -1,6 +1,6 @@
 """Gap between what is learned and what could be, if the motion were known, on the synthetic scenes that move.
 
-    python benchmarks/motion.py FOLDER [--scenes spin,wave,merge,room] [--size 200] [--views 48] [--style moving]
+    python benchmarks/motion.py FOLDER [--scenes spin,wave,room] [--size 200] [--views 48] [--style moving]
         [key=value ...]
 
 For each scene two models are trained for the same number of steps and measured on the test split: the preset

@@ -35,4 +35,4 @@ def person(column: float, height: float = 200.0, width: float = 1.0, swing: floa
     points[:, 1] = 40 + height * np.array(rows)
     points[9, 0] += swing
     points[10, 0] -= swing
-    return Detection(points)
+    return Detection(points, np.zeros((4, 4), np.uint8))

@@ -14,7 +14,6 @@ from operator import add
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -139,11 +138,13 @@ def _at_random(shots: Sequence[_Shot], maps: Sequence[np.ndarray], count: int) -
 
 def _gaps_filled(shot: _Shot, depth: np.ndarray) -> np.ndarray:
     """Return (H, W) the depth of the nearest known pixel for pixels that are unknown and count, NaN for others."""
+    from scipy.ndimage import distance_transform_edt  # late: few scenes need it
+
     is_unknown = np.isnan(depth)
     if is_unknown.all():
         return depth
-    nearest = distance_transform_edt(is_unknown, return_distances=False, return_indices=True)
-    return np.where(is_unknown & shot.counts, depth[tuple(nearest)], np.nan)
+    rows, columns = np.asarray(distance_transform_edt(is_unknown, return_distances=False, return_indices=True))
+    return np.where(is_unknown & shot.counts, depth[rows, columns], np.nan)
 
 
 def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:

@@ -85,7 +85,7 @@ def _overrides(action: argparse.Action, prefix: str, parsed_args: argparse.Names
     known = [k for k in config_keys() if not resumes or k.name in WITH_RESUME]
     known = [k for k in known if "key" in metavar or k.name == "data.root"]
     if equals:
-        return [f"{key}={value}" for k in known if k.name == key for value in _allowed(k.allowed, k.default, text)]
+        return [f"{key}={value}" for k in known if k.name == key for value in _allowed(k.allowed, text)]
     presets = [*_presets(), *_paths(prefix, (".yaml", ".yml"))] if "CONFIG" in metavar and not resumes else []
     presets = [preset for preset in presets if preset.startswith(prefix)]
     names = [f"{k.name}=" for k in known if k.name.startswith(prefix)]
@@ -99,7 +99,7 @@ def _presets() -> list[str]:
     return list(packaged_presets())
 
 
-def _allowed(words: str, default: str, text: str) -> Iterator[str]:
+def _allowed(words: str, text: str) -> Iterator[str]:
     """Yield the values that ``words`` allow, as ``dyngs.config.schema`` puts them."""
     plain = words.removesuffix(" or null")
     if plain != words:
@@ -110,8 +110,6 @@ def _allowed(words: str, default: str, text: str) -> Iterator[str]:
         yield from ("true", "false")
     elif plain == "a path":
         yield from _paths(text)
-    elif default:
-        yield default
 
 
 def _paths(word: str, suffixes: Sequence[str] = ()) -> Iterator[str]:

@@ -15,20 +15,7 @@ if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
-SYNTHETIC_SCENES = (
-    "still",
-    "polyhedra",
-    "spin",
-    "wave",
-    "merge",
-    "room",
-    "roll",
-    "collide",
-    "chain",
-    "enter",
-    "human",
-    "people",
-)
+SYNTHETIC_SCENES = ("still", "polyhedra", "spin", "wave", "room", "roll", "human", "people")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
 _STILL = "still", "polyhedra"
 _OF_A_FIT = {
@@ -164,12 +151,10 @@ def _add_synth(verbs: args.Commands) -> None:
         "write a small synthetic scene as a capture",
         "Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it moves. still: a "
         "still life. polyhedra: flat faces and letters, with true edges and close-ups. spin: a turning die and a "
-        "rolling ball. wave: a rippling cloth. merge: balls that appear, merge "
-        "and vanish. room: videos of a static room with one hopping ball, from fixed cameras. roll: a striped ball "
-        "rolls alone. collide: two balls bounce off each other. chain: a finger of five links bends. enter: a die "
-        "slides into a room and out again. human: a walking person from all around, with exact body parameters; with "
-        "--style teleport one image per time, as in D-NeRF, without them. people: many people, a capture each, with "
-        "depth maps and key points, for networks that predict people.",
+        "rolling ball. wave: a rippling cloth. room: videos of a static room with one hopping ball, from fixed "
+        "cameras. roll: a striped ball rolls alone. human: a walking person from all around, with exact body "
+        "parameters; with --style teleport one image per time, as in D-NeRF, without them. people: many people, a "
+        "capture each, with depth maps and key points, for networks that predict people.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")

@@ -52,11 +52,8 @@ def read_checkpoint(path: Path) -> SplatFile:
         logit_opacities=values["opacities"][:, 0],
         sh=torch.from_numpy(np.concatenate([base[:, None], rest], axis=1).astype(np.float32)),
     )
-    notes = ["in the frame of its training, which the program may have turned and scaled; z is taken for up"]
-    ranks = list(path.parent.glob(f"{path.stem.rpartition('_rank')[0]}_rank*{path.suffix}"))
-    if len(ranks) > 1 and path in ranks:
-        notes.append(f"one of {len(ranks)} parts, one for each GPU: `dyngs edit --merge` adds the others")
-    return SplatFile(gaussians, notes=tuple(notes))
+    note = "in the frame of its training, which the program may have turned and scaled; z is taken for up"
+    return SplatFile(gaussians, notes=(note,))
 
 
 def _load(path: Path) -> object:

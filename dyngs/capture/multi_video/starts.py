@@ -74,7 +74,7 @@ class Alignment:
     Attributes:
         shifts: (C,) samples, to be added to a recording's own time; the first one is 0.
         agreeing: pairs whose own best shift is this one, to a sample; of so many ``pairs``.
-        correlation: mean over all pairs at these shifts; ``together``: if nothing is shifted.
+        correlation: mean over all pairs at these shifts.
         holds: whether the shifts may be relied on: pairs that agree join all recordings, and of the pairs beyond those
             that it takes to join them, which agree by themselves, half agree, too. Without such pairs, each is certain.
     """
@@ -83,7 +83,6 @@ class Alignment:
     agreeing: int
     pairs: int
     correlation: float
-    together: float
     holds: bool
 
 
@@ -128,16 +127,14 @@ def align(pairs: Mapping[tuple[int, int], Correlation], count: int) -> Alignment
     agree = {
         (i, j) for (i, j), found in pairs.items() if found.is_clear and abs(found.best - (shifts[j] - shifts[i])) <= 1.0
     }
-    mean, none = (
-        float(np.mean([found.at(at[j] - at[i]) for (i, j), found in pairs.items()])) if pairs else 0.0
-        for at in (shifts, np.zeros(count))
-    )
+    values = [found.at(shifts[j] - shifts[i]) for (i, j), found in pairs.items()]
+    correlation = float(np.mean(values)) if values else 0.0
     beyond = len(pairs) - (count - 1)
     confirmed = (
         2 * (len(agree) - (count - 1)) >= beyond if beyond > 0 else all(pairs[pair].is_certain for pair in agree)
     )
     holds = len(_reached(agree, count)) == count and confirmed
-    return Alignment(shifts - shifts[0], len(agree), len(pairs), mean, none, holds)
+    return Alignment(shifts - shifts[0], len(agree), len(pairs), correlation, holds)
 
 
 def peak_place(values: np.ndarray) -> float:
@@ -191,22 +188,6 @@ def _reached(links: set[tuple[int, int]], count: int) -> set[int]:
     for _ in range(count):
         reached |= {x for link in links for x in link if reached & set(link)}
     return reached
-
-
-_NOISE = 6.0  # differences below so many times the typical one are noise
-_LEAST_CHANGE = 8.0  # grey levels below which a difference is noise anyway
-
-
-def motion_of(grey: np.ndarray) -> np.ndarray:
-    """Return (F, P) uint8: how much each pixel of (F, H, W) differs from the median, less what noise explains."""
-    every = max(len(grey) // 60, 1)
-    typical = np.median(grey[::every], axis=0)
-    motion = np.empty((len(grey), grey[0].size), np.uint8)
-    for number, image in enumerate(grey):
-        change = image - typical
-        change = np.abs(change - np.median(change)).ravel()
-        motion[number] = np.clip(change - max(_NOISE * float(np.median(change)), _LEAST_CHANGE), 0, 255)
-    return motion
 
 
 RATE = 100.0  # values of a signal per second
@@ -269,7 +250,6 @@ def _samples(path: Path) -> np.ndarray | None:
 
 
 WHOLE = 0.2  # offsets so near to whole frames, in frames, are taken as whole: they are not known better
-TOGETHER = 0.97  # videos begin together if that explains them as well as the offsets found, to this fraction
 MAX_RATE = 60.0
 _SHOWN = 12
 
@@ -283,7 +263,7 @@ def found_starts(films: Sequence[Film]) -> tuple[dict[str, float], str]:
     rate = min(max(film.rate for film in films), MAX_RATE)
     sure = f"{found.agreeing} of {found.pairs} pairs agree, correlation {found.correlation:.2f}"
     frames = found.shifts / RATE * rate
-    if found.together >= TOGETHER * found.correlation or np.abs(frames).max() <= WHOLE:
+    if np.abs(frames).max() <= WHOLE:
         return {film.name: 0.0 for film in films}, f"the videos begin together, by the sound ({sure})"
     rates = [film.rate for film in films]
     if max(rates) <= 1.01 * min(rates) and np.abs(frames - np.round(frames)).max() <= WHOLE:

@@ -12,7 +12,7 @@ import numpy as np
 
 from dyngs.data.synthetic.polyhedra import polyhedra, true_edges
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, is_seen, render_scene, render_things
-from dyngs.data.synthetic.scenes import CORNERS, SceneName, scene_at, still_life
+from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import new_folder
@@ -22,7 +22,7 @@ CaptureStyle = Literal["teleport", "moving", "fixed"]
 """One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all times."""
 
 _FRONT_DEG, _SECTOR_DEG = -45.0, 64.0
-"""Middle and range of the azimuths of fixed and moving cameras, and of all that look into a corner."""
+"""Middle and range of the azimuths of fixed and moving cameras."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
     """Write images of the moving scene ``name`` in the layout of D-NeRF; returns ``out``.
 
     Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the images, RGBA with straight alpha, of
-    ``CORNERS`` without alpha. Each time is seen by one camera somewhere else on the hemisphere, or by one on an arc,
+    ``room`` without alpha. Each time is seen by one camera somewhere else on the hemisphere, or by one on an arc,
     which a fixed camera in its middle tests. Fixed cameras each take all times: ``camAA/frame_BBBB.png``, frames with
     ``camera``; test and val have one camera each, never trained on.
 
@@ -142,11 +142,13 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic capture needs size, num_times, num_cameras and samples of at least 1")
     style = options.style or ("fixed" if name == "room" else "teleport")
-    splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style, name in CORNERS)
+    if name == "room" and style == "teleport":
+        raise DyngsError("the walls of the room would hide it from cameras all around; choose --style fixed or moving")
+    splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style)
     taken = [(shot.name, shot.time or 0.0, shot.world_from_cam) for shots in splits.values() for shot in shots]
     with new_folder(out) as started:
         for split, shots in splits.items():
-            _write_split(started, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options, name in CORNERS)
+            _write_split(started, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options, name == "room")
         write_true_tracks(started, true_tracks(lambda time: scene_at(name, time), taken, options.seed))
     return out
 
@@ -180,10 +182,10 @@ def _write_split(
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
 
 
-def _single_shots(options: DynamicOptions, style: CaptureStyle, in_front: bool) -> dict[str, list[_Shot]]:
+def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[_Shot]]:
     """One image per training time, by cameras in random order or on a smooth arc; the validation camera is fixed.
 
-    Test cameras lie on an orbit, or ``in_front`` on an arc; a moving camera is tested by a fixed one in its middle.
+    Test cameras lie on an orbit; a moving camera is tested by a fixed one in its middle.
     """
     random, count, gaps = np.random.default_rng(options.seed), options.num_test, max(options.num_times - 1, 1)
     if style == "moving":
@@ -193,13 +195,10 @@ def _single_shots(options: DynamicOptions, style: CaptureStyle, in_front: bool) 
         fixed = _poses(options.distance, np.array([middle_deg]), np.array([28.0]))
         test = np.repeat(fixed, count, axis=0)
     else:
-        train = hemisphere_cameras(options.num_times, options.distance, options.seed, in_front)
+        train = hemisphere_cameras(options.num_times, options.distance, options.seed)
         train = random.permutation(train)  # the spiral climbs: time would tell the height
         test = orbit_cameras(count, options.distance, elevation_deg=28.0, start_deg=-60.0)
         fixed = orbit_cameras(1, options.distance, elevation_deg=28.0, start_deg=-60.0)
-        if in_front:
-            azimuths_deg = _FRONT_DEG + 0.8 * _SECTOR_DEG * (np.array(_even_times(count)) - 0.5)
-            test = _poses(options.distance, azimuths_deg, np.full(count, 28.0))
     poses = {"train": train, "val": np.repeat(fixed, options.num_val, axis=0), "test": test}
     times = {
         "train": _even_times(options.num_times),
@@ -245,18 +244,15 @@ def _even_times(count: int) -> list[float]:
     return [i / max(count - 1, 1) for i in range(count)]
 
 
-def hemisphere_cameras(count: int, distance: float, seed: int, in_front: bool = False) -> np.ndarray:
+def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
     """(count, 4, 4) OpenGL camera-to-world poses spread evenly over the upper hemisphere, looking at the origin.
 
-    A Fibonacci spiral from 6 to 80 degrees of elevation, rotated by a random azimuth; ``in_front`` only a sector of it,
-    up to 45 degrees.
+    A Fibonacci spiral from 6 to 80 degrees of elevation, rotated by a random azimuth.
     """
     turn = np.random.default_rng(seed).uniform(0.0, 2 * np.pi)
     fraction = (np.arange(count) + 0.5) / max(count, 1)
-    heights = np.sin(np.radians(6.0)) * (1 - fraction) + np.sin(np.radians(45.0 if in_front else 80.0)) * fraction
+    heights = np.sin(np.radians(6.0)) * (1 - fraction) + np.sin(np.radians(80.0)) * fraction
     azimuths = turn + np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
-    if in_front:
-        azimuths = np.radians(_FRONT_DEG + _SECTOR_DEG * (azimuths / (2 * np.pi) % 1.0 - 0.5))
     return _look_at_origin(distance, azimuths, np.arcsin(heights))
 
 
@@ -293,9 +289,9 @@ def true_tracks(
     """
     times = sorted({time for _, time, _ in shots})
     scenes = {time: scene_of(time) for time in times}
-    fullest = max(scenes.values(), key=lambda scene: len(scene.primitives))
+    first = scenes[times[0]]
     random = np.random.default_rng(seed)
-    local = {i: fullest.primitives[i].sampled(POINTS_PER_THING, random) for i in fullest.movers}
+    local = {i: first.primitives[i].sampled(POINTS_PER_THING, random) for i in first.movers}
     points = {time: _placed(scenes[time], local) for time in times}
     visible = [is_in_image(points[time], pose) & is_seen(scenes[time], points[time], pose) for _, time, pose in shots]
     return TrueTracks(
@@ -315,11 +311,5 @@ def is_in_image(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
 
 
 def _placed(scene: Scene, local: dict[int, np.ndarray]) -> np.ndarray:
-    """(P, 3) float32 of points on the primitives of ``scene``; NaN on those that do not exist."""
-    things = scene.primitives
-    return np.concatenate(
-        [
-            things[i].placed(x).astype(np.float32) if i < len(things) else np.full_like(x, np.nan)
-            for i, x in local.items()
-        ]
-    )
+    """(P, 3) float32 of points on the primitives of ``scene``."""
+    return np.concatenate([scene.primitives[i].placed(x) for i, x in local.items()]).astype(np.float32)

@@ -72,48 +72,6 @@ class Sphere:
 
 
 @dataclass(frozen=True)
-class Capsule(Sphere):
-    """A ball swept along its z axis, ``half_length`` to both sides of ``center``; its middle one hides the sky."""
-
-    half_length: float = 0.0
-
-    def _extents(self) -> np.ndarray:
-        return f32([self.radius, self.radius, self.radius + self.half_length])
-
-    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """The nearest of where a ray enters the ball at either end, and the tube between them."""
-        start, towards = (origins - f32(self.center)) @ f32(self.turn), directions @ f32(self.turn)
-        squared = np.maximum(_dot(towards[:, :2], towards[:, :2]), np.float32(1e-12))
-        half_b = _dot(start[:, :2], towards[:, :2])
-        discriminant = half_b**2 - squared * (_dot(start[:, :2], start[:, :2]) - self.radius**2)
-        tube = (-half_b - np.sqrt(np.maximum(discriminant, 0.0))) / squared
-        is_hit = (discriminant > 0) & (tube > 1e-4) & (np.abs(start[:, 2] + tube * towards[:, 2]) < self.half_length)
-        ends = [np.asarray(self.center) + side * self.half_length * self.turn[:, 2] for side in (-1, 1)]
-        balls = [Sphere((x, y, z), self.radius, self.paint).intersect(origins, directions) for x, y, z in ends]
-        return np.minimum(np.where(is_hit, tube, np.float32(np.inf)), np.minimum(*balls))
-
-    def local(self, points: np.ndarray) -> np.ndarray:
-        """(R, 3) surface points in the capsule's axes, each divided by its half extent."""
-        return (points - f32(self.center)) @ f32(self.turn) / self._extents()
-
-    def placed(self, local: np.ndarray) -> np.ndarray:
-        return (local * self._extents()) @ f32(self.turn).T + f32(self.center)
-
-    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
-        ball = _unit(random.normal(size=(count, 3)))
-        along = random.uniform(-self.half_length, self.half_length, count)
-        on_tube = random.random(count) * (self.radius + self.half_length) < self.half_length
-        tube = np.column_stack([self.radius * _unit(ball[:, :2]), along])
-        ends = self.radius * ball + self.half_length * np.sign(ball[:, 2:]) * [0.0, 0.0, 1.0]
-        return (np.where(on_tube[:, None], tube, ends) / self._extents()).astype(np.float32)
-
-    def normals(self, points: np.ndarray) -> np.ndarray:
-        offset = points - f32(self.center)
-        along = np.clip(offset @ f32(self.turn[:, 2]), -self.half_length, self.half_length)
-        return (offset - along[:, None] * f32(self.turn[:, 2])) / np.float32(self.radius)
-
-
-@dataclass(frozen=True)
 class Box:
     """A box rotated by ``yaw`` radians about the vertical; its methods are as those of ``Sphere``."""
 

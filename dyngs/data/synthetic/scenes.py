@@ -12,13 +12,11 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dyngs.data.synthetic.raytrace import Box, Capsule, Paint, Primitive, Scene, Sheet, Sphere, Wave, f32
+from dyngs.data.synthetic.raytrace import Box, Paint, Scene, Sheet, Sphere, Wave, f32
 from dyngs.errors import DyngsError
 
-SceneName = Literal["spin", "wave", "merge", "room", "roll", "collide", "chain", "enter"]
+SceneName = Literal["spin", "wave", "room", "roll"]
 """The scenes that move."""
-CORNERS: tuple[SceneName, ...] = ("room", "enter")
-"""Those in a furnished corner: opaque in all directions, and seen from its front only."""
 
 Rgb = tuple[float, float, float]
 
@@ -48,26 +46,13 @@ def scene_at(name: SceneName, time: float) -> Scene:
 
     - ``spin``: a die turns by 100 degrees on a plate and a ball rolls about it along 130 degrees of a circle.
     - ``wave``: a cloth ripples over a plate with three still things; after time 1 it is as at time 0.
-    - ``merge``: a ball grows from nothing from 0.3 on, a ball rolls into a larger one, a third sinks into a box.
     - ``room``: a furnished corner, opaque in all directions, where one ball hops across the floor.
     - ``roll``: a striped ball alone rolls along a circle on a plate, turning 2.5 times.
-    - ``collide``: two balls of equal mass roll into each other at time 0.5 and bounce off.
-    - ``chain``: a finger of five rigid links on a socket bends at all joints, and turns.
-    - ``enter``: a die slides through the corner of ``room``; no camera in front shows it at times 0 and 1.
 
     Raises:
         DyngsError: no such scene.
     """
-    moving = {
-        "spin": _spin,
-        "wave": _wave,
-        "merge": _merge,
-        "room": _room,
-        "roll": _roll,
-        "collide": _collide,
-        "chain": _chain,
-        "enter": _enter,
-    }
+    moving = {"spin": _spin, "wave": _wave, "room": _room, "roll": _roll}
     if name in moving:
         return moving[name](time)
     raise DyngsError(f"there is no moving scene '{name}'; choose one of {', '.join(get_args(SceneName))}")
@@ -110,28 +95,6 @@ def _wave(time: float) -> Scene:
     )
 
 
-def _merge(time: float) -> Scene:
-    things: list[Primitive] = [
-        _plate((0.80, 0.77, 0.70), (0.15, 0.24, 0.18)),
-        Box((0.44, 0.42, -0.04), (0.30, 0.30, 0.30), _framed((0.12, 0.20, 0.44), (0.86, 0.62, 0.30)), yaw=0.35),
-    ]
-    large, small = 0.30, 0.20
-    large_x, small_x = -0.55 + 0.55 * time, 0.70 - 0.70 * time
-    for x, radius, paint in (
-        (large_x, large, _swirl((0.10, 0.36, 0.30), (0.95, 0.86, 0.60))),
-        (small_x, small, _sectors(8, (0.92, 0.42, 0.08), (0.97, 0.92, 0.80))),
-    ):
-        center = (x, -0.52, _PLATE_TOP + radius)
-        things.append(Sphere(center, radius, paint, gloss=0.5, turn=_rotation("y", x / radius)))
-    height = 0.62 - 0.66 * _ease(time / 0.8)
-    things.append(Sphere((0.44, 0.42, height), 0.22, _dots((0.62, 0.10, 0.14), (0.96, 0.92, 0.84)), gloss=0.6))
-    grown = 0.36 * _ease((time - 0.3) / 0.6)
-    if grown > 0:
-        paint = _swirl((0.40, 0.16, 0.52), (0.93, 0.80, 0.86))
-        things.append(Sphere((-0.50, 0.42, _PLATE_TOP + grown), grown, paint, gloss=0.6))
-    return Scene(tuple(things), faint=_FAINT, num_static=2)
-
-
 def _room(time: float) -> Scene:
     radius, hops = 0.24, 3
     start, end = np.array([0.72, -0.86]), np.array([-0.45, -0.06])
@@ -140,17 +103,6 @@ def _room(time: float) -> Scene:
     heading = _rotation("z", np.arctan2(*(end - start)[::-1]))
     turn = heading @ _rotation("y", 2 * np.pi * time) @ heading.T
     ball = Sphere((x, y, height), radius, _sectors(8, (0.95, 0.68, 0.10), (0.10, 0.42, 0.30)), gloss=0.6, turn=turn)
-    return _in_corner(ball)
-
-
-def _enter(time: float) -> Scene:
-    along = 4.6 * (time - 0.5) / np.sqrt(2.0)
-    size = 0.24
-    center = (0.5 + along, -0.5 + along, _ROOM_FLOOR + size)
-    return _in_corner(Box(center, (size, size, size), _die(), yaw=float(np.radians(240.0 * time)), gloss=0.3))
-
-
-def _in_corner(mover: Primitive) -> Scene:
     floor = _tiles(26, (0.72, 0.56, 0.40), (0.46, 0.32, 0.21))
     left = _wallpaper(1, 2, (15, 9), (0.62, 0.68, 0.60), (0.36, 0.50, 0.46))
     right = _wallpaper(0, 2, (15, 9), (0.80, 0.72, 0.58), (0.66, 0.42, 0.30))
@@ -163,7 +115,7 @@ def _in_corner(mover: Primitive) -> Scene:
             Box((0.36, 0.98, -0.02), (0.28, 0.28, 0.48), _tiles(4, (0.88, 0.84, 0.74), (0.10, 0.22, 0.34)), yaw=0.25),
             Sphere((-0.85, 0.80, 0.60), 0.26, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.6),
             Sphere((-0.95, -0.55, -0.16), 0.34, _swirl((0.72, 0.16, 0.20), (0.95, 0.86, 0.66)), gloss=0.4),
-            mover,
+            ball,
         ),
         faint=_FAINT,
         num_static=7,
@@ -184,41 +136,6 @@ def _roll(time: float) -> Scene:
     return Scene((_plate((0.74, 0.74, 0.72), (0.22, 0.20, 0.26)), ball), faint=_FAINT, num_static=1)
 
 
-def _collide(time: float) -> Scene:
-    radius, middle, after = 0.27, np.array([0.0, -0.10]), time - 0.5
-    normal = np.array([np.cos(0.35), np.sin(0.35)])  # from the first ball to the second where they meet
-    before = np.array([[1.10, 0.15], [-0.90, 0.35]])
-    swapped = ((before[0] - before[1]) @ normal) * normal
-    balls = []
-    for side, velocity, paint in (
-        (-1, before[0] - swapped * (after > 0), _sectors(6, (0.80, 0.12, 0.10), _CREAM, (0.92, 0.66, 0.08))),
-        (1, before[1] + swapped * (after > 0), _swirl((0.08, 0.30, 0.62), (0.90, 0.86, 0.74))),
-    ):
-        x, y = middle + side * radius * normal + after * velocity
-        heading = _rotation("z", np.arctan2(*velocity[::-1]))
-        turn = heading @ _rotation("y", after * np.linalg.norm(velocity) / radius) @ heading.T
-        balls.append(Sphere((x, y, _PLATE_TOP + radius), radius, paint, gloss=0.5, turn=turn))
-    stone = Box((-0.66, 0.66, -0.16), (0.18, 0.18, 0.18), _framed(_GREEN, (0.86, 0.62, 0.30)), yaw=0.4)
-    return Scene((_plate((0.78, 0.72, 0.64), (0.14, 0.20, 0.28)), stone, *balls), faint=_FAINT, num_static=2)
-
-
-def _chain(time: float) -> Scene:
-    things: list[Primitive] = [
-        _plate((0.76, 0.78, 0.72), (0.28, 0.16, 0.14)),
-        Box((0.0, 0.0, -0.28), (0.20, 0.20, 0.06), _framed((0.12, 0.20, 0.44), (0.86, 0.62, 0.30)), yaw=0.3),
-    ]
-    joint, bend = np.array([0.0, 0.0, -0.20]), -0.5 + 0.25 * np.sin(2 * np.pi * time)
-    colours = (0.62, 0.10, 0.14), (0.92, 0.42, 0.08), (0.10, 0.36, 0.30), (0.08, 0.30, 0.62), (0.40, 0.16, 0.52)
-    for k, (length, colour) in enumerate(zip((0.40, 0.31, 0.26, 0.21, 0.16), colours, strict=True)):
-        bend += 0.08 + 0.34 * (1.0 - np.cos(3 * np.pi * time - 0.3 * k)) if k else 0.0
-        paint = _sectors(6, colour, _CREAM, (0.20, 0.18, 0.22)) if k % 2 else _swirl(colour, _CREAM)
-        turn = _rotation("z", 1.4 * time - 1.5) @ _rotation("x", bend)
-        x, y, z = joint + 0.5 * length * turn[:, 2]
-        things.append(Capsule((x, y, z), 0.14 - 0.01 * k, paint, 0.4, turn, 0.5 * length))
-        joint = joint + length * turn[:, 2]
-    return Scene(tuple(things), faint=_FAINT, num_static=2)
-
-
 def _plate(light: Rgb, dark: Rgb) -> Box:
     """The checkered plate under the other things, its top at ``_PLATE_TOP``."""
     return Box((0.0, 0.0, -0.40), (0.98, 0.98, 0.06), _checkers(6, light, dark), gloss=0.05)
@@ -232,12 +149,6 @@ def _rotation(axis: Literal["x", "y", "z"], angle: float) -> np.ndarray:
     i, j = first % 3, (first + 1) % 3
     turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
     return turn
-
-
-def _ease(fraction: float) -> float:
-    """Smoothstep: 0 below 0, 1 above 1."""
-    x = min(max(fraction, 0.0), 1.0)
-    return x * x * (3.0 - 2.0 * x)
 
 
 def _checkers(count: int, light: Rgb, dark: Rgb) -> Paint:

@@ -23,17 +23,18 @@ class Detection:
 
     Attributes:
         keypoints: (17, 3) float32 in the order of COCO: column and row in pixels, and confidence in [0, 1].
-        mask: (H, W) uint8, 255 = the person; None: this detector makes none.
+        mask: (H, W) uint8, 255 = the person.
     """
 
     keypoints: np.ndarray
-    mask: np.ndarray | None = None
+    mask: np.ndarray
 
     @cached_property
     def box(self) -> np.ndarray:
         """First and last column, first and last row (left, top, right, bottom), pixels; zeros where nothing is sure."""
-        if self.mask is not None and (self.mask > 127).any():
-            rows, columns = ((self.mask > 127).any(side).nonzero()[0] for side in (1, 0))
+        person = self.mask > 127
+        if person.any():
+            rows, columns = (person.any(side).nonzero()[0] for side in (1, 0))
             return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)
         sure = self.keypoints[self.keypoints[:, 2] > SURE, :2]
         return np.concatenate([sure.min(0), sure.max(0)]).astype(np.float64) if len(sure) else np.zeros(4)

@@ -127,11 +127,8 @@ def _summary(person: Sequence[Detection | None], detector: Detector) -> str:
 
 def _write_masks(camera: _Camera, person: Sequence[Detection | None], folder: Path, say: Callable[[str], None]) -> None:
     """Write the masks of all views at their size; nothing where the detector makes no masks."""
-    seen = [x for x in person if x is not None]
-    if any(x.mask is None for x in seen):
-        raise DyngsError("the detector returns no silhouettes, which the fit needs; use another detector")
     size = camera.images.shape[1:3]
-    masks = np.stack([np.zeros(size, bool) if x is None or x.mask is None else x.mask > 127 for x in person])
+    masks = np.stack([np.zeros(size, bool) if x is None else x.mask > 127 for x in person])
     better = outlined(camera.images, masks)
     if better is not None:
         common = (better & masks).sum() / max(int((better | masks).sum()), 1)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.data.synthetic.captures import hemisphere_cameras, orbit_cameras
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Box, Capsule, Scene, Sheet, Sphere, Wave, render_scene
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Box, Scene, Sheet, Sphere, Wave, render_scene
 
 SHEET = Sheet(
     (0.1, -0.2, 0.3),
@@ -59,40 +58,6 @@ def test_box_faces_are_hit_with_their_normals() -> None:
     np.testing.assert_allclose(np.abs(box.local(points)).max(axis=1), 1.0, atol=1e-5)
     assert (np.einsum("ri,ri->r", box.normals(points), directions) < 0).all()
     assert np.isinf(box.intersect(origins, -directions)).all()
-
-
-def test_rays_meet_a_capsule_where_the_first_of_many_balls_along_it_is() -> None:
-    rng = np.random.default_rng(2)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    turn *= np.linalg.det(turn)
-    capsule = Capsule((0.3, -0.2, 0.5), 0.2, _grey, turn=turn, half_length=0.6)
-    origins = (3.0 * _unit(rng.normal(size=(400, 3)))).astype(np.float32)
-    directions = _unit(np.array(capsule.center) + rng.normal(size=(400, 3)) * 0.3 - origins).astype(np.float32)
-    along = np.array(capsule.center) + np.linspace(-0.6, 0.6, 1201)[:, None] * turn[:, 2]
-    balls = [Sphere((x, y, z), 0.2, _grey).intersect(origins, directions) for x, y, z in along]
-    distance, expected = capsule.intersect(origins, directions), np.min(balls, axis=0)
-    assert 0.3 < np.isfinite(distance).mean() < 0.95
-    differ = np.isfinite(distance) != np.isfinite(expected)
-    assert differ.mean() < 0.01, "but rays that graze it"
-    hit = np.isfinite(distance) & ~differ
-    np.testing.assert_allclose(distance[hit], expected[hit], atol=2e-3)
-    points = origins[hit] + distance[hit, None] * directions[hit]
-    np.testing.assert_allclose(capsule.placed(capsule.local(points)), points, atol=1e-5)
-    normals = capsule.normals(points)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-4)
-    assert (np.einsum("ri,ri->r", normals, directions[hit]) < 1e-3).all()
-    axial = capsule.intersect(np.array([along[0] - 2 * turn[:, 2]], np.float32), turn[None, :, 2].astype(np.float32))
-    np.testing.assert_allclose(axial, 2.0 - 0.2, atol=1e-5)
-
-
-def test_points_of_a_capsule_lie_evenly_on_it() -> None:
-    capsule = Capsule((0.3, -0.2, 0.5), 0.2, _grey, half_length=0.6)
-    points = capsule.placed(capsule.sampled(20_000, np.random.default_rng(0))) - np.array(capsule.center)
-    along = np.clip(points[:, 2], -0.6, 0.6)
-    offset = points - along[:, None] * [0.0, 0.0, 1.0]
-    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), 0.2, atol=1e-5)
-    assert (np.abs(points[:, 2]) < 0.6).mean() == pytest.approx(0.6 / 0.8, abs=0.01), "areas of tube and ends"
-    assert points.mean(axis=0) == pytest.approx([0, 0, 0], abs=0.01)
 
 
 def test_paint_turns_with_the_ball() -> None:

@@ -13,6 +13,7 @@ from tests.detections import person
 
 LEFT, RIGHT = [1, 3, 5, 7, 9, 11, 13, 15], [2, 4, 6, 8, 10, 12, 14, 16]
 ARMS = ([7, 9], [8, 10])
+NOBODY = np.zeros((4, 4), np.uint8)
 
 
 def columns_of(track: list[Detection | None]) -> list[float | None]:
@@ -51,7 +52,7 @@ def test_who_jumps_or_grows_is_another_one() -> None:
 def test_nobody() -> None:
     assert followed([[], []]) == []
     unsure = person(100).keypoints * np.array([1, 1, 0], np.float32)
-    assert followed([[Detection(unsure)]]) == [], "where no key point is sure there is no box"
+    assert followed([[Detection(unsure, NOBODY)]]) == [], "where no key point is sure there is no box"
 
 
 @pytest.mark.parametrize("sides", [(LEFT, RIGHT), ARMS], ids=["all", "arms"])
@@ -65,7 +66,7 @@ def test_sides_swapped_in_a_few_images_are_put_right(sides: tuple[list[int], lis
         points = x.keypoints.copy()
         if t in wrong:
             points[sides[0] + sides[1]] = points[sides[1] + sides[0]]
-        seen.append(Detection(points))
+        seen.append(Detection(points, NOBODY))
     found, changed = with_sides(seen)
     assert changed == len(wrong)
     for x, y in zip(found, true, strict=True):
