@@ -158,6 +158,8 @@ def test_no_code_from_data(nodes: dict[str, list[ast.AST]]) -> None:
             elif isinstance(node, ast.Call):
                 called = ast.unparse(node.func)
                 names = {"pickle"} if called in ("eval", "exec", "yaml.load", "torch.load", "os.system") else set()
+                if called == "torch.load" and "weights_only=True" in ast.unparse(node):
+                    names = set()  # its unpickler calls nothing but what makes tensors
             else:
                 continue
             if names & forbidden_modules:
