@@ -45,9 +45,8 @@ def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
     images = root / "images"
 
     def with_mask(view: View) -> View:
-        path = view.image_path
-        name = os.path.relpath(path, images if path.is_relative_to(images) else root)
-        return replace(view, mask_path=mask_of(name, masks))
+        found = (mask_of(os.path.relpath(view.image_path, folder), masks) for folder in (images, root))
+        return replace(view, mask_path=next(filter(None, found), None))
 
     splits = each_view(splits, with_mask)
     return splits, unmasked_warning(all_views(splits), bool(masks))

@@ -240,7 +240,7 @@ def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
     assert view.silhouette == Silhouette(nerfstudio_root / "masks/a.png", "white")
 
 
-@pytest.mark.parametrize("name", ["03.jpg.png", "03.png", "03.mask.png", "03.JPG.PNG"])
+@pytest.mark.parametrize("name", ["03.jpg.png", "03.png", "03.mask.png", "03.JPG.PNG", "images/03.png"])
 @pytest.mark.parametrize("form", ["nerfstudio", "blender"])
 def test_masks_that_no_frame_names(nerfstudio_root: Path, name: str, form: str) -> None:
     """As nerfstudio, COLMAP and Brush name the masks of ``images/03.jpg``."""
