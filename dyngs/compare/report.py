@@ -51,7 +51,8 @@ def about(bench: Bench, results: Sequence[Result]) -> str:
 
 def write_report(bench: Bench, results: Sequence[Result], left_out: Mapping[str, str]) -> list[Path]:
     """Write the table, the page and, with matplotlib, the plot; return their paths."""
-    rows, out = table_rows(results), bench.out
+    rows = table_rows(results)
+    out = bench.out
     head, cells = table_cells(rows)
     missing = "".join(f"\nLeft out: {markdown_text(f'{name}: {problem}')}\n" for name, problem in left_out.items())
     figure = _curves(results) if can_plot() and any(result.curve for result in results) else None

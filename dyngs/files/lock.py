@@ -89,10 +89,10 @@ def writing(folder: Path) -> Iterator[Held]:
 
 
 def make_once(folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str) -> None:
-    """Call ``make``, which makes a folder of the cache in one piece; say ``found`` instead if it exists.
+    """Create a folder of the cache by calling ``make``, or print ``found`` if it exists.
 
-    Of several processes one makes it, the others wait and then use it; where the file system has no locks all make it,
-    and the first that is done counts. Raises DyngsError: as ``make`` does; the cache cannot be written.
+    One of several processes creates it, the others wait for it. Without file locks each of them calls ``make``, and the
+    first result is kept. Raises DyngsError: as ``make`` does, or the cache cannot be written.
     """
     path = folder.with_name(f".{folder.name}.lock")
     _made(folder.parent)

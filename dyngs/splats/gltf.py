@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.conventions import SH_C0, RasterizeMode, num_sh_terms
+from dyngs.data.images.colour_space import srgb_decoded
 from dyngs.files.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
@@ -108,8 +109,7 @@ def _write_primitive(path: Path, splat: SplatFile, document: GlbDocument, primit
 def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]:
     """Add the numbers of Gaussians to a document, harmonics up to degree 3; return their primitive."""
     sh = gaussians.sh.numpy()
-    srgb = (sh[:, 0] * SH_C0 + 0.5).clip(0, 1)
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = srgb_decoded((sh[:, 0] * SH_C0 + 0.5).clip(0, 1))
     arrays = {
         "POSITION": gaussians.means.numpy(),
         "COLOR_0": np.concatenate([linear, gaussians.opacities.numpy()[:, None]], axis=1),

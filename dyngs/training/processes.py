@@ -132,13 +132,13 @@ class Processes:
         self.sum_([x.grad for x in used if x.grad is not None])
 
     def request_stop(self) -> None:
-        """Let the first process know that this one was told to stop."""
+        """Report to rank 0 that this process has received a signal to stop."""
         with suppress(RuntimeError):  # who kept the store has ended
             if self._store is not None:
                 self._store.add(STOP, 1)
 
     def is_stop_requested(self) -> bool:
-        """Return whether any process was told to stop, as far as it has said so."""
+        """Return whether any process has reported a signal to stop."""
         return self._count(STOP) > 0
 
     def send_(self, values: Tensor) -> None:

@@ -86,6 +86,11 @@ def srgb_encoded(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
+def srgb_decoded(signal: np.ndarray) -> np.ndarray:
+    """Return the linear light of an sRGB signal in [0, 1]."""
+    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+
+
 @lru_cache
 def _linear_table(transfer: int, white: int) -> np.ndarray:
     """Return the linear light of every 16-bit level of a transfer curve, 1 = diffuse white."""
@@ -95,7 +100,7 @@ def _linear_table(transfer: int, white: int) -> np.ndarray:
     elif transfer == _PQ:
         linear = _pq_linear(signal) * 10_000 / _REFERENCE_WHITE
     else:
-        linear = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+        linear = srgb_decoded(signal)
     return linear.astype(np.float32)
 
 

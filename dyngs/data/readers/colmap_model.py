@@ -158,9 +158,10 @@ def _point_of(line: str) -> array[float]:
 
 
 def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
-    """Return the entries of a text file, at least as many as its header ``# Number of ..: N`` says.
+    """Parse a text file of a model, one entry per line.
 
-    In images.txt the second line of an image, its 2D points, may be empty or missing.
+    In images.txt the second line of an image, its 2D points, may be empty or missing. Raises DyngsError: a damaged
+    line, or fewer entries than the header ``# Number of ..: N`` announces.
     """
     entries: list[Entry] = []
     announced = 0

@@ -259,7 +259,8 @@ def read_odm(root: Path) -> Capture:
             model = max(content, key=lambda model: len(model["shots"]))
             if len(content) > 1:
                 warnings = [f"{path.name}: the largest of {len(content)} models is read, {len(model['shots'])} photos"]
-            lenses, shots = model["cameras"], model["shots"]
+            lenses = model["cameras"]
+            shots = model["shots"]
             listed = [[*point["coordinates"], *point["color"]] for point in model.get("points", {}).values()]
             if listed:
                 table = numbers_of(f"{path}: points", listed, (len(listed), 6))
