@@ -15,7 +15,9 @@ SPILLED = re.compile(r"(\d+) bytes stack frame, (\d+) bytes spill stores")
 def short_name(mangled: str) -> str:
     """The kernel's name with its template arguments, without its parameters."""
     full = subprocess.run(["c++filt", mangled], capture_output=True, text=True, check=True).stdout
-    without_enum = re.sub(r"\(dyngs::Tally\)", "tally ", full.replace("dyngs::cuda::(anonymous namespace)::", ""))
+    without_enum = re.sub(
+        r"\(dyngs::Tally\)", "tally ", full.replace("dyngs::cuda::(anonymous namespace)::", "")
+    )
     return re.sub(r"_kernel", "", without_enum.removeprefix("void ").partition("(")[0]).strip()
 
 
@@ -32,7 +34,9 @@ def main() -> int:
                 spilled.append(f"{name}, sm_{arch}: {spill[2]} bytes")
         elif used := USED.search(line):
             shared = f"{int(used[2] or 0) / 1024:.1f}"
-            rows.setdefault(name, {})[arch] = f"{used[1]} / {shared}" + (f" / {stack} B stack" if stack != "0" else "")
+            rows.setdefault(name, {})[arch] = f"{used[1]} / {shared}" + (
+                f" / {stack} B stack" if stack != "0" else ""
+            )
     archs = sorted({arch for row in rows.values() for arch in row}, key=int)
     print("registers / KiB of static shared memory of each kernel")
     print("| kernel |", " | ".join(f"sm_{arch}" for arch in archs), "|")

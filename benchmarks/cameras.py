@@ -1,11 +1,13 @@
 """What wrong camera poses cost, and what their refinement (`camera.refine`) wins back.
 
-    python benchmarks/cameras.py FOLDER CAPTURE... [--preset static] [--seed 0] [--refine never,always,auto] [key=value]
+    python benchmarks/cameras.py FOLDER CAPTURE... [--preset static] [--seed 0] [--refine
+    never,always,auto] [key=value]
 
-In a copy of each capture (those with transforms*.json) the cameras of all training images are turned by 0.5 degrees
-around a random axis and shifted in a random direction by 1 % of their mean distance from their middle; test cameras
-stay. The preset is trained on the capture as it is and on the copy, and scored on the test images: from their given
-poses, and from poses refined on the images themselves. FOLDER keeps copies and runs, which are reused.
+In a copy of each capture (those with transforms*.json) the cameras of all training images are
+turned by 0.5 degrees around a random axis and shifted in a random direction by 1 % of their mean
+distance from their middle; test cameras stay. The preset is trained on the capture as it is and on
+the copy, and scored on the test images: from their given poses, and from poses refined on the
+images themselves. FOLDER keeps copies and runs, which are reused.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ def disturb(capture: Path, out: Path, seed: int) -> None:
     views = read_capture(DataConfig(root=out)).splits["train"]
     centers = np.stack([np.linalg.inv(view.cam_from_world)[:3, 3] for view in views])
     shift = FRACTION * float(np.linalg.norm(centers - centers.mean(0), axis=1).mean())
-    trained_on, random = {view.image_path.resolve() for view in views}, np.random.default_rng(seed)
+    trained_on = {view.image_path.resolve() for view in views}
+    random = np.random.default_rng(seed)
     for path in sorted(out.glob("transforms*.json")):
         content = json.loads(path.read_text())
         for frame in content["frames"]:
@@ -47,14 +50,16 @@ def _motion(random: np.random.Generator, shift: float) -> np.ndarray:
     """Return a rigid transform (4, 4) by ``DEGREES`` and ``shift`` in random directions."""
     axis, direction = (x / np.linalg.norm(x) for x in random.normal(size=(2, 3)))
     cross = np.cross(np.eye(3), -axis)
-    motion, angle = np.eye(4), np.radians(DEGREES)
+    motion = np.eye(4)
+    angle = np.radians(DEGREES)
     motion[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     motion[:3, 3] = shift * direction
     return motion
 
 
 def scores(run: Path) -> list[str]:
-    """Return the cells of a run: what was used, PSNR from given and from own poses, and its size."""
+    """Return the cells of a run: what was used, PSNR from given and from own poses, and its
+    size."""
     report = evaluate_run(run, refine_poses=True)
     used = load_run(run).config.camera.refine
     return [used, f"{report.psnr:.2f}", f"{report.psnr_own_poses:.2f}", f"{report.num_gaussians:,}"]

@@ -1,4 +1,5 @@
-"""The frame of benchmarks that train on captures as they are and on copies that were made worse, and print a table."""
+"""The frame of benchmarks that train on captures as they are and on copies that were made worse,
+and print a table."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ class Study:
         text: of the command, for --help.
         worse: what a column calls that of which the copies are worse, "cameras"; --cameras chooses.
         given: the name of the capture as it is, in that column.
-        key: the setting that is tried with never, always and auto; --NAME chooses, by its last part.
+        key: the setting that is tried with never, always and auto; --NAME chooses, by its last
+            part.
         disturb: writes the worse copy of a capture into a new folder, by a seed.
         columns: names of the cells that ``scores`` returns.
         scores: returns the cells of a trained run.
@@ -60,14 +62,20 @@ def print_table(study: Study, words: Sequence[str] | None = None) -> None:
                     print(f"| {' | '.join(cells)} |", flush=True)
 
 
-def _arguments(study: Study, words: Sequence[str] | None) -> tuple[argparse.Namespace, list[Path], list[str]]:
+def _arguments(
+    study: Study, words: Sequence[str] | None
+) -> tuple[argparse.Namespace, list[Path], list[str]]:
     """Return the options, the captures, and the overrides of the configuration."""
-    parser = argparse.ArgumentParser(description=study.text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=study.text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("words", nargs="+", help="captures, and key=value")
     parser.add_argument("--preset", default="static")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(f"--{study.key.rpartition('.')[2]}", dest="settings", default="never,always,auto")
+    parser.add_argument(
+        f"--{study.key.rpartition('.')[2]}", dest="settings", default="never,always,auto"
+    )
     parser.add_argument(f"--{study.worse}", dest="states", default=f"{study.given},disturbed")
     options = parser.parse_intermixed_args(words)
     keys = [word for word in options.words if re.match(r"[\w.]+=", word)]

@@ -4,9 +4,10 @@
     dyngs train bg_triangle data.root=FOLDER run.dir=RUN
     python benchmarks/edges.py RUN [RUN ...]
 
-Prints for each run the numbers that it has learned, and PSNR and SSIM of the splits test and val; where the capture has
-images of true edges (the synthetic scene of polyhedra), PSNR of the pixels within 2 px of one, too. There, val are
-close-ups from 40 % of the distance; other captures are enlarged as much by a run at 40 % of their size.
+Prints for each run the numbers that it has learned, and PSNR and SSIM of the splits test and val;
+where the capture has images of true edges (the synthetic scene of polyhedra), PSNR of the pixels
+within 2 px of one, too. There, val are close-ups from 40 % of the distance; other captures are
+enlarged as much by a run at 40 % of their size.
 """
 
 from __future__ import annotations
@@ -51,15 +52,19 @@ def num_values(scene: Renderable) -> int:
 
 @torch.no_grad()
 def errors(opened: Opened, split: Split) -> list[float]:
-    """Return means over views: PSNR and SSIM of whole images, and PSNR near edges, NaN without any."""
+    """Return means over views: PSNR and SSIM of whole images, and PSNR near edges, NaN without
+    any."""
     options = opened.config.data.model_copy(update={"downscale": 1.0, "longest_side": None})
     views = opened.capture.splits[split]
-    images, found = ImageLoader(views, options), []
+    images = ImageLoader(views, options)
+    found = []
     for i, view in enumerate(views):
-        image, background = images[i], opened.background
+        image = images[i]
+        background = opened.background
         rendered = opened.renderable.render(image.cameras, background=background).rgb[0].clamp(0, 1)
         truth = image.composite(background)
-        squared, near = (rendered - truth).square().mean(-1), near_edges(Path(opened.config.data.root), view)
+        squared = (rendered - truth).square().mean(-1)
+        near = near_edges(Path(opened.config.data.root), view)
         beside = float("nan") if near is None else _psnr(squared[near])
         found.append([_psnr(squared), ssim(rendered, truth), beside])
     return np.mean(found, axis=0).tolist()
@@ -70,7 +75,9 @@ def _psnr(squared: Tensor) -> float:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     for path in parser.parse_args(words).runs:
         opened = open_run(path)
@@ -78,7 +85,9 @@ def main(words: Sequence[str] | None = None) -> None:
         for split in SPLITS:
             if opened.capture.splits[split]:
                 whole, alike, near = errors(opened, split)
-                print(f"  {split}: {whole:.2f} dB, SSIM {alike:.4f}, within {NEAR} px of edges {near:.2f} dB")
+                print(
+                    f"  {split}: {whole:.2f} dB, SSIM {alike:.4f}, within {NEAR} px of edges {near:.2f} dB"
+                )
 
 
 if __name__ == "__main__":

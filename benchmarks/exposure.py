@@ -1,12 +1,15 @@
-"""What exposure and white balance that differ from photo to photo cost, and what `train.exposure` wins back.
+"""What exposure and white balance that differ from photo to photo cost, and what `train.exposure`
+wins back.
 
-    python benchmarks/exposure.py FOLDER CAPTURE... [--seed 0] [--exposure never,always,auto] [key=value ...]
+    python benchmarks/exposure.py FOLDER CAPTURE... [--seed 0] [--exposure never,always,auto]
+    [key=value ...]
 
-In a copy of each capture every training image has its own random gain (0.6 to 1.6) and white balance (each channel
-0.85 to 1.18), applied to the stored values and cut off at white as a camera does; test images are as they were. The
-preset (static, with the overrides) is trained on the capture as it is and on the copy. All are measured on the same
-untouched test images: as they are, after one affine colour for all of them (the scene has the colours of the mean
-image), and right halves after an affine colour fitted on left halves. FOLDER keeps copies and runs, which are reused.
+In a copy of each capture every training image has its own random gain (0.6 to 1.6) and white
+balance (each channel 0.85 to 1.18), applied to the stored values and cut off at white as a camera
+does; test images are as they were. The preset (static, with the overrides) is trained on the
+capture as it is and on the copy. All are measured on the same untouched test images: as they are,
+after one affine colour for all of them (the scene has the colours of the mean image), and right
+halves after an affine colour fitted on left halves. FOLDER keeps copies and runs, which are reused.
 """
 
 from __future__ import annotations
@@ -31,11 +34,13 @@ from dyngs.metrics import psnr
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import load_run
 
-GAINS, WHITE_BALANCE = (0.6, 1.6), (0.85, 1.18)
+GAINS = (0.6, 1.6)
+WHITE_BALANCE = (0.85, 1.18)
 
 
 def disturb(capture: Path, out: Path, seed: int) -> None:
-    """Write a copy of ``capture`` whose training images have a gain and a white balance of their own."""
+    """Write a copy of ``capture`` whose training images have a gain and a white balance of their
+    own."""
     shutil.copytree(capture, out)
     random = np.random.default_rng(seed)
     for view in read_capture(DataConfig(root=out)).splits["train"]:
@@ -64,11 +69,15 @@ def scores(run: Path) -> list[str]:
     options = loaded.scene.options
     shown = []
     for image in (images[i] for i in range(len(images))):
-        rendering = loaded.scene.render(image.cameras, image.time, options=options, background=background)
+        rendering = loaded.scene.render(
+            image.cameras, image.time, options=options, background=background
+        )
         shown.append((image, rendering))
     one = fitted_affine(shown, background)
     plain = [psnr(r.rgb[0], p.composite(background), p.mask) for p, r in shown]
-    fitted = [psnr(recoloured(one, p, r, background), p.composite(background), p.mask) for p, r in shown]
+    fitted = [
+        psnr(recoloured(one, p, r, background), p.composite(background), p.mask) for p, r in shown
+    ]
     halves = [right_half_scores(p, r, background) for p, r in shown]
     means = [
         fmean(plain),

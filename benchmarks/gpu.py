@@ -1,11 +1,13 @@
 """Rendering on a CUDA GPU, forward and backward, beside gsplat where it is installed.
 
-    python benchmarks/gpu.py [--points garden.npz | --splat FILE] [--gaussians N ..] [--sizes WxH ..] [--repeats 50]
+    python benchmarks/gpu.py [--points garden.npz | --splat FILE] [--gaussians N ..] [--sizes WxH
+    ..] [--repeats 50]
 
-Both are called with the same arguments (gsplat 1.5's ``rasterization``; dyngs has its signature), and how far their
-images are apart is printed. Times are medians of CUDA events after a tenth as many calls that do not count, of a GPU
-that nothing else uses. Memory is the most that torch had allocated during a call. Without a GPU that can be used it
-says why in one line and measures nothing.
+Both are called with the same arguments (gsplat 1.5's ``rasterization``; dyngs has its signature),
+and how far their images are apart is printed. Times are medians of CUDA events after a tenth as
+many calls that do not count, of a GPU that nothing else uses. Memory is the most that torch had
+allocated during a call. Without a GPU that can be used it says why in one line and measures
+nothing.
 
 The workload of gsplat's benchmark, 1 and 5 million Gaussians, and a file at three sizes:
 
@@ -48,7 +50,9 @@ def repeated(workload: Workload, count: int) -> Workload:
     shift[: len(workload.means)] = 0
     names = ("means", "quats", "scales", "opacities")
     found = {name: getattr(workload, name)[rows] for name in names}
-    return replace(workload, **found | {"means": found["means"] + shift}, colors=workload.colors[:, rows])
+    return replace(
+        workload, **found | {"means": found["means"] + shift}, colors=workload.colors[:, rows]
+    )
 
 
 def resized(cameras: Cameras, width: int, height: int) -> Cameras:
@@ -56,7 +60,8 @@ def resized(cameras: Cameras, width: int, height: int) -> Cameras:
     scale = min(width, height) / min(cameras.width, cameras.height)
     lens = cameras.intrinsics.clone()
     lens[:, :2] *= scale
-    lens[:, 0, 2], lens[:, 1, 2] = width / 2, height / 2
+    lens[:, 0, 2] = width / 2
+    lens[:, 1, 2] = height / 2
     return Cameras(cameras.cam_from_world, lens, width, height)
 
 
@@ -111,8 +116,11 @@ def milliseconds(call: Callable[[], object], repeats: int) -> float:
     return median(times)
 
 
-def measured(name: str, rasterize: Rasterize, arguments: Arguments, repeats: int) -> tuple[str, Tensor]:
-    """A line about one rasterizer, milliseconds forward, with backward, and megabytes; and its image."""
+def measured(
+    name: str, rasterize: Rasterize, arguments: Arguments, repeats: int
+) -> tuple[str, Tensor]:
+    """A line about one rasterizer, milliseconds forward, with backward, and megabytes; and its
+    image."""
     leaves = [x for x in arguments.values() if isinstance(x, Tensor) and x.requires_grad]
 
     def forward() -> Tensor:
@@ -141,7 +149,9 @@ def compared(arguments: Arguments, repeats: int) -> None:
         return
     line, theirs = measured("gsplat", import_module("gsplat").rasterization, arguments, repeats)
     apart = (ours - theirs).abs()
-    print(f"{line}\nimages differ by {float(apart.max()):.1e} at most, {float(apart.mean()):.1e} on average\n")
+    print(
+        f"{line}\nimages differ by {float(apart.max()):.1e} at most, {float(apart.mean()):.1e} on average\n"
+    )
 
 
 def workloads(options: argparse.Namespace) -> Iterator[Arguments]:
@@ -161,9 +171,13 @@ def workloads(options: argparse.Namespace) -> Iterator[Arguments]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--points", type=Path, metavar="NPZ", help="points and cameras of gsplat's benchmark")
+    parser.add_argument(
+        "--points", type=Path, metavar="NPZ", help="points and cameras of gsplat's benchmark"
+    )
     parser.add_argument("--splat", type=Path, metavar="FILE", help="a file of Gaussians instead")
-    parser.add_argument("--gaussians", type=int, nargs="+", metavar="N", help="repeat the points to so many")
+    parser.add_argument(
+        "--gaussians", type=int, nargs="+", metavar="N", help="repeat the points to so many"
+    )
     parser.add_argument("--sizes", nargs="+", default=[], metavar="WxH", help="of the image, px")
     parser.add_argument("--repeats", type=int, default=50, metavar="N")
     options = parser.parse_args()

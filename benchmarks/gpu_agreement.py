@@ -1,9 +1,11 @@
-"""How far a CUDA GPU is from the CPU, op by op: the largest difference over the largest value, values and gradients.
+"""How far a CUDA GPU is from the CPU, op by op: the largest difference over the largest value,
+values and gradients.
 
     python benchmarks/gpu_agreement.py
 
-On a GPU that can be used; without one on the emulation of tests/, which needs a C++ compiler and nanobind. Inputs are
-the same float32 numbers everywhere. Beside the GPU's distance from the CPU's float64 stands that of the CPU's float32.
+On a GPU that can be used; without one on the emulation of tests/, which needs a C++ compiler and
+nanobind. Inputs are the same float32 numbers everywhere. Beside the GPU's distance from the CPU's
+float64 stands that of the CPU's float32.
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ def numbers(*shape: int, seed: int = 0, scale: float = 1.0) -> Tensor:
 def with_gradients(given: Given, outputs: Found) -> Found:
     """``outputs`` and the gradients by ``given`` of their sum with fixed random weights."""
     leaves = {name: x for name, x in given.items() if x.requires_grad}
-    terms = [(numbers(*x.shape, seed=7).to(x) * x).sum() for x in outputs.values() if x.requires_grad]
+    terms = [
+        (numbers(*x.shape, seed=7).to(x) * x).sum() for x in outputs.values() if x.requires_grad
+    ]
     gradients = torch.autograd.grad(sum(terms[1:], terms[0]), list(leaves.values()))
     return outputs | {f"by {name}": x for name, x in zip(leaves, gradients, strict=True)}
 
@@ -61,7 +65,10 @@ def scene() -> Given:
         "sh": numbers(COUNT, 9, 3, seed=4, scale=0.3),
     }
     lens = torch.tensor([[1.2 * SIDE, 0.0, SIDE / 2], [0.0, 1.2 * SIDE, SIDE / 2], [0.0, 0.0, 1.0]])
-    return {name: x.requires_grad_() for name, x in trained.items()} | {"pose": torch.eye(4)[None], "lens": lens[None]}
+    return {name: x.requires_grad_() for name, x in trained.items()} | {
+        "pose": torch.eye(4)[None],
+        "lens": lens[None],
+    }
 
 
 def drawn(given: Given) -> Found:
@@ -80,7 +87,9 @@ def compared(given: Given) -> Found:
 
 def updated(given: Given) -> Found:
     """One parameter after ten steps of Adam."""
-    x, first, second = given["x"].clone(), torch.zeros_like(given["x"]), torch.zeros_like(given["x"])
+    x = given["x"].clone()
+    first = torch.zeros_like(given["x"])
+    second = torch.zeros_like(given["x"])
     for step in range(1, 11):
         adam_step_(x, given["gradient"] * step, first, second, lr=0.01, step=step)
     return {"parameter": x, "moment": first}
@@ -89,20 +98,25 @@ def updated(given: Given) -> Found:
 def looked_up(given: Given) -> Found:
     """Features of space-time grids, and their penalty."""
     levels = [PlaneLevel(given["space"], given["time"])]
-    features, penalty = hexplane_features(given["places"], 0.4, levels), plane_penalty(levels, (0.1, 0.2, 0.3))
+    features = hexplane_features(given["places"], 0.4, levels)
+    penalty = plane_penalty(levels, (0.1, 0.2, 0.3))
     return with_gradients(given, {"features": features, "penalty": penalty})
 
 
 def skinned(given: Given) -> Found:
     """Points that follow control nodes."""
-    arguments = (given[name] for name in ("points", "nodes", "radii", "followed", "motion", "values"))
+    arguments = (
+        given[name] for name in ("points", "nodes", "radii", "followed", "motion", "values")
+    )
     offsets, blended = blend_skinning(*arguments)
     return with_gradients(given, {"offsets": offsets, "values": blended})
 
 
 def posed(given: Given) -> Found:
     """Gaussians that follow joints; axes as covariances, which no order of axes changes."""
-    made = pose_by_joints(*(given[name] for name in ("means", "quats", "log_scales", "weights", "transforms")))
+    made = pose_by_joints(
+        *(given[name] for name in ("means", "quats", "log_scales", "weights", "transforms"))
+    )
     axes = rotation_matrices(made.quats) * made.log_scales.exp()[:, None, :]
     return with_gradients(given, {"means": made.means, "covariances": axes @ axes.mT})
 
@@ -116,33 +130,50 @@ def decoded(given: Given) -> Found:
 def hashed(given: Given) -> Found:
     """Features of a hash grid of eight levels."""
     levels = HashLevels.geometric(8, 16, 256, 1 << 14)
-    return with_gradients(given, {"features": hash_features(given["places"], given["table"], levels)})
+    return with_gradients(
+        given, {"features": hash_features(given["places"], given["table"], levels)}
+    )
 
 
 def composited(given: Given) -> Found:
     """Rays of 30 samples each."""
-    starts, count = given["starts"], torch.arange(COUNT // 30 + 1, device=given["starts"].device)
+    starts = given["starts"]
+    count = torch.arange(COUNT // 30 + 1, device=given["starts"].device)
     samples = Samples(
-        30 * count, count[:-1].repeat_interleave(30).int(), starts, starts + 0.05, starts[:, None].repeat(1, 3)
+        30 * count,
+        count[:-1].repeat_interleave(30).int(),
+        starts,
+        starts + 0.05,
+        starts[:, None].repeat(1, 3),
     )
     seen = composite(given["log_densities"].exp(), given["colours"], samples, 1e-6)
-    return with_gradients(given, {"colours": seen.colour, "transmittance": seen.transmittance, "depth": seen.depth})
+    return with_gradients(
+        given, {"colours": seen.colour, "transmittance": seen.transmittance, "depth": seen.depth}
+    )
 
 
 def network() -> Given:
     """Features, and the weights of 40-64-64-64-10."""
     given = {"features": numbers(COUNT, 40).requires_grad_()}
     for i, (width, inputs) in enumerate(((64, 40), (64, 64), (64, 104), (10, 64))):
-        given[f"weight{i}"] = numbers(width, inputs, seed=i, scale=(2 / inputs) ** 0.5).requires_grad_()
+        given[f"weight{i}"] = numbers(
+            width, inputs, seed=i, scale=(2 / inputs) ** 0.5
+        ).requires_grad_()
         given[f"bias{i}"] = numbers(width, seed=4 + i, scale=0.1).requires_grad_()
     return given
 
 
 def cases() -> dict[str, tuple[Callable[[Given], Found], Given]]:
     """What is computed, of what, by name."""
-    trained, images = torch.Tensor.requires_grad_, [numbers(SIDE, SIDE, 3, seed=i).sigmoid() for i in range(2)]
-    motion = torch.cat([numbers(50, 3, seed=5, scale=0.1), numbers(50, 4, seed=6) + torch.tensor([4.0, 0, 0, 0])], 1)
-    transforms = torch.cat([torch.eye(3).expand(24, 3, 3) + numbers(24, 3, 3, scale=0.2), numbers(24, 3, 1)], 2)
+    trained = torch.Tensor.requires_grad_
+    images = [numbers(SIDE, SIDE, 3, seed=i).sigmoid() for i in range(2)]
+    motion = torch.cat(
+        [numbers(50, 3, seed=5, scale=0.1), numbers(50, 4, seed=6) + torch.tensor([4.0, 0, 0, 0])],
+        1,
+    )
+    transforms = torch.cat(
+        [torch.eye(3).expand(24, 3, 3) + numbers(24, 3, 3, scale=0.2), numbers(24, 3, 1)], 2
+    )
     return {
         "render": (drawn, scene()),
         "loss": (compared, {"image": trained(images[0]), "truth": images[1]}),
@@ -198,7 +229,9 @@ def cases() -> dict[str, tuple[Callable[[Given], Found], Given]]:
 def on(given: Given, device: str, dtype: torch.dtype) -> Given:
     """The same numbers elsewhere, as leaves where they are."""
     return {
-        name: x.detach().to(device, dtype if x.is_floating_point() else None).requires_grad_(x.requires_grad)
+        name: x.detach()
+        .to(device, dtype if x.is_floating_point() else None)
+        .requires_grad_(x.requires_grad)
         for name, x in given.items()
     }
 
@@ -206,7 +239,9 @@ def on(given: Given, device: str, dtype: torch.dtype) -> Given:
 def distance(found: Tensor, wanted: Tensor) -> float:
     """The largest difference over the largest value."""
     wanted = wanted.detach().double()
-    return float((found.detach().double().cpu() - wanted).abs().max() / wanted.abs().max().clamp_min(1e-30))
+    return float(
+        (found.detach().double().cpu() - wanted).abs().max() / wanted.abs().max().clamp_min(1e-30)
+    )
 
 
 @contextmanager
@@ -228,16 +263,26 @@ def gpu() -> Iterator[tuple[str, str]]:
 def main() -> None:
     """Print a table in Markdown."""
     chosen = cases()
-    exact = {name: compute(on(given, "cpu", torch.float64)) for name, (compute, given) in chosen.items()}
-    cpu = {name: compute(on(given, "cpu", torch.float32)) for name, (compute, given) in chosen.items()}
+    exact = {
+        name: compute(on(given, "cpu", torch.float64)) for name, (compute, given) in chosen.items()
+    }
+    cpu = {
+        name: compute(on(given, "cpu", torch.float32)) for name, (compute, given) in chosen.items()
+    }
     with gpu() as (device, called):
-        there = {name: compute(on(given, device, torch.float32)) for name, (compute, given) in chosen.items()}
+        there = {
+            name: compute(on(given, device, torch.float32))
+            for name, (compute, given) in chosen.items()
+        }
         print(f"GPU: {called}\n")
-    print("| op | result | GPU, to the CPU's float64 | CPU's float32, to its float64 | GPU, to the CPU's float32 |")
+    print(
+        "| op | result | GPU, to the CPU's float64 | CPU's float32, to its float64 | GPU, to the CPU's float32 |"
+    )
     print("|---|---|---|---|---|")
     for name, parts in exact.items():
         for part, wanted in parts.items():
-            own, found = cpu[name][part], there[name][part]
+            own = cpu[name][part]
+            found = there[name][part]
             figures = distance(found, wanted), distance(own, wanted), distance(found, own)
             print(f"| {name} | {part} | " + " | ".join(f"{x:.1e}" for x in figures) + " |")
 

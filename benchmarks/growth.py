@@ -1,6 +1,8 @@
-"""What a forward and a backward pass of the rasterizer cost as the scene and the image grow: time and peak memory.
+"""What a forward and a backward pass of the rasterizer cost as the scene and the image grow: time
+and peak memory.
 
-Each size in a process of its own, by random points as ``dyngs bench rasterize`` has them (scales up to 0.02):
+Each size in a process of its own, by random points as ``dyngs bench rasterize`` has them (scales up
+to 0.02):
 
     python benchmarks/growth.py [--threads N] [--repeats N]
 """
@@ -27,7 +29,9 @@ def measure(count: int, side: int, threads: int, repeats: int) -> str:
 
     load = random_workload(count)
     focal = 480 * side / 648
-    intrinsics = load.cameras.intrinsics.new_tensor([[[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]]])
+    intrinsics = load.cameras.intrinsics.new_tensor(
+        [[[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]]]
+    )
     cameras = replace(load.cameras, intrinsics=intrinsics, width=side, height=side)
     report = bench_rasterize(replace(load, cameras=cameras), [threads], repeats)
     times = report.runs[0].milliseconds
@@ -50,7 +54,9 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|---|")
     for count, side in SIZES:
         options = ["--threads", str(arguments.threads), "--repeats", str(arguments.repeats)]
-        subprocess.run([sys.executable, __file__, "--one", str(count), str(side), *options], check=True)
+        subprocess.run(
+            [sys.executable, __file__, "--one", str(count), str(side), *options], check=True
+        )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""What undistorting a fisheye lens costs, with the same focal length and with a wide pinhole (`data.undistort`).
+"""What undistorting a fisheye lens costs, with the same focal length and with a wide pinhole
+(`data.undistort`).
 
     python benchmarks/lenses.py FOLDER [--degrees 120] [--side 160] [--views 24] [key=value ...]
 
-Ray-traced images of a furnished corner (`dyngs/data/synthetic`): training through an equidistant fisheye of so many
-degrees across, and as many through a pinhole of the same focal length, to compare with. Test images are the truth
-from poses in between, through pinholes 60 and 100 degrees across, which no lens touched. FOLDER keeps captures and
-runs, which are reused.
+Ray-traced images of a furnished corner (`dyngs/data/synthetic`): training through an equidistant
+fisheye of so many degrees across, and as many through a pinhole of the same focal length, to
+compare with. Test images are the truth from poses in between, through pinholes 60 and 100 degrees
+across, which no lens touched. FOLDER keeps captures and runs, which are reused.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ SAMPLES, DISTANCE = 2, 2.6
 FISHEYE = Lens("fisheye", (0.0,) * 4)
 
 
-def directions(lens: Lens, focal: float, size: tuple[int, int], shift: tuple[float, float]) -> np.ndarray:
+def directions(
+    lens: Lens, focal: float, size: tuple[int, int], shift: tuple[float, float]
+) -> np.ndarray:
     """Return (H * W, 3) unit rays in OpenGL axes through one place in every pixel."""
     width, height = size
     y, x = np.mgrid[:height, :width] + np.asarray(shift)[::-1, None, None]
@@ -49,9 +52,13 @@ def directions(lens: Lens, focal: float, size: tuple[int, int], shift: tuple[flo
 
 def image(pose: np.ndarray, lens: Lens, focal: float, size: tuple[int, int]) -> np.ndarray:
     """Return the (H, W, 3) uint8 image of the room from an OpenGL pose."""
-    scene, total = scene_at("room", 0.3), np.zeros((size[0] * size[1], 3), np.float32)
+    scene = scene_at("room", 0.3)
+    total = np.zeros((size[0] * size[1], 3), np.float32)
     for a, b in np.ndindex(SAMPLES, SAMPLES):
-        rays = directions(lens, focal, size, ((a + 0.5) / SAMPLES, (b + 0.5) / SAMPLES)) @ pose[:3, :3].T
+        rays = (
+            directions(lens, focal, size, ((a + 0.5) / SAMPLES, (b + 0.5) / SAMPLES))
+            @ pose[:3, :3].T
+        )
         total += raytrace.colours_along(scene, pose[:3, 3], rays)
     return (255 * total / SAMPLES**2 + 0.5).astype(np.uint8).reshape(size[1], size[0], 3)
 
@@ -59,11 +66,18 @@ def image(pose: np.ndarray, lens: Lens, focal: float, size: tuple[int, int]) -> 
 def poses(count: int, seed: int) -> np.ndarray:
     """Return (count, 4, 4) OpenGL poses on an arc before the corner, looking about its middle."""
     random = np.random.default_rng(seed)
-    azimuth = np.radians(-45 + 70 * ((np.arange(count) + 0.5) / count - 0.5) + random.uniform(-2, 2, count))
+    azimuth = np.radians(
+        -45 + 70 * ((np.arange(count) + 0.5) / count - 0.5) + random.uniform(-2, 2, count)
+    )
     elevation = np.radians(random.uniform(8, 32, count))
     distance = DISTANCE * random.uniform(0.6, 1.0, count)
     centres = distance[:, None] * np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        -1,
     )
     backward = centres - random.uniform(-0.4, 0.4, (count, 3))
     backward /= np.linalg.norm(backward, axis=1, keepdims=True)
@@ -95,7 +109,9 @@ def write_capture(out: Path, lens: Lens, focal: float, options: argparse.Namespa
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("keys", nargs="*", help="key=value")
     parser.add_argument("--degrees", type=float, default=120.0)
@@ -111,7 +127,8 @@ def main(words: Sequence[str] | None = None) -> None:
             ("fisheye", FISHEYE, "same_focal"),
             ("fisheye", FISHEYE, "wide"),
         ):
-            root, run = options.folder / name, options.folder / f"{name}_{how}"
+            root = options.folder / name
+            run = options.folder / f"{name}_{how}"
             if not root.exists():
                 write_capture(root, lens, focal, options)
             begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
@@ -120,7 +137,10 @@ def main(words: Sequence[str] | None = None) -> None:
                 train(load_config(packaged_preset("static"), own))
             seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun
             report = evaluate_run(run)
-            print(f"| {name} | {how} | {report.psnr:.2f} | {report.num_gaussians:,} | {seconds:.0f} |", flush=True)
+            print(
+                f"| {name} | {how} | {report.psnr:.2f} | {report.num_gaussians:,} | {seconds:.0f} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

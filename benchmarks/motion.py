@@ -1,14 +1,17 @@
-"""Gap between what is learned and what could be, if the motion were known, on the synthetic scenes that move.
+"""Gap between what is learned and what could be, if the motion were known, on the synthetic scenes
+that move.
 
-    python benchmarks/motion.py FOLDER [--scenes spin,wave,room] [--size 200] [--views 48] [--style moving]
+    python benchmarks/motion.py FOLDER [--scenes spin,wave,room] [--size 200] [--views 48] [--style
+    moving]
         [key=value ...]
 
-For each scene two models are trained for the same number of steps and measured on the test split: the preset
-(configs/dynamic.yaml with the overrides), and an oracle. The oracle's Gaussians begin on the true surfaces, with labels
-of what they belong to, and a field moves them by the scene's own description: each rigid body and the cloth. The
-rasterizer, the strategy, the learning rates and the harmonics are the preset's, the base colours of what moves may
-change over time, and images have their full size from the start. The gap is what it costs to find the motion; shading
-and shadows hold back both. FOLDER keeps captures and runs of the preset, which are reused.
+For each scene two models are trained for the same number of steps and measured on the test split:
+the preset (configs/dynamic.yaml with the overrides), and an oracle. The oracle's Gaussians begin on
+the true surfaces, with labels of what they belong to, and a field moves them by the scene's own
+description: each rigid body and the cloth. The rasterizer, the strategy, the learning rates and the
+harmonics are the preset's, the base colours of what moves may change over time, and images have
+their full size from the start. The gap is what it costs to find the motion; shading and shadows
+hold back both. FOLDER keeps captures and runs of the preset, which are reused.
 """
 
 from __future__ import annotations
@@ -31,7 +34,12 @@ from dyngs.config import Config, PointsInit, RandomInit, StaticModel
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
 from dyngs.data.loader import ImageLoader
-from dyngs.data.synthetic.captures import CaptureStyle, DynamicOptions, is_in_image, write_dynamic_capture
+from dyngs.data.synthetic.captures import (
+    CaptureStyle,
+    DynamicOptions,
+    is_in_image,
+    write_dynamic_capture,
+)
 from dyngs.data.synthetic.raytrace import Primitive, Sheet, is_seen
 from dyngs.data.synthetic.raytrace import Scene as TrueScene
 from dyngs.data.synthetic.scenes import SceneName, scene_at
@@ -65,7 +73,8 @@ REST = 1.0
 PER_MOVER, MOST_STILL = 1500, 3000
 """Points on the surface of each thing that moves, and of each that stands, at most."""
 DRAWN, LOOKS = 20_000, 16
-"""Points that are drawn per thing, of which those that one of so many training views sees are kept."""
+"""Points that are drawn per thing, of which those that one of so many training views sees are
+kept."""
 GONE = -30.0
 """Logit opacity by which what does not exist is dimmed."""
 POWERS, FREQUENCIES = 3, 2
@@ -74,7 +83,8 @@ POWERS, FREQUENCIES = 3, 2
 
 @dataclass(frozen=True)
 class Motion:
-    """A rigid or uniformly scaled motion x' = A x + b from the rest, or none where the thing does not exist."""
+    """A rigid or uniformly scaled motion x' = A x + b from the rest, or none where the thing does
+    not exist."""
 
     matrix: Tensor
     shift: Tensor
@@ -84,7 +94,9 @@ class Motion:
         """Return the motion of ``rest`` to ``now``, two states of one ball or box."""
         corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
         moved = now.placed(rest.local(corners)).astype(np.float64)
-        return Motion(torch.from_numpy((moved[1:] - moved[0]).T).float(), torch.from_numpy(moved[0]).float())
+        return Motion(
+            torch.from_numpy((moved[1:] - moved[0]).T).float(), torch.from_numpy(moved[0]).float()
+        )
 
     @property
     def scale(self) -> float:
@@ -101,7 +113,8 @@ class Motion:
 
 
 class TrueMotion(DeformationField):
-    """The motion of a synthetic scene as a field of which only the base colours over time are learned.
+    """The motion of a synthetic scene as a field of which only the base colours over time are
+    learned.
 
     Args:
         name: of the scene.
@@ -110,23 +123,34 @@ class TrueMotion(DeformationField):
     """
 
     def __init__(self, name: SceneName, labels: Tensor, setup: FieldSetup) -> None:
-        self.setup, terms = setup, POWERS + 2 * FREQUENCIES
+        self.setup = setup
+        terms = POWERS + 2 * FREQUENCIES
         start = {"colors": torch.zeros(setup.num_moving, terms, 3, device="cpu")}
         self.parameters = Parameters(start, {"colors": 1e-3}, 0.01, Role.PER_MOVING)
         self.labels, self.rest = labels, scene_at(name, REST).primitives
         self.primitives_at = cache(lambda time: scene_at(name, time).primitives)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """See ``DeformationField.offsets``; differentiable in ``means``, as rotations turn what they learn."""
-        x, turns = 2 * time - 1, [2 * np.pi * k * time for k in range(1, FREQUENCIES + 1)]
-        terms = [x**k for k in range(1, POWERS + 1)] + [f(angle) for angle in turns for f in (np.sin, np.cos)]
-        colors = torch.einsum("b,mbd->md", means.new_tensor(terms), chosen(self.parameters["colors"], rows))
-        labels, means = chosen(self.labels, rows), chosen(means, rows)
-        moved, quats = means.clone(), means.new_tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
-        scales, opacities = means.new_zeros(len(means), 3), means.new_zeros(len(means))
+        """See ``DeformationField.offsets``; differentiable in ``means``, as rotations turn what
+        they learn."""
+        x = 2 * time - 1
+        turns = [2 * np.pi * k * time for k in range(1, FREQUENCIES + 1)]
+        terms = [x**k for k in range(1, POWERS + 1)] + [
+            f(angle) for angle in turns for f in (np.sin, np.cos)
+        ]
+        colors = torch.einsum(
+            "b,mbd->md", means.new_tensor(terms), chosen(self.parameters["colors"], rows)
+        )
+        labels = chosen(self.labels, rows)
+        means = chosen(means, rows)
+        moved = means.clone()
+        quats = means.new_tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
+        scales = means.new_zeros(len(means), 3)
+        opacities = means.new_zeros(len(means))
         now = self.primitives_at(time)
         for label in self.labels.unique().tolist():
-            own, rest = torch.nonzero(labels == label)[:, 0], self.rest[label]
+            own = torch.nonzero(labels == label)[:, 0]
+            rest = self.rest[label]
             if label >= len(now):
                 opacities[own] = GONE
             elif isinstance(rest, Sheet):
@@ -137,7 +161,9 @@ class TrueMotion(DeformationField):
                 motion = Motion.between(rest, now[label])
                 moved = moved.index_copy(0, own, means[own] @ motion.matrix.T + motion.shift)
                 quats[own], scales[own] = motion.quat, float(np.log(motion.scale))
-        return Offsets(moved - means, quats - quats.new_tensor([1.0, 0, 0, 0]), scales, opacities, colors)
+        return Offsets(
+            moved - means, quats - quats.new_tensor([1.0, 0, 0, 0]), scales, opacities, colors
+        )
 
     def edited(self, edit: TopologyEdit) -> TrueMotion:
         field = self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
@@ -146,7 +172,8 @@ class TrueMotion(DeformationField):
 
 
 def _bent(rest: Sheet, now: Primitive, means: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how far a cloth has moved at ``means`` (R, 3), and the (R, 4) quaternions that turn its normals."""
+    """Return how far a cloth has moved at ``means`` (R, 3), and the (R, 4) quaternions that turn
+    its normals."""
     points = means.double().numpy()
     local = rest.local(points)
     shift = now.placed(local) - rest.placed(local)
@@ -174,7 +201,8 @@ class OracleTraining(StaticTraining):
 def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     """Return the trainer of the oracle of a scene; its capture must be that of ``config``."""
     model = StaticModel(sh_degree=config.model.sh_degree)
-    init, sizes = RandomInit(num_random=100), config.train.model_copy(update={"initial_downscale": 1})
+    init = RandomInit(num_random=100)
+    sizes = config.train.model_copy(update={"initial_downscale": 1})
     config = config.model_copy(update={"model": model, "init": init, "train": sizes})
     capture = read_capture(config.data)  # in the unit of the files, in which the true motion is
     trainer = assemble(config, capture)
@@ -187,22 +215,35 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     times = tuple(sorted(set(training_times(capture))))
     setup = FieldSetup(*box_of(gaussians, trainer.extent), len(times), len(moving), trainer.extent)
     scene = DynamicScene(
-        gaussians=gaussians, seen_at=times, field=TrueMotion(name, labels[moving], setup), moving=moving
+        gaussians=gaussians,
+        seen_at=times,
+        field=TrueMotion(name, labels[moving], setup),
+        moving=moving,
     )
     trainer.model.begin_with(scene, OracleTraining(config.train.steps))
     return trainer
 
 
-def surface_points(name: SceneName, views: Sequence[View], seed: int) -> tuple[np.ndarray, np.ndarray, Tensor]:
-    """Return points (P, 3) at rest that training views see, their colours (P, 3) uint8, and the primitive of each."""
-    random, rest = np.random.default_rng(seed), scene_at(name, REST)
+def surface_points(
+    name: SceneName, views: Sequence[View], seed: int
+) -> tuple[np.ndarray, np.ndarray, Tensor]:
+    """Return points (P, 3) at rest that training views see, their colours (P, 3) uint8, and the
+    primitive of each."""
+    random = np.random.default_rng(seed)
+    rest = scene_at(name, REST)
     looks = [views[i] for i in evenly_spaced(len(views), LOOKS)]
-    points, colours, labels = [], [], []
+    points = []
+    colours = []
+    labels = []
     for label, primitive in enumerate(rest.primitives):
         local = primitive.sampled(DRAWN if label not in rest.movers else 2 * PER_MOVER, random)
-        local = local[_seen(name, label, local, looks)][: PER_MOVER if label in rest.movers else MOST_STILL]
+        local = local[_seen(name, label, local, looks)][
+            : PER_MOVER if label in rest.movers else MOST_STILL
+        ]
         points.append(primitive.placed(local))
-        colours.append((255 * np.clip(0.8 * primitive.paint(local), 0, 1) ** (1 / 2.2)).astype(np.uint8))
+        colours.append(
+            (255 * np.clip(0.8 * primitive.paint(local), 0, 1) ** (1 / 2.2)).astype(np.uint8)
+        )
         labels += [label] * len(local)
     return np.concatenate(points), np.concatenate(colours), torch.tensor(labels, device="cpu")
 
@@ -221,7 +262,8 @@ def _seen(name: SceneName, label: int, local: np.ndarray, looks: Sequence[View])
 
 @dataclass(frozen=True)
 class Row:
-    """What is printed of a model: PSNR in dB of whole images and of parts, tracks in px, and Gaussians."""
+    """What is printed of a model: PSNR in dB of whole images and of parts, tracks in px, and
+    Gaussians."""
 
     psnr: float
     foreground: float | None
@@ -252,7 +294,9 @@ def measured(scene: GaussianScene, config: Config) -> Row:
     loader = ImageLoader(views, config.data)
     regions = Regions(views, loader, background)
     images = (loader[i] for i in range(len(loader)))
-    scores, _ = score_views(scene, images, scene.options, background, Lpips("alex", "not measured"), regions)
+    scores, _ = score_views(
+        scene, images, scene.options, background, Lpips("alex", "not measured"), regions
+    )
     cameras = training_cameras(views, config.data)
     truth = read_true_tracks(capture)
     pairs = list(zip(views, cameras, strict=True))
@@ -291,25 +335,31 @@ def oracle_row(name: SceneName, config: Config) -> Row:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("overrides", nargs="*")
     parser.add_argument("--scenes", default=",".join(get_args(SceneName)))
     parser.add_argument("--size", type=int, default=200)
     parser.add_argument("--views", type=int, default=48)
-    parser.add_argument("--style", choices=get_args(CaptureStyle), help="as dyngs data synth; one per FOLDER")
+    parser.add_argument(
+        "--style", choices=get_args(CaptureStyle), help="as dyngs data synth; one per FOLDER"
+    )
     given = parser.parse_intermixed_args(words)
     print("| scene | model | PSNR | foreground | moves | stands | tracks, px | Gaussians |")
     print("|---|---|---|---|---|---|---|---|")
     for name in get_args(SceneName):
         if name not in given.scenes.split(","):
             continue
-        root, run = given.folder / name, given.folder / f"{name}_run"
+        root = given.folder / name
+        run = given.folder / f"{name}_run"
         if not root.is_dir():
             options = DynamicOptions(size=given.size, num_times=given.views, style=given.style)
             write_dynamic_capture(name, root, options)
         config = load_config(PRESET, [*given.overrides, f"data.root={root}", f"run.dir={run}"])
-        learned, known = preset_row(config, run), oracle_row(name, config)
+        learned = preset_row(config, run)
+        known = oracle_row(name, config)
         for row, model in ((learned, "preset"), (known, "oracle"), (known.minus(learned), "gap")):
             print(row.line(name, model), flush=True)
 

@@ -1,13 +1,15 @@
 """Effect of pruning on a finished run, as a table in Markdown.
 
-    python benchmarks/prune.py RUN FOLDER [key=value ...] [--rows promise|where|stages|parts|scores] [--threads 1]
+    python benchmarks/prune.py RUN FOLDER [key=value ...] [--rows promise|where|stages|parts|scores]
+    [--threads 1]
 
-FOLDER keeps the pruned runs, which are reused. `promise`: `dyngs prune --max-loss X` for each of --max-loss, drawn from
-the file. `where`: the bytes of each tensor, and the time of each part of an image. `stages`: a fraction of 0.8 pruned,
-fine-tuned, and stored by `dyngs export --format dyngs`. `parts` compares pruning alone, masks alone and both, with and
-without fine-tuning (one step); `scores` compares the scores. Overrides (prune.steps=500, ...) apply to all rows.
-Columns: Gaussians, PSNR of 20 training views and of the whole test split, speed relative to RUN, MB as float32 and as
-stored.
+FOLDER keeps the pruned runs, which are reused. `promise`: `dyngs prune --max-loss X` for each of
+--max-loss, drawn from the file. `where`: the bytes of each tensor, and the time of each part of an
+image. `stages`: a fraction of 0.8 pruned, fine-tuned, and stored by `dyngs export --format dyngs`.
+`parts` compares pruning alone, masks alone and both, with and without fine-tuning (one step);
+`scores` compares the scores. Overrides (prune.steps=500, ...) apply to all rows. Columns:
+Gaussians, PSNR of 20 training views and of the whole test split, speed relative to RUN, MB as
+float32 and as stored.
 """
 
 from __future__ import annotations
@@ -43,13 +45,16 @@ ROWS = {
         "both": (),
         "both, not fine-tuned": (ONCE,),
     },
-    "scores": {name: (f"prune.score={name}",) for name in ("sensitivity", "contribution", "variation")},
+    "scores": {
+        name: (f"prune.score={name}",) for name in ("sensitivity", "contribution", "variation")
+    },
 }
 
 
 def line(name: str, run: Path, cost: Cost, before: Cost, threads: int) -> str:
     """Return a row of the table without its last column."""
-    test, faster = evaluate_run(run, threads=threads).psnr, cost.fps / before.fps
+    test = evaluate_run(run, threads=threads).psnr
+    faster = cost.fps / before.fps
     quality = f"{cost.psnr_train:.2f} | {test:.2f}"
     return f"| {name} | {cost.num_gaussians} | {quality} | {faster:.2f} | {cost.megabytes:.2f} |"
 
@@ -76,8 +81,10 @@ def promises(given: argparse.Namespace) -> None:
 
 
 def where(given: argparse.Namespace) -> None:
-    """Print bytes by tensor, and the time of an image by part (processor time of one thread, medians)."""
-    run, folder = load_run(given.run_dir), given.folder / "stored"
+    """Print bytes by tensor, and the time of an image by part (processor time of one thread,
+    medians)."""
+    run = load_run(given.run_dir)
+    folder = given.folder / "stored"
     file = read_scene(write_scene_file(given.run_dir, folder).path)
     exact = {name: x.numel() * x.itemsize for name, x in drawable(run.scene).items()}
     print("| tensor | float | stored |\n|---|---|---|")
@@ -95,7 +102,10 @@ def where(given: argparse.Namespace) -> None:
             moments = [scene.time_step(p.time) for p in images]
             moved = milliseconds([lambda p=p, s=scene: s.time_step(p.time) for p in images])
             drawn = milliseconds(
-                [lambda p=p, m=m, s=scene: s.render(p.cameras, m) for p, m in zip(images, moments, strict=True)]
+                [
+                    lambda p=p, m=m, s=scene: s.render(p.cameras, m)
+                    for p, m in zip(images, moments, strict=True)
+                ]
             )
             print(f"| {name}: moved to its time | {moved:.2f} |\n| {name}: drawn | {drawn:.2f} |")
 
@@ -111,7 +121,9 @@ def milliseconds(calls: list[Callable[[], object]], rounds: int = 5) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("overrides", nargs="*")
@@ -122,7 +134,9 @@ def main() -> None:
     if given.rows == "where":
         where(given)
         return
-    print("| | Gaussians | train dB | test dB | times as fast | MB | stored |\n|---|---|---|---|---|---|---|")
+    print(
+        "| | Gaussians | train dB | test dB | times as fast | MB | stored |\n|---|---|---|---|---|---|---|"
+    )
     if given.rows == "promise":
         promises(given)
         return

@@ -1,11 +1,14 @@
-"""Poses found by `dyngs data sfm` beside those that captures come with, and what is trained from both.
+"""Poses found by `dyngs data sfm` beside those that captures come with, and what is trained from
+both.
 
-    python benchmarks/sfm.py FOLDER CAPTURE... [--video NAME,...] [--train STEPS] [--side PX] [--threads N] [key=value]
+    python benchmarks/sfm.py FOLDER CAPTURE... [--video NAME,...] [--train STEPS] [--side PX]
+    [--threads N] [key=value]
 
-The images of each capture are copied, shrunk to PX on their longest side, without their poses; those of captures
-named by --video become a video. Poses are estimated, aligned with the given ones by a similarity, and compared: the
-distance of camera centres as a fraction of the span (the largest distance of two given centres). With --train both are
-trained at PX with the given overrides and measured on the same images: every eighth one. FOLDER keeps all of it.
+The images of each capture are copied, shrunk to PX on their longest side, without their poses;
+those of captures named by --video become a video. Poses are estimated, aligned with the given ones
+by a similarity, and compared: the distance of camera centres as a fraction of the span (the largest
+distance of two given centres). With --train both are trained at PX with the given overrides and
+measured on the same images: every eighth one. FOLDER keeps all of it.
 """
 
 from __future__ import annotations
@@ -45,7 +48,8 @@ def shrunk(view: View, side: int) -> np.ndarray:
 
 
 def unposed(views: Sequence[View], folder: Path, side: int, video: bool) -> Path:
-    """Write the images without their poses; return the folder or the video, whose frames are sorted by name."""
+    """Write the images without their poses; return the folder or the video, whose frames are sorted
+    by name."""
     if video:
         path = folder.with_suffix(".mp4")
         if not path.exists():
@@ -67,10 +71,12 @@ def centres(views: Sequence[View], names: Sequence[str]) -> dict[str, np.ndarray
 
 
 def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> np.ndarray:
-    """Return distances of centres after a similarity, as fractions of the span of the given ones."""
+    """Return distances of centres after a similarity, as fractions of the span of the given
+    ones."""
     names = sorted(found.keys() & given.keys())
     x, y = (np.array([centre[name] for name in names]) for centre in (found, given))
-    a, b = x - x.mean(0), y - y.mean(0)
+    a = x - x.mean(0)
+    b = y - y.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
     scale = (s * signs).sum() / (a**2).sum()
@@ -88,16 +94,27 @@ def trained(root: Path, run: Path, preset: str, overrides: Sequence[str]) -> flo
 def row(capture: Path, options: argparse.Namespace, overrides: Sequence[str]) -> str:
     """Return the row of the table for a capture."""
     video = capture.name in options.video.split(",")
-    views = sorted(all_views(read_capture(DataConfig(root=capture)).splits), key=lambda view: view.image_path.stem)
+    views = sorted(
+        all_views(read_capture(DataConfig(root=capture)).splits),
+        key=lambda view: view.image_path.stem,
+    )
     name = f"{capture.name}_{options.side}"
     source = unposed(views, options.folder / name, options.side, video)
-    out, figures = options.folder / f"{name}_posed", options.folder / f"{name}_sfm.json"
+    out = options.folder / f"{name}_posed"
+    figures = options.folder / f"{name}_sfm.json"
     if not figures.exists():
-        before, begun = resource.getrusage(resource.RUSAGE_SELF), time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_SELF)
+        begun = time.perf_counter()
         result = estimate_poses(source, out, SfmOptions(num_threads=options.threads))
         after = resource.getrusage(resource.RUSAGE_SELF)
         cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-        fields = [time.perf_counter() - begun, cpu, result.num_registered, result.num_images, result.mean_error_px]
+        fields = [
+            time.perf_counter() - begun,
+            cpu,
+            result.num_registered,
+            result.num_images,
+            result.mean_error_px,
+        ]
         figures.write_text(json.dumps([*fields, result.mapper]))
     seconds, cpu, registered, count, error_px, mapper = json.loads(figures.read_text())
     posed = all_views(read_capture(DataConfig(root=out)).splits)
@@ -110,13 +127,17 @@ def row(capture: Path, options: argparse.Namespace, overrides: Sequence[str]) ->
         preset = "dynamic" if video else "static"
         keys = [f"train.steps={options.train}", f"data.longest_side={options.side}", *overrides]
         roots = (("given", capture), ("found", out))
-        given, found = (trained(root, options.folder / f"{name}_{kind}", preset, keys) for kind, root in roots)
+        given, found = (
+            trained(root, options.folder / f"{name}_{kind}", preset, keys) for kind, root in roots
+        )
         text += f"| {given:.2f} dB | {found:.2f} dB "
     return text + "|"
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("words", nargs="+", help="captures, and key=value")
     parser.add_argument("--video", default="", help="names of captures whose images become a video")
@@ -126,7 +147,13 @@ def main(words: Sequence[str] | None = None) -> None:
     options = parser.parse_intermixed_args(words)
     options.folder.mkdir(parents=True, exist_ok=True)
     overrides = [word for word in options.words if "=" in word]
-    columns = ["capture", "seconds (CPU)", "registered", "error", "centres, mean and max of the span"]
+    columns = [
+        "capture",
+        "seconds (CPU)",
+        "registered",
+        "error",
+        "centres, mean and max of the span",
+    ]
     columns += ["PSNR, given poses", "PSNR, found poses"] if options.train else []
     print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     for word in options.words:

@@ -56,7 +56,8 @@ class Avatar:
 
 
 def read_avatar(path: Path, gamma: float) -> Avatar:
-    """Read the skinned meshes of a ``.glb``; ``gamma`` is the power that sRGB values of textures are raised to.
+    """Read the skinned meshes of a ``.glb``; ``gamma`` is the power that sRGB values of textures
+    are raised to.
 
     Raises:
         DyngsError: no skin, joints of an unknown rig, or a person who does not face +z.
@@ -67,7 +68,9 @@ def read_avatar(path: Path, gamma: float) -> Avatar:
     node_ids = list(document["skins"][0]["joints"]) if document.get("skins") else []
     if not node_ids:
         raise DyngsError(f"{path}: has no skin; export the person with its skeleton")
-    parts: dict[str, list[np.ndarray]] = {key: [] for key in ("vertices", "normals", "uv", "weights", "faces", "paint")}
+    parts: dict[str, list[np.ndarray]] = {
+        key: [] for key in ("vertices", "normals", "uv", "weights", "faces", "paint")
+    }
     textures: list[np.ndarray] = []
     used: dict[int, int] = {}
     for node in document["nodes"]:
@@ -84,16 +87,22 @@ def read_avatar(path: Path, gamma: float) -> Avatar:
                 textures.append(_texture(document, binary, material) ** gamma)
             start = sum(map(len, parts["vertices"]))
             _add_piece(file, piece, rest, rows, len(node_ids), parts)
-            parts["faces"].append(file.numbers(piece["indices"], "SCALAR").astype(np.int64).reshape(-1, 3) + start)
+            parts["faces"].append(
+                file.numbers(piece["indices"], "SCALAR").astype(np.int64).reshape(-1, 3) + start
+            )
             parts["paint"].append(np.full(len(parts["faces"][-1]), used[material]))
     joints = np.stack([world[j][:3, 3] for j in node_ids])
     parents, order = _tree(file, node_ids)
     names = [document["nodes"][j].get("name", "") for j in node_ids]
-    named = match_joints(path, names) | {f"{x.lower()}_eye": names.index(f"{x}Eye") for x in _eyes(names)}
+    named = match_joints(path, names) | {
+        f"{x.lower()}_eye": names.index(f"{x}Eye") for x in _eyes(names)
+    }
     if joints[named["left_hip"], 0] <= joints[named["right_hip"], 0]:
         raise DyngsError(f"{path}: the person does not face +z at rest; turn it")
     whole = {key: np.concatenate(values) for key, values in parts.items()}
-    return Avatar(**whole, textures=tuple(textures), joints=joints, parents=parents, order=order, named=named)
+    return Avatar(
+        **whole, textures=tuple(textures), joints=joints, parents=parents, order=order, named=named
+    )
 
 
 def _eyes(names: list[str]) -> list[str]:
@@ -101,9 +110,15 @@ def _eyes(names: list[str]) -> list[str]:
 
 
 def _add_piece(
-    file: GltfFile, piece: dict, rest: np.ndarray, rows: list[int], joints: int, parts: dict[str, list[np.ndarray]]
+    file: GltfFile,
+    piece: dict,
+    rest: np.ndarray,
+    rows: list[int],
+    joints: int,
+    parts: dict[str, list[np.ndarray]],
 ) -> None:
-    """Add the vertices of a primitive, skinned by ``rest`` (S', 4, 4) of the joints ``rows`` (S') of all ``joints``."""
+    """Add the vertices of a primitive, skinned by ``rest`` (S', 4, 4) of the joints ``rows`` (S')
+    of all ``joints``."""
     given = piece["attributes"]
     points, normals = (file.numbers(given[key], "VEC3") for key in ("POSITION", "NORMAL"))
     fraction = file.numbers(given["WEIGHTS_0"], "VEC4")
@@ -112,7 +127,9 @@ def _add_piece(
     fraction = fraction / fraction.sum(axis=1, keepdims=True)
     np.add.at(weights, (np.arange(len(points))[:, None], np.array(rows)[owner]), fraction)
     blended = np.einsum("mk,mkij->mij", fraction, rest[owner])
-    parts["vertices"].append(np.einsum("mij,mj->mi", blended[:, :3, :3], points) + blended[:, :3, 3])
+    parts["vertices"].append(
+        np.einsum("mij,mj->mi", blended[:, :3, :3], points) + blended[:, :3, 3]
+    )
     parts["normals"].append(normalized(np.einsum("mij,mj->mi", blended[:, :3, :3], normals)))
     parts["uv"].append(file.numbers(given["TEXCOORD_0"], "VEC2"))
     parts["weights"].append(weights)
@@ -126,9 +143,12 @@ def _chunks(path: Path) -> tuple[dict, bytes]:
 
 
 def _texture(document: dict, binary: bytes, material: int) -> np.ndarray:
-    """Return the colours (H, W, 3) in [0, 1] of a material, averaged down to at most 1024 texels per side."""
+    """Return the colours (H, W, 3) in [0, 1] of a material, averaged down to at most 1024 texels
+    per side."""
     base = document["materials"][material]["pbrMetallicRoughness"]
-    view = document["images"][document["textures"][base["baseColorTexture"]["index"]]["source"]]["bufferView"]
+    view = document["images"][document["textures"][base["baseColorTexture"]["index"]]["source"]][
+        "bufferView"
+    ]
     place = document["bufferViews"][view]
     start = place.get("byteOffset", 0)
     image = Image.open(io.BytesIO(binary[start : start + place["byteLength"]])).convert("RGB")
@@ -160,7 +180,8 @@ def _node_matrices(file: GltfFile) -> list[np.ndarray]:
 
 
 def _tree(file: GltfFile, node_ids: list[int]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Return the parents (S,) of the joints, -1 for a root, and the joints in an order with parents first."""
+    """Return the parents (S,) of the joints, -1 for a root, and the joints in an order with parents
+    first."""
     row = {node: i for i, node in enumerate(node_ids)}
     parents = np.full(len(node_ids), -1)
     for node, i in row.items():
@@ -173,8 +194,11 @@ def _tree(file: GltfFile, node_ids: list[int]) -> tuple[np.ndarray, tuple[int, .
     return parents, tuple(order)
 
 
-def posed_mesh(avatar: Avatar, rotations: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices and normals (M, 3) of a frame with world rotations (S, 3, 3) and joints (S, 3)."""
+def posed_mesh(
+    avatar: Avatar, rotations: np.ndarray, joints: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and normals (M, 3) of a frame with world rotations (S, 3, 3) and joints
+    (S, 3)."""
     shifts = joints - np.einsum("sij,sj->si", rotations, avatar.joints)
     turned = (avatar.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
     vertices = np.einsum("mij,mj->mi", turned, avatar.vertices) + avatar.weights @ shifts

@@ -2,10 +2,11 @@
 
     python benchmarks/sky.py FOLDER CAPTURE... [key=value ...]
 
-Copies of each capture, whose images must have alpha, are put before a procedural sky. `infinite`: clouds and hills that
-depend on the direction of the ray alone. `ridges`: that sky behind five ridges, 30 to 100 times as far as the cameras
-are from their centre. Points are in silhouettes, and as far as structure from motion finds them. Printed are Gaussians,
-those more than ten times as far as the farthest camera, and held-out PSNR: whole, where there is sky, and the rest.
+Copies of each capture, whose images must have alpha, are put before a procedural sky. `infinite`:
+clouds and hills that depend on the direction of the ray alone. `ridges`: that sky behind five
+ridges, 30 to 100 times as far as the cameras are from their centre. Points are in silhouettes, and
+as far as structure from motion finds them. Printed are Gaussians, those more than ten times as far
+as the farthest camera, and held-out PSNR: whole, where there is sky, and the rest.
 """
 
 from __future__ import annotations
@@ -46,15 +47,23 @@ FAR_POINTS = 60  # per view
 
 def _noise(points: np.ndarray, frequency: float, seed: int) -> np.ndarray:
     """Return smooth noise (...,) in about [-1, 1] of ``points`` (..., 3)."""
-    random, total = np.random.default_rng(seed), np.zeros(points.shape[:-1], np.float32)
+    random = np.random.default_rng(seed)
+    total = np.zeros(points.shape[:-1], np.float32)
     for octave in range(3):
         waves = random.normal(size=(3, 8)) * frequency * 2**octave
-        total += 0.5**octave * np.cos(points @ waves.astype(np.float32) + random.uniform(0, 6.28, 8)).sum(-1) / 3
+        total += (
+            0.5**octave
+            * np.cos(points @ waves.astype(np.float32) + random.uniform(0, 6.28, 8)).sum(-1)
+            / 3
+        )
     return total / 2
 
 
-def far_colours(rays: np.ndarray, origin: np.ndarray, distances: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours (..., 3) and distances (...) of unit ``rays`` (..., 3) from ``origin`` (3,), z up, centre at 0."""
+def far_colours(
+    rays: np.ndarray, origin: np.ndarray, distances: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return colours (..., 3) and distances (...) of unit ``rays`` (..., 3) from ``origin`` (3,), z
+    up, centre at 0."""
     up = rays[..., 2] / np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-6)
     height = np.clip((up - HORIZON) / 1.5, 0, 1)[..., None]
     sky = (1 - height) * np.array([0.78, 0.85, 0.95]) + height * np.array([0.2, 0.42, 0.8])
@@ -63,15 +72,21 @@ def far_colours(rays: np.ndarray, origin: np.ndarray, distances: tuple[float, ..
     depth = np.full(rays.shape[:-1], 1e6)
     for k, far in reversed(list(enumerate(distances))):
         flat = rays[..., :2]
-        a, b, c = (flat**2).sum(-1), flat @ origin[:2], (origin[:2] ** 2).sum() - far**2
+        a = (flat**2).sum(-1)
+        b = flat @ origin[:2]
+        c = (origin[:2] ** 2).sum() - far**2
         hit = origin + rays * ((np.sqrt(b**2 - a * c) - b) / np.maximum(a, 1e-9))[..., None]
         azimuth = np.arctan2(hit[..., 1], hit[..., 0])
         random = np.random.default_rng(k)
-        ridge = sum(np.sin(n * azimuth + random.uniform(0, 6.28)) / n for n in (3, 5, 8, 13, 21, 34))
+        ridge = sum(
+            np.sin(n * azimuth + random.uniform(0, 6.28)) / n for n in (3, 5, 8, 13, 21, 34)
+        )
         top = HORIZON + 0.1 * (ridge + k - len(distances) + 1)
         shade = 0.75 + 0.25 * _noise((hit / far).astype(np.float32), 12, 10 + k)
         haze = k / max(len(distances), 2)
-        own = ((1 - haze) * np.array([0.25, 0.4, 0.15]) + haze * np.array([0.5, 0.6, 0.75])) * shade[..., None]
+        own = (
+            (1 - haze) * np.array([0.25, 0.4, 0.15]) + haze * np.array([0.5, 0.6, 0.75])
+        ) * shade[..., None]
         is_hit = hit[..., 2] / far < top
         colours = np.where(is_hit[..., None], own, colours)
         depth = np.where(is_hit, np.linalg.norm(hit - origin, axis=-1), depth)
@@ -80,15 +95,21 @@ def far_colours(rays: np.ndarray, origin: np.ndarray, distances: tuple[float, ..
 
 def rays_of(view: View, pixels: np.ndarray) -> np.ndarray:
     """Return unit rays (..., 3) of ``pixels`` (..., 2) in the world."""
-    rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1) @ np.linalg.inv(view.intrinsics).T
+    rays = (
+        np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1)
+        @ np.linalg.inv(view.intrinsics).T
+    )
     rays = (rays @ view.cam_from_world[:3, :3]).astype(np.float32)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def behind(view: View, centre: np.ndarray, scale: float, distances: tuple[float, ...]) -> np.ndarray:
+def behind(
+    view: View, centre: np.ndarray, scale: float, distances: tuple[float, ...]
+) -> np.ndarray:
     """Return what a view (H, W, 3) sees of what is far."""
     n = SAMPLES
-    x, y = (np.arange(view.width * n) + 0.5) / n, (np.arange(view.height * n) + 0.5) / n
+    x = (np.arange(view.width * n) + 0.5) / n
+    y = (np.arange(view.height * n) + 0.5) / n
     rays = rays_of(view, np.stack(np.meshgrid(x, y), -1))
     origin = ((camera_center(view.cam_from_world) - centre) / scale).astype(np.float32)
     colours, _ = far_colours(rays, origin, distances)
@@ -96,7 +117,8 @@ def behind(view: View, centre: np.ndarray, scale: float, distances: tuple[float,
 
 
 def far_points(view: View, centre: np.ndarray, scale: float, kind: str, seed: int) -> PointCloud:
-    """Return points as structure from motion finds them: up to 76 times as far as the cameras are from their centre."""
+    """Return points as structure from motion finds them: up to 76 times as far as the cameras are
+    from their centre."""
     random = np.random.default_rng(seed)
     rays = rays_of(view, random.random((FAR_POINTS, 2)) * (view.width, view.height))
     origin = (camera_center(view.cam_from_world) - centre) / scale
@@ -122,13 +144,15 @@ def with_sky(capture: Path, out: Path, kind: str) -> None:
         write_image(view.image_path, np.round(255 * mixed.clip(0, 1)).astype(np.uint8))
     clouds = [far_points(view, centre, scale, kind, i) for i, view in enumerate(splits["train"])]
     clouds += [near] if near is not None else []
-    xyz, rgb = np.concatenate([x.xyz for x in clouds]), np.concatenate([x.rgb for x in clouds])
+    xyz = np.concatenate([x.xyz for x in clouds])
+    rgb = np.concatenate([x.rgb for x in clouds])
     trimesh.PointCloud(xyz, colors=rgb).export(out / "points3D.ply")
     _as_nerfstudio(out, splits)
 
 
 def _as_nerfstudio(out: Path, splits: Splits) -> None:
-    """Write the poses anew as ``transforms.json``: NeRF-synthetic says that all lies in a cube around the origin."""
+    """Write the poses anew as ``transforms.json``: NeRF-synthetic says that all lies in a cube
+    around the origin."""
     frames = []
     for view in (view for views in splits.values() for view in views):
         pose = inverse_rigid(view.cam_from_world) * np.array([1, -1, -1, 1])
@@ -137,7 +161,8 @@ def _as_nerfstudio(out: Path, splits: Splits) -> None:
         path = view.image_path.relative_to(out).as_posix()
         frames.append({"file_path": path, "transform_matrix": pose.tolist(), **size})
     lists = {
-        f"{name}_filenames": [v.image_path.relative_to(out).as_posix() for v in views] for name, views in splits.items()
+        f"{name}_filenames": [v.image_path.relative_to(out).as_posix() for v in views]
+        for name, views in splits.items()
     }
     for path in out.glob("transforms_*.json"):
         path.unlink()
@@ -148,20 +173,25 @@ def _as_nerfstudio(out: Path, splits: Splits) -> None:
 def scores(run: Path, capture: Path) -> str:
     """Return a row about a run; ``capture`` has the alpha."""
     loaded = load_run(run)
-    gaussians, config = require_gaussians(loaded.scene, str(run)).at(None), loaded.config
+    gaussians = require_gaussians(loaded.scene, str(run)).at(None)
+    config = loaded.config
     centres = torch.stack([image.cameras.centers[0] for image in _images(config.data, "train")])
     middle = centres.mean(0)
     reach = 10 * (centres - middle).norm(dim=1).max()
     far = int(((gaussians.means - middle).norm(dim=1) > reach).sum())
     found: list[list[float]] = []
     for image, cut in zip(
-        _images(config.data, "test"), _images(config.data.model_copy(update={"root": capture}), "test"), strict=True
+        _images(config.data, "test"),
+        _images(config.data.model_copy(update={"root": capture}), "test"),
+        strict=True,
     ):
         black = torch.zeros(3, device="cpu")
         shown = loaded.scene.render(image.cameras, None, background=black).rgb[0]
         assert cut.alpha is not None
         is_sky = (cut.alpha < 0.01).float()
-        found.append([psnr(shown, image.composite(black), mask) for mask in (None, is_sky, 1 - is_sky)])
+        found.append(
+            [psnr(shown, image.composite(black), mask) for mask in (None, is_sky, 1 - is_sky)]
+        )
     means = (f"{fmean(x):.2f}" for x in zip(*found, strict=True))
     return f"{run.name}: {len(gaussians):,} Gaussians, {far:,} far; whole, sky, rest: {', '.join(means)} dB"
 
@@ -177,10 +207,16 @@ def main(folder: Path, captures: Sequence[Path], overrides: Sequence[str]) -> No
             copy, run = (folder / f"{name}_{capture.name}_{kind}" for name in ("capture", "run"))
             if not copy.exists():
                 with_sky(capture, copy, kind)
-            train(load_config(packaged_preset("static"), [f"data.root={copy}", f"run.dir={run}", *overrides]))
+            train(
+                load_config(
+                    packaged_preset("static"), [f"data.root={copy}", f"run.dir={run}", *overrides]
+                )
+            )
             print(scores(run, capture), flush=True)
 
 
 if __name__ == "__main__":
     given = sys.argv[2:]
-    main(Path(sys.argv[1]), [Path(x) for x in given if "=" not in x], [x for x in given if "=" in x])
+    main(
+        Path(sys.argv[1]), [Path(x) for x in given if "=" not in x], [x for x in given if "=" in x]
+    )

@@ -1,18 +1,22 @@
-"""Soak test: kills, full disks and too little memory must not lose or change a run, or leave files behind.
+"""Soak test: kills, full disks and too little memory must not lose or change a run, or leave files
+behind.
 
-    python benchmarks/soak.py [--kills 500] [--minutes 60] [--seed 0] [--jobs static,dynamic,prune,export]
+    python benchmarks/soak.py [--kills 500] [--minutes 60] [--seed 0] [--jobs
+    static,dynamic,prune,export]
 
-Every round starts a tiny run (16 px; a static one, one with moving Gaussians, one with a size limit, the pruning or
-the export of a finished one), and kills it with SIGKILL: at a random time, right before one of its file operations,
-or within a few milliseconds of one, so that saves are hit. It is then continued as a person would (`train --resume`,
-or the same command if there is nothing to resume), killed again, and finally left to finish. Other rounds meet a full
-disk (a small tmpfs where that can be mounted, otherwise a limit on the size of files), too little memory, or a second
-process with the same command. After each interruption the run must load if it has a checkpoint; the error of a failed
-command must be one line; in the end all files must have the bytes of an uninterrupted run (the log: all but its
-seconds) and there must be no other files. Prints a table in Markdown; exit code 1 if anything was lost.
+Every round starts a tiny run (16 px; a static one, one with moving Gaussians, one with a size
+limit, the pruning or the export of a finished one), and kills it with SIGKILL: at a random time,
+right before one of its file operations, or within a few milliseconds of one, so that saves are hit.
+It is then continued as a person would (`train --resume`, or the same command if there is nothing to
+resume), killed again, and finally left to finish. Other rounds meet a full disk (a small tmpfs
+where that can be mounted, otherwise a limit on the size of files), too little memory, or a second
+process with the same command. After each interruption the run must load if it has a checkpoint; the
+error of a failed command must be one line; in the end all files must have the bytes of an
+uninterrupted run (the log: all but its seconds) and there must be no other files. Prints a table in
+Markdown; exit code 1 if anything was lost.
 
-One process imports everything and forks for every command. It uses one thread, so that the children may use theirs.
-The same seed makes the same choices, but not the same timing. Linux and macOS.
+One process imports everything and forks for every command. It uses one thread, so that the children
+may use theirs. The same seed makes the same choices, but not the same timing. Linux and macOS.
 """
 
 from __future__ import annotations
@@ -45,7 +49,15 @@ from dyngs.config.io import RESOLVED_NAME
 from dyngs.runs.checkpoint import checkpoint_paths, has_only_scene_file, load_run
 from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
 
-OPERATIONS = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fcntl.flock", "shutil.rmtree")
+OPERATIONS = (
+    "os.rename",
+    "os.remove",
+    "os.mkdir",
+    "os.rmdir",
+    "os.truncate",
+    "fcntl.flock",
+    "shutil.rmtree",
+)
 WRITES = os.O_WRONLY | os.O_RDWR
 PATIENCE = 300.0
 """Seconds after which a command counts as hung."""
@@ -54,7 +66,9 @@ COMMON = (
     "run.threads=1 run.seed=3 init.kind=random train.log_every=1 model.sh_degree=1 strategy.kind=default "
     "strategy.start=1 strategy.every=3 strategy.grad_threshold=1e-6 strategy.max_gaussians=300"
 )
-STATIC = f"train static {COMMON} data.root=still init.num_random=150 train.steps=14 train.save_every=2"
+STATIC = (
+    f"train static {COMMON} data.root=still init.num_random=150 train.steps=14 train.save_every=2"
+)
 DYNAMIC = (
     f"train dynamic {COMMON} data.root=moving init.num_random=150 model.num_random_moving=40 train.steps=18 "
     "train.save_every=3 train.initial_downscale=1"
@@ -139,19 +153,23 @@ class Trap:
             self._act()
 
 
-def forked(words: str, out: Path, prepare: Callable[[], Trap | None], meet: Callable[[int, int], None]) -> End:
+def forked(
+    words: str, out: Path, prepare: Callable[[], Trap | None], meet: Callable[[int, int], None]
+) -> End:
     """Run ``dyngs WORDS`` in a child process, with ``out`` for ``OUT``, and return how it ended.
 
     Args:
         words: of the command.
         out: a folder that must load before, if it holds a checkpoint.
-        prepare: called in the child before it begins; it may write bytes to file 3, and return a trap whose count is
-            wanted.
+        prepare: called in the child before it begins; it may write bytes to file 3, and return a
+            trap whose count is wanted.
         meet: called in the parent with the child's number and the file at which those bytes arrive.
     """
-    opened, name = tempfile.mkstemp(prefix="soak-stderr-")  # not beside `out`, whose disk may be full
+    # not beside `out`, whose disk may be full
+    opened, name = tempfile.mkstemp(prefix="soak-stderr-")
     os.close(opened)
-    errors, start = Path(name), time.perf_counter()
+    errors = Path(name)
+    start = time.perf_counter()
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -170,7 +188,9 @@ def forked(words: str, out: Path, prepare: Callable[[], Trap | None], meet: Call
     return End(os.waitstatus_to_exitcode(status), said, time.perf_counter() - start, operations)
 
 
-def _be_child(words: str, out: Path, files: tuple[Path, int], prepare: Callable[[], Trap | None]) -> None:
+def _be_child(
+    words: str, out: Path, files: tuple[Path, int], prepare: Callable[[], Trap | None]
+) -> None:
     code = LOST_CODE
     try:
         error_file = os.open(files[0], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -217,7 +237,8 @@ def left_alone(words: str, out: Path) -> End:
 
 def killed(words: str, out: Path, kind: str, dice: random.Random, reference: Reference) -> End:
     """Run a command and kill it; return how it ended."""
-    fraction = dice.uniform(0, 0.6) if checkpoint_paths(out) else dice.random()  # the rest takes less than the whole
+    # the rest takes less than the whole
+    fraction = dice.uniform(0, 0.6) if checkpoint_paths(out) else dice.random()
     at = 1 + int(fraction * reference.end.operations)
     after = fraction * reference.end.seconds if kind == "any moment" else dice.uniform(0, 0.004)
 
@@ -237,7 +258,11 @@ def killed(words: str, out: Path, kind: str, dice: random.Random, reference: Ref
             time.sleep(after)
             os.kill(pid, signal.SIGKILL)
 
-    prepare = {"any moment": nothing, "before a file operation": at_once, "around a file operation": soon}[kind]
+    prepare = {
+        "any moment": nothing,
+        "before a file operation": at_once,
+        "around a file operation": soon,
+    }[kind]
     return forked(words, out, prepare, kill)
 
 
@@ -271,10 +296,12 @@ def differences(out: Path, reference: Path) -> list[str]:
     """Return what is wrong with a finished run; training times may differ."""
     problems = []
     there, wanted = (
-        {str(f.relative_to(folder)) for folder in (root,) for f in folder.rglob("*")} for root in (out, reference)
+        {str(f.relative_to(folder)) for folder in (root,) for f in folder.rglob("*")}
+        for root in (out, reference)
     )
     problems += [f"left over: {name}" for name in sorted(there - wanted)]
-    # The file of a pruned run comes at the end of `dyngs prune`; an interrupted one that is trained on has none.
+    # The file of a pruned run comes at the end of `dyngs prune`; an interrupted one that is trained
+    # on has none.
     missing = [name for name in sorted(wanted - there) if Path(name).parts[0] != EXPORT_FOLDER]
     problems += [f"missing: {name}" for name in missing]
     problems += [f"left over beside it: {f.name}" for f in out.parent.iterdir() if f != out]
@@ -292,7 +319,9 @@ def told(file: Path) -> object:
     if file.name == "timing.json":
         return list(json.loads(file.read_text())["seconds_train"])
     if file.name in (RESOLVED_NAME, ASKED_NAME):
-        return [line for line in file.read_text().splitlines() if not line.strip().startswith("dir:")]
+        return [
+            line for line in file.read_text().splitlines() if not line.strip().startswith("dir:")
+        ]
     return file.read_bytes()
 
 
@@ -307,10 +336,13 @@ class Soak:
             moves = any("moving" in JOBS[job] for job in jobs)
             sources = [words for name, words in SOURCES.items() if moves or "moving" not in name]
             for words in (*sources, JOBS["export"].replace("OUT", "stored")):
-                if dyngs(words.split()) != 0:  # in this process, which imports all that the children need
+                if dyngs(words.split()) != 0:
+                    # in this process, which imports all that the children need
                     raise SystemExit(f"dyngs {words} failed")
         if Path("/proc/self/task").exists() and len(list(Path("/proc/self/task").iterdir())) > 1:
-            raise SystemExit("this process has several threads, which a child would wait for in vain")
+            raise SystemExit(
+                "this process has several threads, which a child would wait for in vain"
+            )
         for job in jobs:
             (folder / "reference").mkdir(exist_ok=True)
             out = folder / "reference" / job.replace(" ", "_")
@@ -324,10 +356,15 @@ class Soak:
 
     def kill_round(self, job: str, kills: int) -> None:
         """Kill a run up to so many times, then let it finish."""
-        tally, out = self.tallies[job], self._new()
+        tally = self.tallies[job]
+        out = self._new()
         for _ in range(kills):
-            kind = self.dice.choice(("any moment", "before a file operation", "around a file operation"))
-            end = killed(next_command(job, out, self.dice), out, kind, self.dice, self.references[job])
+            kind = self.dice.choice(
+                ("any moment", "before a file operation", "around a file operation")
+            )
+            end = killed(
+                next_command(job, out, self.dice), out, kind, self.dice, self.references[job]
+            )
             if end.code == -signal.SIGKILL:
                 tally.counts["kills"] += 1
                 tally.counts[kind] += 1
@@ -337,7 +374,8 @@ class Soak:
 
     def limit_round(self, job: str, kind: str) -> None:
         """Run into a limit, then finish without it."""
-        tally, out = self.tallies[job], self._new()
+        tally = self.tallies[job]
+        out = self._new()
         if kind == "disk":
             self._on_full_disk(job, out)
             return
@@ -350,7 +388,9 @@ class Soak:
         """Run into a full disk, then finish with more space."""
         disk = out.parent
         size = self.dice.randrange(8, 160)
-        if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", disk], check=False).returncode:
+        if subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", disk], check=False
+        ).returncode:
             raise SystemExit("a tmpfs could be mounted before, and cannot now")
         try:
             end = forked(next_command(job, out, self.dice), out, nothing, alone)
@@ -362,8 +402,10 @@ class Soak:
             subprocess.run(["umount", disk], check=False)
 
     def pair_round(self, job: str) -> None:
-        """Run the same command twice at once: one succeeds, the other is refused or has nothing to do."""
-        tally, out = self.tallies[job], self._new()
+        """Run the same command twice at once: one succeeds, the other is refused or has nothing to
+        do."""
+        tally = self.tallies[job]
+        out = self._new()
         ends: list[End] = []
 
         def second(pid: int, arrived: int) -> None:
@@ -386,7 +428,8 @@ class Soak:
     def _judge(self, job: str, kind: str, end: End) -> None:
         if end.problem is None:
             return
-        if kind == "memory" and end.code != LOST_CODE:  # a library may end the process; the run must survive it
+        if kind == "memory" and end.code != LOST_CODE:
+            # a library may end the process; the run must survive it
             self.tallies[job].counts["ended by a library"] += 1
         else:
             self.tallies[job].lost.append(f"{job}, {kind}: {end.problem}")
@@ -399,18 +442,28 @@ class Soak:
         if end.code != 0:
             tally.lost.append(f"{job}: cannot go on: {end.said.strip()}")
             return
-        tally.lost += [f"{job}: {problem}" for problem in differences(out, self.references[job].folder)]
+        tally.lost += [
+            f"{job}: {problem}" for problem in differences(out, self.references[job].folder)
+        ]
 
     def rows(self) -> list[str]:
         """Return the table."""
-        columns = ("runs", "kills", "any moment", "before a file operation", "around a file operation")
+        columns = (
+            "runs",
+            "kills",
+            "any moment",
+            "before a file operation",
+            "around a file operation",
+        )
         columns += ("disk", "file size", "memory", "ended by a library", "pairs")
         head = f"| job | {' | '.join(columns)} | lost |"
         rows = [head, "|---" * (len(columns) + 2) + "|"]
         total: Counter[str] = Counter()
         for job, tally in self.tallies.items():
             total += tally.counts
-            rows.append(f"| {job} | {' | '.join(str(tally.counts[c]) for c in columns)} | {len(tally.lost)} |")
+            rows.append(
+                f"| {job} | {' | '.join(str(tally.counts[c]) for c in columns)} | {len(tally.lost)} |"
+            )
         lost = sum(len(tally.lost) for tally in self.tallies.values())
         return [*rows, f"| all | {' | '.join(str(total[c]) for c in columns)} | {lost} |"]
 
@@ -435,28 +488,36 @@ def can_mount(folder: Path) -> bool:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=500)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", default=",".join(JOBS))
     given = parser.parse_args()
     torch.set_num_threads(1)
-    dice, start = random.Random(given.seed), time.perf_counter()
+    dice = random.Random(given.seed)
+    start = time.perf_counter()
     jobs = [job for job in JOBS if job in given.jobs.split(",")]
     with tempfile.TemporaryDirectory(prefix="soak.") as name:
         os.chdir(name)
         soak = Soak(Path(name), jobs, dice)
         limits = ["disk" if can_mount(Path(name)) else "file size"]
         if limits == ["file size"]:
-            print("no tmpfs can be mounted here: a limit on the size of files stands for the full disk")
+            print(
+                "no tmpfs can be mounted here: a limit on the size of files stands for the full disk"
+            )
         if Path("/proc/self/statm").exists():
             limits.append("memory")
         number = 0
         while soak.kills < given.kills and time.perf_counter() - start < 60 * given.minutes:
             job = jobs[number % len(jobs)]
             if number % 20 == 19:
-                print(f"{soak.kills} kills in {(time.perf_counter() - start) / 60:.1f} minutes", flush=True)
+                print(
+                    f"{soak.kills} kills in {(time.perf_counter() - start) / 60:.1f} minutes",
+                    flush=True,
+                )
             soak.kill_round(job, min(dice.randint(1, 5), given.kills - soak.kills))
             if number // len(jobs) % 4 == 3 or number < len(jobs):
                 soak.limit_round(job, limits[number % len(limits)])
@@ -466,7 +527,9 @@ def main() -> int:
         os.chdir("/")
     print("\n".join(soak.rows()))
     lost = [problem for tally in soak.tallies.values() for problem in tally.lost]
-    print(f"{soak.kills} kills in {(time.perf_counter() - start) / 60:.1f} minutes, {len(lost)} lost")
+    print(
+        f"{soak.kills} kills in {(time.perf_counter() - start) / 60:.1f} minutes, {len(lost)} lost"
+    )
     for problem in lost[:50]:
         print(f"lost: {problem}")
     return 1 if lost else 0

@@ -1,10 +1,13 @@
-"""Preset dynamic against preset static, on still and on moving captures, in runs of several lengths.
+"""Preset dynamic against preset static, on still and on moving captures, in runs of several
+lengths.
 
-    python benchmarks/still.py runs/still lego=LEGO cup=CUP,data.times=order orbits=ORBITS --lengths train.steps=3000
+    python benchmarks/still.py runs/still lego=LEGO cup=CUP,data.times=order orbits=ORBITS --lengths
+    train.steps=3000
 
-A still capture without times gets them by its order, time = i / n, in a copy, unless it is given data.times. A capture
-is a name, a folder and keys that preset dynamic alone gets. Runs that are there are not trained again; where dynamic
-resolves to the config of static, that is the same run. A length "" is that of the preset.
+A still capture without times gets them by its order, time = i / n, in a copy, unless it is given
+data.times. A capture is a name, a folder and keys that preset dynamic alone gets. Runs that are
+there are not trained again; where dynamic resolves to the config of static, that is the same run. A
+length "" is that of the preset.
 """
 
 from __future__ import annotations
@@ -25,14 +28,22 @@ from dyngs.runs.checkpoint import checkpoint_paths
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("captures", nargs="+", help="NAME=FOLDER[,KEY=VALUE...]")
-    parser.add_argument("--lengths", nargs="*", default=["train.steps=500", "train.steps=3000", "train.steps=8000", ""])
+    parser.add_argument(
+        "--lengths",
+        nargs="*",
+        default=["train.steps=500", "train.steps=3000", "train.steps=8000", ""],
+    )
     parser.add_argument("--seeds", nargs="*", type=int, default=[42, 43])
     parser.add_argument("--keys", nargs="*", default=[], help="KEY=VALUE of both presets")
     options = parser.parse_args()
-    print("| capture | length | seed | static | dynamic | gain, dB | chosen | trial |\n|" + "---|" * 8)
+    print(
+        "| capture | length | seed | static | dynamic | gain, dB | chosen | trial |\n|" + "---|" * 8
+    )
     with kernel_threads(torch.get_num_threads()):
         for text in options.captures:
             name, _, rest = text.partition("=")
@@ -41,9 +52,16 @@ def main() -> None:
             source = _with_times(Path(root), folder / "capture") if not own else Path(root)
             for length in options.lengths:
                 for seed in options.seeds:
-                    keys = [f"data.root={source}", f"run.seed={seed}", *options.keys, *length.split()]
+                    keys = [
+                        f"data.root={source}",
+                        f"run.seed={seed}",
+                        *options.keys,
+                        *length.split(),
+                    ]
                     base = folder / f"{length or 'preset'}_{seed}"
-                    moving = _trained(load_config("dynamic", [*keys, *own, f"run.dir={base}_dynamic"]))
+                    moving = _trained(
+                        load_config("dynamic", [*keys, *own, f"run.dir={base}_dynamic"])
+                    )
                     still = load_config("static", [*keys, f"run.dir={base}_static"])
                     chosen = load_resolved(moving)
                     same = chosen.train.minutes is None and _differences(chosen, still) == {"run"}
@@ -64,7 +82,8 @@ def _differences(one: Config, other: Config) -> set[str]:
 
 
 def _trial(run: Path) -> str:
-    """Return gain, standard error and seconds of the trial of motion; "none" where there was none."""
+    """Return gain, standard error and seconds of the trial of motion; "none" where there was
+    none."""
     file = run / "choices.json"
     choices = json.loads(file.read_text()) if file.is_file() else []
     found = [x for x in choices if x["setting"] == "model.kind=dynamic"]

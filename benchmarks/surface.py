@@ -4,8 +4,9 @@
     dyngs train static data.root=FOLDER run.dir=RUN
     python benchmarks/surface.py RUN [RUN ...]
 
-The true surface is what rays through the pixels of the training views meet. Prints the mean distance from points of the
-mesh to it and back (their mean is the Chamfer distance), as parts of the scene's size, and the F-score at 1 % of that.
+The true surface is what rays through the pixels of the training views meet. Prints the mean
+distance from points of the mesh to it and back (their mean is the Chamfer distance), as parts of
+the scene's size, and the F-score at 1 % of that.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ NEAR = 0.01  # Of the scene's size
 
 def true_points(opened: Opened) -> np.ndarray:
     """Return (P, 3) points of the true surface that training views see."""
-    scene, found = polyhedra(), []
+    scene = polyhedra()
+    found = []
     for view in opened.capture.splits["train"]:
         pose = inverse_rigid(view.cam_from_world).astype(np.float32)
         pose[:3, 1:3] *= -1  # axes of cameras as the ray tracer has them: y up, looking along -z
@@ -44,19 +46,29 @@ def true_points(opened: Opened) -> np.ndarray:
 
 
 def scored(found: np.ndarray, true: np.ndarray) -> tuple[float, float, float]:
-    """Return mean distances of ``found`` from ``true`` and back, and the F-score, all as parts of the size."""
+    """Return mean distances of ``found`` from ``true`` and back, and the F-score, all as parts of
+    the size."""
     size = float(np.ptp(true, axis=0).max())
     to_true = cKDTree(true).query(found)[0] / size
     to_found = cKDTree(found).query(true)[0] / size
-    precision, recall = float((to_true < NEAR).mean()), float((to_found < NEAR).mean())
-    return float(to_true.mean()), float(to_found.mean()), 2 * precision * recall / max(precision + recall, 1e-9)
+    precision = float((to_true < NEAR).mean())
+    recall = float((to_found < NEAR).mean())
+    return (
+        float(to_true.mean()),
+        float(to_found.mean()),
+        2 * precision * recall / max(precision + recall, 1e-9),
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     runs: list[Path] = parser.parse_args().runs
-    print("| run | triangles | mesh to truth | truth to mesh | F-score at 1 % |\n|---|---|---|---|---|")
+    print(
+        "| run | triangles | mesh to truth | truth to mesh | F-score at 1 % |\n|---|---|---|---|---|"
+    )
     for path in runs:
         opened = open_run(path)
         with tempfile.TemporaryDirectory() as folder:
@@ -64,7 +76,10 @@ def main() -> None:
         mesh = trimesh.Trimesh(opened.world.points(surface.vertices), surface.faces, process=False)
         points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
         near, far, score = scored(np.asarray(points), true_points(opened))
-        print(f"| {path} | {len(surface.faces):,} | {near:.2%} | {far:.2%} | {score:.3f} |", flush=True)
+        print(
+            f"| {path} | {len(surface.faces):,} | {near:.2%} | {far:.2%} | {score:.3f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python benchmarks/units.py FOLDER CAPTURE PRESET... [--at SCALE:OFFSET ...] [key=value ...]
 
-CAPTURE has transforms files. OFFSET is in extents of the cameras. Every row should show the same PSNR, within what
-rounding decides in a training (about 0.3 dB).
+CAPTURE has transforms files. OFFSET is in extents of the cameras. Every row should show the same
+PSNR, within what rounding decides in a training (about 0.3 dB).
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ PLACES = ("1:0", "1e-4:0", "0.05:0", "1e3:0", "1:1e6")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("capture", type=Path)
     parser.add_argument("words", nargs="+", metavar="PRESET or key=value")
@@ -39,7 +41,9 @@ def main() -> None:
                 extent = 5.0  # of NeRF-synthetic scenes
                 scaled_capture(given.capture, capture, scale, (offset * extent, 0.0, 0.0))
             run = given.folder / f"{preset}_{capture.name}"
-            config = dyngs.load_config(preset, [f"data.root={capture}", f"run.dir={run}", *overrides])
+            config = dyngs.load_config(
+                preset, [f"data.root={capture}", f"run.dir={run}", *overrides]
+            )
             dyngs.train(config)
             cells.append(f"{evaluate_run(run).psnr:.2f}")
         print(f"| {preset} | {' | '.join(cells)} |", flush=True)

@@ -2,9 +2,10 @@
 
     python benchmarks/viewer.py RUN... [--size 1000x600] [--seconds 6]
 
-Opens each run or file in Debian's chromium without a window (WebGL on the CPU) and measures while the mouse orbits,
-and, where something moves, while time plays. Needs `pip install '.[test]'` and chromium. The browser takes time of the
-same cores: with a GPU, or a browser elsewhere, there is more for the images.
+Opens each run or file in Debian's chromium without a window (WebGL on the CPU) and measures while
+the mouse orbits, and, where something moves, while time plays. Needs `pip install '.[test]'` and
+chromium. The browser takes time of the same cores: with a GPU, or a browser elsewhere, there is
+more for the images.
 """
 
 from __future__ import annotations
@@ -37,10 +38,16 @@ for (const name of ["texImage2D", "texSubImage2D"]) {
 """Counts images that reach the GPU of the page, real or not."""
 
 
-def measure(page: Page, browsing: Browsing, act: Callable[[int], None], seconds: float) -> tuple[float, float]:
-    """Return the images per second that were sent and shown while ``act`` is called with 0, 1, ..."""
+def measure(
+    page: Page, browsing: Browsing, act: Callable[[int], None], seconds: float
+) -> tuple[float, float]:
+    """Return the images per second that were sent and shown while ``act`` is called with 0, 1,
+    ..."""
     for length in (WARM_UP, seconds):
-        sent, shown, start, count = browsing.num_sent, page.evaluate("window.uploads"), time.monotonic(), 0
+        sent = browsing.num_sent
+        shown = page.evaluate("window.uploads")
+        start = time.monotonic()
+        count = 0
         while time.monotonic() < start + length:
             act(count)
             count += 1
@@ -59,7 +66,8 @@ def rows(path: Path, size: tuple[int, int], seconds: float) -> list[str]:
         while not viewer.browsing or not viewer.browsing[0].num_sent:
             page.driven.wait_for_timeout(100)
         (browsing,) = viewer.browsing
-        mouse, middle = page.driven.mouse, (size[0] // 4, size[1] // 2)
+        mouse = page.driven.mouse
+        middle = (size[0] // 4, size[1] // 2)
 
         def orbit(count: int) -> None:
             mouse.move(middle[0] + 3 * count % 100, middle[1] + count % 50)
@@ -72,14 +80,18 @@ def rows(path: Path, size: tuple[int, int], seconds: float) -> list[str]:
         found.append(f"| {source.names[0]} | orbiting | {sent:.1f} | {shown:.1f} |")
         if browsing.time_slider is not None:
             page.click("text=Play")
-            sent, shown = measure(page, browsing, lambda _: page.driven.wait_for_timeout(100), seconds)
+            sent, shown = measure(
+                page, browsing, lambda _: page.driven.wait_for_timeout(100), seconds
+            )
             found.append(f"| {source.names[0]} | playing | {sent:.1f} | {shown:.1f} |")
     return found
 
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("paths", nargs="+", type=Path, metavar="RUN", help="run or file")
     parser.add_argument("--size", default="1000x600", help="of the page, px")
     parser.add_argument("--seconds", type=float, default=6.0)

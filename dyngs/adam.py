@@ -24,7 +24,9 @@ class AdamState:
     @staticmethod
     def zero(tensors: Mapping[str, Tensor]) -> AdamState:
         """Return the moments before the first update of ``tensors``."""
-        first, second = ({name: torch.zeros_like(x.detach()) for name, x in tensors.items()} for _ in MOMENTS)
+        first, second = (
+            {name: torch.zeros_like(x.detach()) for name, x in tensors.items()} for _ in MOMENTS
+        )
         return AdamState(first, second)
 
     @staticmethod
@@ -32,7 +34,9 @@ class AdamState:
         """Return the moments of ``tensors`` from what ``state`` returned."""
         first, second = (
             {
-                name: require_tensor(f"{part}.{name}", stored[f"{part}.{name}"], tuple(x.shape), x.dtype)
+                name: require_tensor(
+                    f"{part}.{name}", stored[f"{part}.{name}"], tuple(x.shape), x.dtype
+                )
                 .to(x.device)
                 .clone()
                 for name, x in tensors.items()
@@ -42,9 +46,17 @@ class AdamState:
         return AdamState(first, second)
 
     def step_(
-        self, name: str, x: Tensor, *, lr: float | Tensor, step: int, eps: float = 1e-15, rows: Tensor | None = None
+        self,
+        name: str,
+        x: Tensor,
+        *,
+        lr: float | Tensor,
+        step: int,
+        eps: float = 1e-15,
+        rows: Tensor | None = None,
     ) -> Count:
-        """As ``steps_`` of one tensor, of which only the ``rows`` (N,) bool are updated; None: all."""
+        """As ``steps_`` of one tensor, of which only the ``rows`` (N,) bool are updated; None:
+        all."""
         return self.steps_([self.update(name, x, lr, rows)], step=step, eps=eps)
 
     def steps_(
@@ -55,31 +67,42 @@ class AdamState:
         eps: float = 1e-15,
         betas: tuple[float, float] = (0.9, 0.999),
     ) -> Count:
-        """Do the ``updates`` in place, those that are None left out, and return the number of rows left out.
+        """Do the ``updates`` in place, those that are None left out, and return the number of rows
+        left out.
 
-        Rows whose gradient is not finite are left out. ``step``: the number of this update, from 1, for the bias
-        correction.
+        Rows whose gradient is not finite are left out. ``step``: the number of this update, from 1,
+        for the bias correction.
         """
         wanted = [x for x in updates if x is not None]
         return adam_steps_(wanted, step=step, eps=eps, betas=betas) if wanted else 0
 
-    def update(self, name: str, x: Tensor, lr: float | Tensor, rows: Tensor | None = None) -> AdamUpdate | None:
-        """Return the update of the leaf tensor ``x`` (N, ...), and drop its gradient; None where it has none."""
-        grad, x.grad = x.grad, None
+    def update(
+        self, name: str, x: Tensor, lr: float | Tensor, rows: Tensor | None = None
+    ) -> AdamUpdate | None:
+        """Return the update of the leaf tensor ``x`` (N, ...), and drop its gradient; None where it
+        has none."""
+        grad = x.grad
+        x.grad = None
         if grad is None:
             return None
         return AdamUpdate(x.detach(), grad, self.exp_avg[name], self.exp_avg_sq[name], lr, rows)
 
     def update_along_last_axis(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:
-        """As ``update``; only the values along the last axis are a row, so that little is left out of a large array."""
-        grad, x.grad = x.grad, None
+        """As ``update``; only the values along the last axis are a row, so that little is left out
+        of a large array."""
+        grad = x.grad
+        x.grad = None
         if grad is None:
             return None
-        first, second = _rows(self.exp_avg[name]), _rows(self.exp_avg_sq[name])
+        first = _rows(self.exp_avg[name])
+        second = _rows(self.exp_avg_sq[name])
         return AdamUpdate(_rows(x.detach()), _rows(grad), first, second, lr)
 
-    def mapped(self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None) -> AdamState:
-        """Return the moments with ``function`` applied to those of the named tensors; None: of all."""
+    def mapped(
+        self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None
+    ) -> AdamState:
+        """Return the moments with ``function`` applied to those of the named tensors; None: of
+        all."""
         chosen = set(self.exp_avg if names is None else names)
         first, second = (
             {name: function(x) if name in chosen else x for name, x in moments.items()}
@@ -89,7 +112,11 @@ class AdamState:
 
     def state(self) -> State:
         parts = zip(MOMENTS, (self.exp_avg, self.exp_avg_sq), strict=True)
-        return {k: x for part, moments in parts for k, x in prefixed(part, with_role(moments, Role.TRAINING)).items()}
+        return {
+            k: x
+            for part, moments in parts
+            for k, x in prefixed(part, with_role(moments, Role.TRAINING)).items()
+        }
 
     def to(self, device: torch.device | str) -> AdamState:
         return AdamState(moved_to(self.exp_avg, device), moved_to(self.exp_avg_sq, device))

@@ -52,7 +52,8 @@ class Workload:
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Median and shortest times by stage, and the rate of a float32 matrix product, at one number of threads."""
+    """Median and shortest times by stage, and the rate of a float32 matrix product, at one number
+    of threads."""
 
     threads: int
     milliseconds: dict[str, float]
@@ -88,7 +89,8 @@ class RasterizeReport:
 
 
 def garden_workload(path: Path) -> Workload:
-    """Read the workload of gsplat's benchmark: points within 2 units of the origin with random shapes, first camera."""
+    """Read the workload of gsplat's benchmark: points within 2 units of the origin with random
+    shapes, first camera."""
     keys = ("means3d", "colors", "viewmats", "Ks", "width", "height")
     data = read_arrays(path, lambda names: [key for key in keys if key in names])
     with reading(path, "give a workload of gsplat's benchmark"):
@@ -100,7 +102,9 @@ def garden_workload(path: Path) -> Workload:
             raise ValueError("means3d and colors must have rows of three")
         if not all(bool(x.isfinite().all()) for x in (colors, view, intrinsics)):
             raise ValueError("a number in it is not finite")
-        return _with_random_shapes(means, colors, Cameras(view, intrinsics, int(data["width"]), int(data["height"])))
+        return _with_random_shapes(
+            means, colors, Cameras(view, intrinsics, int(data["width"]), int(data["height"]))
+        )
 
 
 def random_workload(num_gaussians: int = 110_000) -> Workload:
@@ -119,7 +123,9 @@ def _with_random_shapes(means: Tensor, colors: Tensor, cameras: Cameras) -> Work
     generator = torch.Generator("cpu").manual_seed(42)
     n = len(means)
     scales = torch.rand(n, 3, generator=generator, device="cpu") * 0.02
-    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=generator, device="cpu"), dim=-1)
+    quats = torch.nn.functional.normalize(
+        torch.randn(n, 4, generator=generator, device="cpu"), dim=-1
+    )
     opacities = torch.rand(n, generator=generator, device="cpu")
     return Workload(means, quats, scales, opacities, colors.contiguous(), cameras)
 
@@ -130,11 +136,14 @@ def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> Rasteri
     A workload on a GPU is timed by CUDA events.
     """
     with torch.no_grad():
-        projection = project(load.means, load.quats, load.scales, load.opacities, load.cameras, _LIMITS)
+        projection = project(
+            load.means, load.quats, load.scales, load.opacities, load.cameras, _LIMITS
+        )
     opacities = load.opacities[None]
     entries = bin_tiles(projection, opacities, load.size)
     pairs, lanes = (
-        float(tally(projection, opacities, load.size, kind).double().sum()) for kind in (Tally.PIXELS, Tally.LANES)
+        float(tally(projection, opacities, load.size, kind).double().sum())
+        for kind in (Tally.PIXELS, Tally.LANES)
     )
     samples = {count: {name: [] for name in (*STAGES, "sgemm")} for count in threads}
     for repeat in range(repeats + 2):
@@ -153,28 +162,38 @@ def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> Rasteri
         pairs=int(pairs),
         lanes_used=pairs / max(lanes, 1.0),
         runs=[_summary(count, samples[count]) for count in threads],
-        device="cpu" if load.means.device.type == "cpu" else torch.cuda.get_device_name(load.means.device),
+        device="cpu"
+        if load.means.device.type == "cpu"
+        else torch.cuda.get_device_name(load.means.device),
     )
 
 
 _LIMITS = ProjectionOptions(near=0.01)
 
 
-def _time_stages(load: Workload, projection: Projection, entries: TileEntries, threads: int) -> dict[str, float]:
+def _time_stages(
+    load: Workload, projection: Projection, entries: TileEntries, threads: int
+) -> dict[str, float]:
     """Run each stage once and return its seconds."""
     leaves = [x.clone().requires_grad_() for x in (load.means, load.quats, load.scales)]
     splats = [projection.means2d, projection.factors, load.opacities[None], load.colors]
     means2d, factors, opacities, colors = (x.clone().requires_grad_() for x in splats)
-    flat = Projection(means2d, projection.depths, factors, projection.compensations, projection.radii)
+    flat = Projection(
+        means2d, projection.depths, factors, projection.compensations, projection.radii
+    )
     seconds: dict[str, float] = {}
     timed = partial(_timed, load.means.device)
     with kernel_threads(threads):
         seconds["project"], projected = timed(
             lambda: project(*leaves, load.opacities, load.cameras, _LIMITS)  # type: ignore[misc]
         )
-        seconds["bin + sort"], _ = timed(lambda: bin_tiles(projection, load.opacities[None], load.size))
+        seconds["bin + sort"], _ = timed(
+            lambda: bin_tiles(projection, load.opacities[None], load.size)
+        )
         seconds["blend"], blended = timed(
-            lambda: rasterize(flat, opacities, colors, load.size, options=BlendOptions(), entries=entries)
+            lambda: rasterize(
+                flat, opacities, colors, load.size, options=BlendOptions(), entries=entries
+            )
         )
         grad = torch.ones_like(blended.color)
         seconds["blend backward"], _ = timed(lambda: torch.autograd.backward(blended.color, grad))
@@ -212,7 +231,9 @@ def _sgemm_seconds(device: torch.device, threads: int) -> float:
 def _summary(threads: int, samples: dict[str, list[float]]) -> StageTimes:
     milliseconds = {name: 1e3 * statistics.median(samples[name]) for name in STAGES}
     fastest = {name: 1e3 * min(samples[name]) for name in STAGES}
-    return StageTimes(threads, milliseconds, fastest, 2e-9 * SGEMM_SIZE**3 / statistics.median(samples["sgemm"]))
+    return StageTimes(
+        threads, milliseconds, fastest, 2e-9 * SGEMM_SIZE**3 / statistics.median(samples["sgemm"])
+    )
 
 
 def write_report(report: RasterizeReport, path: Path) -> None:
@@ -220,8 +241,13 @@ def write_report(report: RasterizeReport, path: Path) -> None:
 
 
 def format_report(report: RasterizeReport) -> str:
-    labels = [counted(run.threads, "thread") if report.device == "cpu" else "cuda" for run in report.runs]
-    preparing = [(run.milliseconds["project"] + run.milliseconds["bin + sort"]) / run.total for run in report.runs]
+    labels = [
+        counted(run.threads, "thread") if report.device == "cpu" else "cuda" for run in report.runs
+    ]
+    preparing = [
+        (run.milliseconds["project"] + run.milliseconds["bin + sort"]) / run.total
+        for run in report.runs
+    ]
     lines = [
         f"{counted(report.num_gaussians, 'Gaussian')}, {report.num_visible:,} visible at "
         f"{report.width}x{report.height}, {report.entries:,} tile entries, {report.pairs / 1e6:.1f} M blended pairs, "
@@ -230,7 +256,9 @@ def format_report(report: RasterizeReport) -> str:
         f"{'stage, median (best) ms':<26}" + "".join(f"{label:>20}" for label in labels),
     ]
     for name in STAGES:
-        cells = [f"{run.milliseconds[name]:10.2f} ({run.fastest[name]:6.2f})" for run in report.runs]
+        cells = [
+            f"{run.milliseconds[name]:10.2f} ({run.fastest[name]:6.2f})" for run in report.runs
+        ]
         lines.append(f"{name:<26}" + "".join(f"{cell:>20}" for cell in cells))
     rows = [
         ("all stages", [f"{run.total:.2f}" for run in report.runs]),

@@ -35,11 +35,15 @@ class Cameras:
 
     def __post_init__(self) -> None:
         if self.cam_from_world.ndim != 3 or self.cam_from_world.shape[1:] != (4, 4):
-            raise ValueError(f"cam_from_world must be (V, 4, 4), got {tuple(self.cam_from_world.shape)}")
+            raise ValueError(
+                f"cam_from_world must be (V, 4, 4), got {tuple(self.cam_from_world.shape)}"
+            )
         if self.intrinsics.shape != (len(self.cam_from_world), 3, 3):
             raise ValueError(f"intrinsics must be (V, 3, 3), got {tuple(self.intrinsics.shape)}")
         if not all(hasattr(size, "__index__") and size >= 1 for size in (self.width, self.height)):
-            raise ValueError(f"image size must be positive, in whole pixels, got {self.width}x{self.height}")
+            raise ValueError(
+                f"image size must be positive, in whole pixels, got {self.width}x{self.height}"
+            )
 
     def __len__(self) -> int:
         return len(self.cam_from_world)
@@ -47,25 +51,32 @@ class Cameras:
     @property
     def centers(self) -> Tensor:
         """Return (V, 3) camera centres in the world."""
-        rotation, translation = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
+        rotation = self.cam_from_world[:, :3, :3]
+        translation = self.cam_from_world[:, :3, 3]
         return -(rotation * translation[..., None]).sum(1)  # small products through BLAS are slow
 
     def select(self, index: int) -> Cameras:
         """Return the camera at ``index`` as a batch of one."""
-        return Cameras(self.cam_from_world[index][None], self.intrinsics[index][None], self.width, self.height)
+        return Cameras(
+            self.cam_from_world[index][None], self.intrinsics[index][None], self.width, self.height
+        )
 
     def scaled(self, factor: float) -> Cameras:
-        """Return the same cameras with width and height times ``factor``, rounded to whole pixels."""
+        """Return the same cameras with width and height times ``factor``, rounded to whole
+        pixels."""
         if factor == 1:
             return self
         width, height = (max(1, round(factor * side)) for side in (self.width, self.height))
         factors = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return Cameras(self.cam_from_world, factors[:, None] * self.intrinsics, width, height)
 
-    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
+    def to(
+        self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Cameras:
         """Return the same cameras on another device or in another precision."""
         pose, intrinsics = (
-            x.to(device=device, dtype=dtype, non_blocking=x.device.type == "cpu")  # no GPU waits for them
+            # no GPU waits for them
+            x.to(device=device, dtype=dtype, non_blocking=x.device.type == "cpu")
             for x in (self.cam_from_world, self.intrinsics)
         )
         return Cameras(pose, intrinsics, self.width, self.height)

@@ -1,4 +1,5 @@
-"""``rasterization`` with the interface of gsplat 1.5, so that its users can switch by changing an import.
+"""``rasterization`` with the interface of gsplat 1.5, so that its users can switch by changing an
+import.
 
 Names, shapes, defaults and conventions follow gsplat's documentation; the implementation is ours.
 """
@@ -15,10 +16,24 @@ from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE
 from dyngs.errors import DyngsError
 from dyngs.models.renderable import check_focal_lengths, check_poses
-from dyngs.ops.checks import LARGEST_COUNT, check_choice, check_count, check_finite, check_near_and_far, check_number
+from dyngs.ops.checks import (
+    LARGEST_COUNT,
+    check_choice,
+    check_count,
+    check_finite,
+    check_near_and_far,
+    check_number,
+)
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
-from dyngs.ops.rasterization import MAX_CHANNELS, TILE, BlendOptions, TileEntries, bin_tiles, rasterize
+from dyngs.ops.rasterization import (
+    MAX_CHANNELS,
+    TILE,
+    BlendOptions,
+    TileEntries,
+    bin_tiles,
+    rasterize,
+)
 
 GSPLAT_ALPHA_MAX = 0.999
 """Largest alpha of gsplat 1.5 (dyngs and 3DGS: 0.99)."""
@@ -64,8 +79,9 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Return images (C, H, W, D), their alphas (C, H, W, 1), and a dict of intermediate results.
 
-    Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. ``meta["means2d"]`` may be
-    asked to ``retain_grad()``; with ``absgrad`` it also gets an attribute ``absgrad`` in the backward pass.
+    Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds.
+    ``meta["means2d"]`` may be asked to ``retain_grad()``; with ``absgrad`` it also gets an
+    attribute ``absgrad`` in the backward pass.
 
     Example::
 
@@ -74,16 +90,18 @@ def rasterization(
         import dyngs
 
         means, quats = torch.tensor([[0.0, 0, 4]]), torch.tensor([[1.0, 0, 0, 0]])
-        scales, opacities, colors = torch.full((1, 3), 0.3), torch.tensor([0.9]), torch.tensor([[1.0, 0.5, 0]])
-        pose, intrinsics = torch.eye(4)[None], torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
-        images, alphas, meta = dyngs.rasterization(means, quats, scales, opacities, colors, pose, intrinsics, 64, 48)
+        scales, opacities, colors = torch.full((1, 3), 0.3), torch.tensor([0.9]),
+        torch.tensor([[1.0, 0.5, 0]]) pose, intrinsics = torch.eye(4)[None], torch.tensor([[[50.0,
+        0, 32], [0, 50, 24], [0, 0, 1]]]) images, alphas, meta = dyngs.rasterization(means, quats,
+        scales, opacities, colors, pose, intrinsics, 64, 48)
 
     Args:
         means: (N, 3) world.
         quats: (N, 4) wxyz, any norm.
         scales: (N, 3) standard deviations.
         opacities: (N,) in [0, 1].
-        colors: (N, D) or (C, N, D) values; with ``sh_degree``, (N, K, 3) or (C, N, K, 3) coefficients.
+        colors: (N, D) or (C, N, D) values; with ``sh_degree``, (N, K, 3) or (C, N, K, 3)
+            coefficients.
         viewmats: (C, 4, 4) world to camera, OpenCV axes; rigid, the last row is not read.
         Ks: (C, 3, 3) intrinsics, px; focal lengths positive, skew and the last row are not read.
         width, height: px.
@@ -91,16 +109,19 @@ def rasterization(
         radius_clip: splats with no larger half extent are skipped, px.
         eps2d: 2D low-pass variance, px^2.
         sh_degree: degree to use; None if colors are values.
-        packed: ``meta`` lists the visible (camera, Gaussian) pairs instead of (C, N) arrays. Images are the same.
+        packed: ``meta`` lists the visible (camera, Gaussian) pairs instead of (C, N) arrays. Images
+            are the same.
         backgrounds: (C, D).
-        render_mode: colour, accumulated depth (D), expected depth (ED), or both; depth is the last channel.
+        render_mode: colour, accumulated depth (D), expected depth (ED), or both; depth is the last
+            channel.
         absgrad: see above.
         rasterize_mode: ``antialiased`` compensates the opacity for the low-pass.
         channel_chunk: channels per pass; at most 40 are taken.
 
     Raises:
-        DyngsError: shapes that do not fit, NaN or infinite input, numbers out of their range (planes in the wrong
-            order, focal lengths or sizes that are not positive, ...), or an argument that dyngs does not support.
+        DyngsError: shapes that do not fit, NaN or infinite input, numbers out of their range
+            (planes in the wrong order, focal lengths or sizes that are not positive, ...), or an
+            argument that dyngs does not support.
     """
     refused = {
         "tile_size": tile_size != TILE,
@@ -115,7 +136,8 @@ def rasterization(
         "tangential_coeffs": tangential_coeffs is not None,
         "thin_prism_coeffs": thin_prism_coeffs is not None,
         "ftheta_coeffs": ftheta_coeffs is not None,
-        "rolling_shutter": getattr(rolling_shutter, "name", rolling_shutter) not in (None, "GLOBAL"),
+        "rolling_shutter": getattr(rolling_shutter, "name", rolling_shutter)
+        not in (None, "GLOBAL"),
         "viewmats_rs": viewmats_rs is not None,
     }
     if any(refused.values()):
@@ -124,20 +146,32 @@ def rasterization(
     _check_settings(width, height, near_plane, far_plane, radius_clip, eps2d, channel_chunk)
     check_choice("rasterization: render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     check_choice("rasterization: rasterize_mode", rasterize_mode, ("classic", "antialiased"))
-    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    tensors |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
+    tensors = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+    }
+    tensors |= {"viewmats": viewmats, "Ks": Ks} | (
+        {} if backgrounds is None else {"backgrounds": backgrounds}
+    )
     _check_shapes(tensors, sh_degree, with_colors="RGB" in render_mode)
     check_finite(tensors)
     check_focal_lengths(Ks, "Ks")
     check_poses(viewmats, "viewmats")
     cameras = Cameras(viewmats, Ks, width, height)
-    limits = ProjectionOptions(eps2d, near_plane, far_plane, 1 / 255, radius_clip, rasterize_mode == "antialiased")
+    limits = ProjectionOptions(
+        eps2d, near_plane, far_plane, 1 / 255, radius_clip, rasterize_mode == "antialiased"
+    )
     splats = _project(means, quats, scales, opacities, cameras, limits, packed=packed)
     shades = _colors(means, cameras, colors, splats.projection, sh_degree)
     channels, backgrounds = _with_depth(shades, splats.projection.depths, backgrounds, render_mode)
     options = BlendOptions(alpha_max=GSPLAT_ALPHA_MAX, absgrad=absgrad)
     entries = bin_tiles(splats.projection, splats.opacities, (width, height), options)
-    image, alpha = _blend(splats, channels, entries, backgrounds, (width, height), options, channel_chunk)
+    image, alpha = _blend(
+        splats, channels, entries, backgrounds, (width, height), options, channel_chunk
+    )
     if render_mode in ("ED", "RGB+ED"):
         expected = image[..., -1:] / alpha.clamp(min=1e-10)
         image = torch.cat([image[..., :-1], expected], dim=-1)
@@ -146,7 +180,8 @@ def rasterization(
 
 @dataclass(frozen=True)
 class _Splats:
-    """Projected Gaussians: ``projection`` is dense (C, N); ``means2d`` is the tensor that the user gets to see."""
+    """Projected Gaussians: ``projection`` is dense (C, N); ``means2d`` is the tensor that the user
+    gets to see."""
 
     projection: Projection
     opacities: Tensor
@@ -160,7 +195,13 @@ class _Splats:
 
 
 def _check_settings(
-    width: int, height: int, near: float, far: float, radius_clip: float, eps2d: float, channel_chunk: int
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    radius_clip: float,
+    eps2d: float,
+    channel_chunk: int,
 ) -> None:
     try:
         for name, count in (("width", width), ("height", height), ("channel_chunk", channel_chunk)):
@@ -173,18 +214,33 @@ def _check_settings(
 
 
 def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None, *, with_colors: bool) -> None:
-    means, colors = tensors["means"], tensors["colors"]
+    means = tensors["means"]
+    colors = tensors["colors"]
     for name, x in tensors.items():
         if not isinstance(x, Tensor):
-            raise DyngsError(f"rasterization: {name} must be a torch tensor, got {type(x).__name__}")
+            raise DyngsError(
+                f"rasterization: {name} must be a torch tensor, got {type(x).__name__}"
+            )
         if x.device != means.device:
-            raise DyngsError(f"rasterization: {name} is on {x.device}, but means on {means.device}; use one device")
+            raise DyngsError(
+                f"rasterization: {name} is on {x.device}, but means on {means.device}; use one device"
+            )
     if means.ndim != 2:
-        raise DyngsError(f"rasterization: means must be (N, 3), got {tuple(means.shape)}; scenes are not batched here")
+        raise DyngsError(
+            f"rasterization: means must be (N, 3), got {tuple(means.shape)}; scenes are not batched here"
+        )
     if means.dtype not in (torch.float32, torch.float64):
-        raise DyngsError(f"rasterization: means is {means.dtype}; use float32 (or float64 for checks)")
-    n, c = len(means), tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
-    shapes: dict[str, tuple[int, ...]] = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+        raise DyngsError(
+            f"rasterization: means is {means.dtype}; use float32 (or float64 for checks)"
+        )
+    n = len(means)
+    c = tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (n, 3),
+        "quats": (n, 4),
+        "scales": (n, 3),
+        "opacities": (n,),
+    }
     shapes |= {"viewmats": (c, 4, 4), "Ks": (c, 3, 3)}
     if with_colors:  # to depth alone the background does not matter
         shapes["backgrounds"] = (c, *((3,) if sh_degree is not None else colors.shape[-1:]))
@@ -192,20 +248,28 @@ def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None, *, with_col
         if name in shapes and tuple(x.shape) != shapes[name]:
             raise DyngsError(f"rasterization: {name} must be {shapes[name]}, got {tuple(x.shape)}")
         if x.dtype != means.dtype:
-            raise DyngsError(f"rasterization: {name} is {x.dtype}, but means is {means.dtype}; use one dtype")
+            raise DyngsError(
+                f"rasterization: {name} is {x.dtype}, but means is {means.dtype}; use one dtype"
+            )
     _check_colors(colors, n, c, sh_degree)
 
 
 def _check_colors(colors: Tensor, n: int, c: int, sh_degree: int | None) -> None:
     if sh_degree is None:
         if tuple(colors.shape[:-1]) not in ((n,), (c, n)) or colors.shape[-1] == 0:
-            raise DyngsError(f"rasterization: colors must be ({n}, D) or ({c}, {n}, D), got {tuple(colors.shape)}")
+            raise DyngsError(
+                f"rasterization: colors must be ({n}, D) or ({c}, {n}, D), got {tuple(colors.shape)}"
+            )
         return
     if tuple(colors.shape[:-2]) not in ((n,), (c, n)) or colors.shape[-1] != 3:
-        raise DyngsError(f"rasterization: with sh_degree colors must be ([{c},] {n}, K, 3), got {tuple(colors.shape)}")
+        raise DyngsError(
+            f"rasterization: with sh_degree colors must be ([{c},] {n}, K, 3), got {tuple(colors.shape)}"
+        )
     check_count("rasterization: sh_degree", sh_degree, 0, MAX_SH_DEGREE)
     if (sh_degree + 1) ** 2 > colors.shape[-2]:
-        raise DyngsError(f"rasterization: sh_degree {sh_degree} does not fit {colors.shape[-2]} coefficients")
+        raise DyngsError(
+            f"rasterization: sh_degree {sh_degree} does not fit {colors.shape[-2]} coefficients"
+        )
 
 
 def _project(
@@ -231,7 +295,9 @@ def _project(
     return _Splats(replace(projection, means2d=dense), per_view, visible, camera_ids, gaussian_ids)
 
 
-def _colors(means: Tensor, cameras: Cameras, colors: Tensor, projection: Projection, sh_degree: int | None) -> Tensor:
+def _colors(
+    means: Tensor, cameras: Cameras, colors: Tensor, projection: Projection, sh_degree: int | None
+) -> Tensor:
     """Return (C, N, D) colour values."""
     c, n = projection.depths.shape
     if sh_degree is None:
@@ -239,14 +305,18 @@ def _colors(means: Tensor, cameras: Cameras, colors: Tensor, projection: Project
     if colors.ndim == 3:
         return evaluate_harmonics(means, cameras.centers, colors, projection.radii, sh_degree)
     each = [slice(i, i + 1) for i in range(c)]
-    centers, radii = cameras.centers, projection.radii
-    return torch.cat([evaluate_harmonics(means, centers[i], colors[i][0], radii[i], sh_degree) for i in each])
+    centers = cameras.centers
+    radii = projection.radii
+    return torch.cat(
+        [evaluate_harmonics(means, centers[i], colors[i][0], radii[i], sh_degree) for i in each]
+    )
 
 
 def _with_depth(
     shades: Tensor, depths: Tensor, backgrounds: Tensor | None, render_mode: str
 ) -> tuple[Tensor, Tensor | None]:
-    """Return the channels to blend and their backgrounds; depth comes last, on a background of 0."""
+    """Return the channels to blend and their backgrounds; depth comes last, on a background of
+    0."""
     depth = depths[..., None]
     if render_mode in ("D", "ED"):
         return depth, None
@@ -266,10 +336,12 @@ def _blend(
     options: BlendOptions,
     channel_chunk: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return image (C, H, W, D) and alpha (C, H, W, 1), drawn in passes of ``channel_chunk`` channels."""
+    """Return image (C, H, W, D) and alpha (C, H, W, 1), drawn in passes of ``channel_chunk``
+    channels."""
     chunk = min(channel_chunk, MAX_CHANNELS)
     probe = _absgrad_probe(splats) if options.absgrad else None
-    images, transmittance = [], None
+    images = []
+    transmittance = None
     for start in range(0, channels.shape[-1], chunk):
         part = slice(start, start + chunk)
         background = None if backgrounds is None else backgrounds[:, part]
@@ -290,8 +362,11 @@ def _blend(
 
 
 def _absgrad_probe(splats: _Splats) -> Tensor:
-    """Return a probe whose gradient is handed to ``means2d.absgrad`` in the backward pass, as gsplat does."""
-    probe = splats.projection.means2d.new_zeros(*splats.projection.depths.shape, 4, requires_grad=True)
+    """Return a probe whose gradient is handed to ``means2d.absgrad`` in the backward pass, as
+    gsplat does."""
+    probe = splats.projection.means2d.new_zeros(
+        *splats.projection.depths.shape, 4, requires_grad=True
+    )
     means2d = splats.means2d
 
     def hand_over(grad: Tensor) -> None:
@@ -303,7 +378,8 @@ def _absgrad_probe(splats: _Splats) -> Tensor:
 
 def _meta(splats: _Splats, entries: TileEntries, cameras: Cameras) -> dict[str, Any]:
     projection = splats.projection
-    columns, rows = -(-cameras.width // TILE), -(-cameras.height // TILE)
+    columns = -(-cameras.width // TILE)
+    rows = -(-cameras.height // TILE)
     flat_ids = entries.gaussians.long()
     if splats.camera_ids is not None:
         visible = (projection.radii > 0).all(-1).reshape(-1)

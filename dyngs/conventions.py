@@ -12,9 +12,9 @@ J, M   joints, mesh vertices
 F      frames of a sequence
 ====== ==========================================================
 
-Frames: cameras are OpenCV (x right, y down, z forward); ``cam_from_world`` maps world points to camera points.
-Quaternions are wxyz. The centre of the first pixel is (0.5, 0.5). Time lies in [0, 1] over the capture.
-Colours are display-referred sRGB in [0, 1].
+Frames: cameras are OpenCV (x right, y down, z forward); ``cam_from_world`` maps world points to
+camera points. Quaternions are wxyz. The centre of the first pixel is (0.5, 0.5). Time lies in [0,
+1] over the capture. Colours are display-referred sRGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ SH_C0 = 0.28209479177387814
 MAX_SH_DEGREE = 4
 
 ReportProgress = Callable[[str, int, int], None]
-"""Function that is told how far long work has come: what is being done, how many parts of it are done, of how many."""
+"""Function that is told how far long work has come: what is being done, how many parts of it are
+done, of how many."""
 
 
 def report_nothing(what: str, done: int, total: int) -> None:

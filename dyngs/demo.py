@@ -47,7 +47,8 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The run, its rendered test views, an orbit video, the model for other programs, metrics and the total time."""
+    """The run, its rendered test views, an orbit video, the model for other programs, metrics and
+    the total time."""
 
     run_dir: Path
     images: Path
@@ -58,10 +59,13 @@ class DemoResult:
 
 
 def run_demo(out: Path, options: DemoOptions = DemoOptions()) -> DemoResult:
-    """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty. Raises DyngsError."""
+    """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty. Raises
+    DyngsError."""
     start = time.perf_counter()
     with claimed_folder(out) as folder:
-        capture, run_dir, images, video = (folder / name for name in ("capture", "run", "images", "orbit.mp4"))
+        capture, run_dir, images, video = (
+            folder / name for name in ("capture", "run", "images", "orbit.mp4")
+        )
         print(f"[1/4] ray tracing the images of the demo scene into {capture}", flush=True)
         moving = DynamicOptions(size=options.size, num_times=options.num_times, samples=3)
         write_dynamic_capture("spin", capture, moving)
@@ -94,12 +98,15 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
     )
     config = load_config(packaged_preset("dynamic"), overrides)
     data = config.data.model_copy(update={"root": capture.absolute()})
-    return config.model_copy(update={"data": data, "run": config.run.model_copy(update={"dir": run_dir})})
+    return config.model_copy(
+        update={"data": data, "run": config.run.model_copy(update={"dir": run_dir})}
+    )
 
 
 @contextmanager
 def claimed_folder(out: Path) -> Iterator[Path]:
-    """Yield the first of ``out``, ``out-2``, ``out-3``... that holds nothing, locked against other demos."""
+    """Yield the first of ``out``, ``out-2``, ``out-3``... that holds nothing, locked against other
+    demos."""
     with ExitStack() as stack:
         for number in range(1, 1001):
             folder = out if number == 1 else out.with_name(f"{out.name}-{number}")
@@ -112,12 +119,16 @@ def claimed_folder(out: Path) -> Iterator[Path]:
             if is_unused(folder):
                 yield folder
                 return
-    raise DyngsError(f"{out}: so many demos lie there already; delete some or give --out another folder")
+    raise DyngsError(
+        f"{out}: so many demos lie there already; delete some or give --out another folder"
+    )
 
 
 def is_unused(folder: Path) -> bool:
     """Whether ``folder`` can be made, or holds at most a lock file."""
-    return not folder.exists() or (folder.is_dir() and all(path.name == LOCK_NAME for path in folder.iterdir()))
+    return not folder.exists() or (
+        folder.is_dir() and all(path.name == LOCK_NAME for path in folder.iterdir())
+    )
 
 
 def result_table(result: DemoResult) -> Table:

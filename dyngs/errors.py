@@ -1,4 +1,5 @@
-"""The one exception type that users see as a single line, and the boundary at which a reader's faults become it."""
+"""The one exception type that users see as a single line, and the boundary at which a reader's
+faults become it."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class DyngsError(Exception):
     """
 
     def __str__(self) -> str:
-        """The message on one line without anything that a terminal would obey, whatever names and values it quotes."""
+        """The message on one line without anything that a terminal would obey, whatever names and
+        values it quotes."""
         return printable(super().__str__())
 
 
@@ -38,12 +40,16 @@ class NoCaptureError(DyngsError):
 
 
 @contextmanager
-def reading(path: str | os.PathLike[str], advice: str = "copy or export it again") -> Generator[None]:
-    """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first error as its cause.
+def reading(
+    path: str | os.PathLike[str], advice: str = "copy or export it again"
+) -> Generator[None]:
+    """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first
+    error as its cause.
 
-    For the readers of files from others: their parsers raise more kinds of errors than anybody can list. A DyngsError
-    passes as it is. What the file has no part in belongs outside the block, because a fault of our own would be blamed
-    on the file there (``dyngs --debug`` shows the cause).
+    For the readers of files from others: their parsers raise more kinds of errors than anybody can
+    list. A DyngsError passes as it is. What the file has no part in belongs outside the block,
+    because a fault of our own would be blamed on the file there (``dyngs --debug`` shows the
+    cause).
     """
     where = os.fspath(path)
     try:
@@ -51,33 +57,44 @@ def reading(path: str | os.PathLike[str], advice: str = "copy or export it again
     except DyngsError:
         raise
     except MemoryError as cause:
-        raise DyngsError(f"{where}: reading it takes more memory than there is; {advice}") from cause
+        raise DyngsError(
+            f"{where}: reading it takes more memory than there is; {advice}"
+        ) from cause
     except Exception as cause:
-        raise DyngsError(f"{where}: cannot be read ({reason(cause).removesuffix(f': {where}')}); {advice}") from cause
+        raise DyngsError(
+            f"{where}: cannot be read ({reason(cause).removesuffix(f': {where}')}); {advice}"
+        ) from cause
 
 
 def require_name(text: str) -> None:
-    """Nothing, if ``text`` may name a file: no NUL, nothing that is no character. Raises DyngsError."""
+    """Nothing, if ``text`` may name a file: no NUL, nothing that is no character. Raises
+    DyngsError."""
     try:
         if b"\0" not in os.fsencode(text):
             return
     except UnicodeEncodeError:
         pass
-    raise DyngsError(f"{printable(text, _MAX_REASON)!r} holds a character that no name or path may hold; remove it")
+    raise DyngsError(
+        f"{printable(text, _MAX_REASON)!r} holds a character that no name or path may hold; remove it"
+    )
 
 
 def require_regular(path: str | os.PathLike[str]) -> None:
-    """Nothing, if ``path`` is a file, a folder or not there: what reads a pipe or a device may never end."""
+    """Nothing, if ``path`` is a file, a folder or not there: what reads a pipe or a device may
+    never end."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise DyngsError(f"{os.fspath(path)}: is no file but a pipe, a device or the like; put a file there")
+        raise DyngsError(
+            f"{os.fspath(path)}: is no file but a pipe, a device or the like; put a file there"
+        )
 
 
 def reason(error: BaseException) -> str:
-    """Return the text of ``error`` on one short line of printable characters; its type where it does not say much."""
+    """Return the text of ``error`` on one short line of printable characters; its type where it
+    does not say much."""
     if isinstance(error, OSError) and error.strerror:
         where = f": {error.filename}" if error.filename is not None else ""
         text = f"{error.strerror}{where}"
@@ -87,7 +104,8 @@ def reason(error: BaseException) -> str:
 
 
 def as_word(path: str | os.PathLike[str]) -> str:
-    """Return a path as a word of a command that can be copied to a shell, whatever characters it holds."""
+    """Return a path as a word of a command that can be copied to a shell, whatever characters it
+    holds."""
     text = os.fspath(path)
     return quoted(f"./{text}" if text.startswith("-") else text)
 
@@ -95,7 +113,9 @@ def as_word(path: str | os.PathLike[str]) -> str:
 def quoted(text: str) -> str:
     """Return ``text`` as a word for a shell, with escapes ($'...') where stdout cannot show it."""
     encoding = getattr(sys.stdout, "encoding", None) or "ascii"
-    if printable(text) == text and text == text.encode(encoding, "replace").decode(encoding, "replace"):
+    if printable(text) == text and text == text.encode(encoding, "replace").decode(
+        encoding, "replace"
+    ):
         return shlex.quote(text)
     try:
         name = os.fsencode(text)
@@ -111,7 +131,8 @@ def counted(number: int, noun: str) -> str:
 
 
 def printable(text: str, length: int | None = None) -> str:
-    """``text`` on one line, what a terminal would obey or cannot show as escapes, with ``...`` beyond ``length``."""
+    """``text`` on one line, what a terminal would obey or cannot show as escapes, with ``...``
+    beyond ``length``."""
     shown = escaped(" ".join(text.split()))
     return shown if length is None or len(shown) <= length else f"{shown[: length - 3]}..."
 
@@ -128,4 +149,6 @@ def warn(text: str) -> None:
 
 def escaped(line: str) -> str:
     """Return a line with escapes for all that a terminal would obey or cannot show."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line
+    )

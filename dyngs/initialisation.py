@@ -9,7 +9,8 @@ from torch import Tensor
 
 
 def glorot(fan_in: int, fan_out: int, generator: torch.Generator) -> Tensor:
-    """Return (fan_out, fan_in) weights, uniform within sqrt(6 / (fan_in + fan_out)) (Glorot and Bengio 2010).
+    """Return (fan_out, fan_in) weights, uniform within sqrt(6 / (fan_in + fan_out)) (Glorot and
+    Bengio 2010).
 
     They are drawn on the CPU, so that they are the same whatever device trains them.
     """

@@ -45,9 +45,12 @@ from dyngs.training.trainer import Trainer, ViewSampler
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
 MANY_ALIKE = 0.05
-"""Fraction of the opaque pixels of the background's colour from which moving things are found by their silhouettes."""
-EARLY_OPACITY = 0.2  # fraction of train.alpha_weight before other moving things, until their motion is followed
-FULL_OPACITY_FROM = 0.6  # fraction of the run; measured as the others, see docs/benchmarks.md#backgrounds
+"""Fraction of the opaque pixels of the background's colour from which moving things are found by
+their silhouettes."""
+# fraction of train.alpha_weight before other moving things, until their motion is followed
+EARLY_OPACITY = 0.2
+# fraction of the run; measured as the others, see docs/benchmarks.md#backgrounds
+FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
 
@@ -77,7 +80,8 @@ def assemble(
 
     Args:
         capture: as ``prepared`` returned it; None: it is read now.
-        restored: a checkpoint will be, so that it does not matter where the model begins: no points are triangulated.
+        restored: a checkpoint will be, so that it does not matter where the model begins: no points
+            are triangulated.
         images: the training images of another trainer of the same ones; None: they are opened.
         held_out: indices of training views that are never trained on.
         first: Gaussians that it goes on from; None: it begins as ``config.init`` says.
@@ -89,14 +93,21 @@ def assemble(
         config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
-        images = ImageLoader(capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads())
+        images = ImageLoader(
+            capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
+        )
     priors = _priors(config, capture, images)
     if not priors.masks:
         images = images.without_motion_masks()
-    background, extent = resolved_background(config, capture), surroundings(capture).extent
-    model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator, first))
-    refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
-    robust, exposures = _robust(config, capture, images), exposures_of(config.train, images)
+    background = resolved_background(config, capture)
+    extent = surroundings(capture).extent
+    model = kind_of(config.model).start(
+        RunStart(config, asked, capture, images, background, extent, generator, first)
+    )
+    # before what asks the images for corrected cameras
+    refinement = _refinement(config, images, extent)
+    robust = _robust(config, capture, images)
+    exposures = exposures_of(config.train, images)
     early = _early_opacity(config, capture, images, background)
     findings: list[str] = []
     if capture.has_alpha and config.train.alpha_weight == 0 and background != "random":
@@ -136,13 +147,16 @@ def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
     """Return the scene of a checkpoint of ``model``.
 
     Raises:
-        DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names the file.
+        DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names
+            the file.
     """
     with reading(checkpoint.name, OTHER_CONFIG):
         try:
             return kind_of(model).restore(model, checkpoint)
         except KeyError as missing:
-            raise DyngsError(f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew") from None
+            raise DyngsError(
+                f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew"
+            ) from None
 
 
 def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
@@ -151,7 +165,8 @@ def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene
 
 
 def prepared(config: Config) -> Capture:
-    """Return the capture of a run with the points that its scene begins with, see ``with_first_points``.
+    """Return the capture of a run with the points that its scene begins with, see
+    ``with_first_points``.
 
     What is suspicious about the capture, and where the points are from, is printed to stderr.
     """
@@ -159,7 +174,8 @@ def prepared(config: Config) -> Capture:
 
 
 def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
-    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others need none."""
+    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
+    need none."""
     lines: list[str] = []
     if config.model.begins_with_points:
         init = config.init
@@ -167,15 +183,22 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
             capture, lines = with_first_points(capture, config.data, init)
         elif isinstance(init, RandomInit):
             views = capture.splits["train"]
-            why = outside_of_cube(views, cube_half_side(init.half_extent, views, capture.world_scale))
-            lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]
+            why = outside_of_cube(
+                views, cube_half_side(init.half_extent, views, capture.world_scale)
+            )
+            lines = (
+                []
+                if why is None
+                else [f"init.kind=random draws points around the origin, but {why}: give auto"]
+            )
     for line in [] if quiet else [*lines, *before_training(capture)]:
         warn(line)
     return capture
 
 
 def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors:
-    """Return the priors of the capture that are used; none for people, whose poses say how they move."""
+    """Return the priors of the capture that are used; none for people, whose poses say how they
+    move."""
     if config.model.is_posed or not config.model.draws_whole_images:
         return UsedPriors()
     moves = config.model.may_move and len(set(training_times(capture))) > 1
@@ -191,7 +214,8 @@ def _robust(config: Config, capture: Capture, images: ImageLoader) -> RobustMask
 
 
 def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefinement | None:
-    """Return the refinement of the training cameras, if it is requested; ``images`` have corrected cameras then."""
+    """Return the refinement of the training cameras, if it is requested; ``images`` have corrected
+    cameras then."""
     if config.camera.refine != "always":
         return None
     refinement = CameraRefinement(images.views, size, config.train.steps)
@@ -205,7 +229,12 @@ def _early_opacity(config: Config, capture: Capture, images: ImageLoader, backgr
     It depends on the capture alone, so that a moving model begins exactly as a static one.
     """
     is_still = len(set(training_times(capture))) < 2
-    if is_still or not capture.has_alpha or config.train.alpha_weight == 0 or background == "random":
+    if (
+        is_still
+        or not capture.has_alpha
+        or config.train.alpha_weight == 0
+        or background == "random"
+    ):
         return 1.0
     shown = (images[i] for i in evenly_spaced(len(images), ALIKE_IMAGES))
     alike = share_alike(shown, background_colour(background))

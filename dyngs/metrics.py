@@ -1,9 +1,9 @@
 """Image metrics: PSNR, SSIM, FLIP and LPIPS, with the conventions written out.
 
-All functions take images (H, W, 3), display-referred sRGB, clamped here to [0, 1]; nothing is rounded to 8 bit.
-``mask`` (H, W) holds weights in [0, 1], 1 = counts, 0 = ignore; a mask of zeros gives NaN. FLIP and LPIPS depend on
-optional packages: where one is missing, the result is a ``MetricValue`` with the reason and no value. Nothing is ever
-downloaded.
+All functions take images (H, W, 3), display-referred sRGB, clamped here to [0, 1]; nothing is
+rounded to 8 bit. ``mask`` (H, W) holds weights in [0, 1], 1 = counts, 0 = ignore; a mask of zeros
+gives NaN. FLIP and LPIPS depend on optional packages: where one is missing, the result is a
+``MetricValue`` with the reason and no value. Nothing is ever downloaded.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from torch import Tensor
 LpipsNet = Literal["alex", "vgg", "squeeze"]
 
 MAX_PSNR = 100.0
-"""Reported for images that agree to a mean squared error of 1e-10 or better, so that no infinity enters a mean."""
+"""Reported for images that agree to a mean squared error of 1e-10 or better, so that no infinity
+enters a mean."""
 
 _WINDOW, _SIGMA = 11, 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+_C1 = 0.01**2
+_C2 = 0.03**2
 _FLIP_PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
 """FLIP's default viewing conditions: 0.7 m from a monitor 0.7 m and 3840 px wide."""
 
@@ -38,7 +40,8 @@ class MetricValue:
 
 
 def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """Return the peak signal-to-noise ratio in dB over all pixels and channels, at most ``MAX_PSNR``."""
+    """Return the peak signal-to-noise ratio in dB over all pixels and channels, at most
+    ``MAX_PSNR``."""
     squared = (_clamped(rendered).double() - _clamped(truth).double()).square()
     mse = _weighted_mean(squared, mask)
     return math.nan if math.isnan(mse) else -10 * math.log10(max(mse, 10 ** (-MAX_PSNR / 10)))
@@ -47,8 +50,9 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     """Return the mean structural similarity in [-1, 1] with the convention of 3DGS.
 
-    Gaussian window 11x11 with sigma 1.5, zero padding, data range 1, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
-    channels. With a mask, ignored pixels are replaced by the truth and the map is weighted (Wang et al. 2004).
+    Gaussian window 11x11 with sigma 1.5, zero padding, data range 1, C1 = 0.01^2, C2 = 0.03^2, mean
+    over pixels and channels. With a mask, ignored pixels are replaced by the truth and the map is
+    weighted (Wang et al. 2004).
     """
     return _weighted_mean(ssim_map(masked(rendered, truth, mask), truth), mask)
 
@@ -56,8 +60,9 @@ def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
     """Return (H, W, 3) structural similarity per pixel and channel; see ``ssim``.
 
-    By way of the difference d and the sum s, whose variances do not cancel where the images agree or are white: with
-    P = mean_a^2 + mean_b^2 + C1 and Q = var_a + var_b + C2 it is (1 - mean_d^2 / P) (1 - var_d / Q).
+    By way of the difference d and the sum s, whose variances do not cancel where the images agree
+    or are white: with P = mean_a^2 + mean_b^2 + C1 and Q = var_a + var_b + C2 it is (1 - mean_d^2 /
+    P) (1 - var_d / Q).
     """
     a, b = (_clamped(x).permute(2, 0, 1)[:, None] for x in (rendered, truth))
     offsets = torch.arange(_WINDOW, dtype=a.dtype, device="cpu") - _WINDOW // 2
@@ -65,7 +70,8 @@ def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
     taps = (window / window.sum()).tolist()
 
     def blur(x: Tensor) -> Tensor:
-        for axis in (-1, -2):  # added up shift by shift: a sixth of the time of conv2d with one channel
+        for axis in (-1, -2):
+            # added up shift by shift: a sixth of the time of conv2d with one channel
             shifts = [x.narrow(axis, k, x.shape[axis] - _WINDOW + 1) for k in range(_WINDOW)]
             x = shifts[0] * taps[0]
             for shift, tap in zip(shifts[1:], taps[1:], strict=True):
@@ -86,24 +92,38 @@ def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
 
 
 def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricValue:
-    """Return the mean LDR-FLIP error in [0, 1], 0 = equal, at 67.02 pixels per degree (Andersson et al. 2020).
+    """Return the mean LDR-FLIP error in [0, 1], 0 = equal, at 67.02 pixels per degree (Andersson et
+    al. 2020).
 
     Needs the package ``flip-evaluator`` (the extra ``metrics``).
     """
     if find_spec("flip_evaluator") is None:
-        return MetricValue(None, "the package flip-evaluator is not installed (pip install 'dyngs[metrics]')")
+        return MetricValue(
+            None, "the package flip-evaluator is not installed (pip install 'dyngs[metrics]')"
+        )
     from flip_evaluator import evaluate  # pyright: ignore[reportMissingImports]
 
-    a, b = (_clamped(x).cpu().float().contiguous().numpy() for x in (truth, masked(rendered, truth, mask)))
+    a, b = (
+        _clamped(x).cpu().float().contiguous().numpy()
+        for x in (truth, masked(rendered, truth, mask))
+    )
     viewing = {"ppd": _FLIP_PIXELS_PER_DEGREE}
-    error, _, _ = evaluate(a, b, "LDR", applyMagma=False, computeMeanError=False, parameters=viewing)
+    error, _, _ = evaluate(
+        a, b, "LDR", applyMagma=False, computeMeanError=False, parameters=viewing
+    )
     # Our own mean, as it takes weights and sums in a fixed order.
-    return MetricValue(_weighted_mean(torch.from_numpy(error)[..., :1], mask if mask is None else mask.cpu()))
+    return MetricValue(
+        _weighted_mean(torch.from_numpy(error)[..., :1], mask if mask is None else mask.cpu())
+    )
 
 
 def masked(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
     """Return (H, W, 3) the rendered image with ignored pixels replaced by the truth."""
-    return rendered if mask is None else torch.lerp(truth, rendered, mask[..., None].to(rendered.dtype))
+    return (
+        rendered
+        if mask is None
+        else torch.lerp(truth, rendered, mask[..., None].to(rendered.dtype))
+    )
 
 
 @dataclass(frozen=True)
@@ -118,33 +138,48 @@ class Lpips:
         """Return the perceptual distance, 0 = equal (Zhang et al. 2018)."""
         if self.distance is None:
             return MetricValue(None, self.reason)
-        a, b = (_clamped(x).float().permute(2, 0, 1)[None] * 2 - 1 for x in (masked(rendered, truth, mask), truth))
+        a, b = (
+            _clamped(x).float().permute(2, 0, 1)[None] * 2 - 1
+            for x in (masked(rendered, truth, mask), truth)
+        )
         try:
             with torch.no_grad():
                 return MetricValue(self.distance(a, b).item())
         except RuntimeError:
-            return MetricValue(None, f"images of {a.shape[3]}x{a.shape[2]} are too small for LPIPS ({self.net})")
+            return MetricValue(
+                None, f"images of {a.shape[3]}x{a.shape[2]} are too small for LPIPS ({self.net})"
+            )
 
 
 def load_lpips(net: LpipsNet = "alex", device: torch.device | str = "cpu") -> Lpips:
-    """Return LPIPS on ``device`` from ``torchmetrics`` or ``lpips``, only if the weights are already in torch's cache.
+    """Return LPIPS on ``device`` from ``torchmetrics`` or ``lpips``, only if the weights are
+    already in torch's cache.
 
     Both packages would download missing weights, hence the check before either is constructed.
     """
-    package = next((name for name in ("torchmetrics", "lpips") if find_spec(name) is not None), None)
+    package = next(
+        (name for name in ("torchmetrics", "lpips") if find_spec(name) is not None), None
+    )
     if package is None or find_spec("torchvision") is None:
-        return Lpips(net, "the packages lpips (or torchmetrics) and torchvision are not installed (dyngs[metrics])")
+        return Lpips(
+            net,
+            "the packages lpips (or torchmetrics) and torchvision are not installed (dyngs[metrics])",
+        )
     try:
         weights = _backbone_file(net)
         if not weights.is_file():
-            return Lpips(net, f"the weights {weights.name} are not in torch's cache ({weights.parent})")
+            return Lpips(
+                net, f"the weights {weights.name} are not in torch's cache ({weights.parent})"
+            )
         return Lpips(net, None, _lpips_distance(package, net, device))
-    except Exception as error:  # whatever a third-party package raises is a reason, never a failed evaluation
+    except Exception as error:
+        # whatever a third-party package raises is a reason, never a failed evaluation
         return Lpips(net, f"{package} could not be set up: {' '.join(str(error).split())[:200]}")
 
 
 def _backbone_file(net: LpipsNet) -> Path:
-    """Return the path where torch looks for the ImageNet weights of ``net`` before it downloads them."""
+    """Return the path where torch looks for the ImageNet weights of ``net`` before it downloads
+    them."""
     from torchvision import models  # pyright: ignore[reportMissingImports]
 
     weights = {
@@ -155,7 +190,9 @@ def _backbone_file(net: LpipsNet) -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints" / weights[net].url.rsplit("/", 1)[1]
 
 
-def _lpips_distance(package: str, net: LpipsNet, device: torch.device | str) -> Callable[[Tensor, Tensor], Tensor]:
+def _lpips_distance(
+    package: str, net: LpipsNet, device: torch.device | str
+) -> Callable[[Tensor, Tensor], Tensor]:
     if package == "lpips":
         from lpips import LPIPS  # pyright: ignore[reportMissingImports]
 
@@ -166,7 +203,8 @@ def _lpips_distance(package: str, net: LpipsNet, device: torch.device | str) -> 
 
 
 def _weighted_mean(values: Tensor, mask: Tensor | None) -> float:
-    """Return the mean of ``values`` (H, W, C) weighted with ``mask`` (H, W), in float64; NaN where all weights are 0.
+    """Return the mean of ``values`` (H, W, C) weighted with ``mask`` (H, W), in float64; NaN where
+    all weights are 0.
 
     Of all numbers at once: a mean over three channels first takes torch several times as long.
     """

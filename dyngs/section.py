@@ -1,4 +1,5 @@
-"""The base classes of all sections of the configuration, and ranges of numbers that several of them use."""
+"""The base classes of all sections of the configuration, and ranges of numbers that several of them
+use."""
 
 from __future__ import annotations
 
@@ -23,17 +24,19 @@ class Section(BaseModel):
 
 
 class ModelSection(Section):
-    """Base of the sections of all kinds, with what code that does not otherwise care for kinds asks of them.
+    """Base of the sections of all kinds, with what code that does not otherwise care for kinds asks
+    of them.
 
     Attributes:
         made_of_gaussians: it has Gaussians, which a strategy adds and limits remove.
         begins_with_points: they begin where the points of the capture are.
         is_network: it predicts scenes, and is trained on several captures.
-        is_posed: a body moves it: priors on motion say nothing, and poses are refined instead of cameras.
+        is_posed: a body moves it: priors on motion say nothing, and poses are refined instead of
+            cameras.
         source_views: images that a network predicts from, unless it is told otherwise.
         may_move: a field moves it over the times of the capture.
-        draws_whole_images: in training; what needs these (priors, masks of what disagrees, refined cameras, exposures)
-            does not go with a model that draws some pixels of an image.
+        draws_whole_images: in training; what needs these (priors, masks of what disagrees, refined
+            cameras, exposures) does not go with a model that draws some pixels of an image.
         is_trained: not only predicted, so that a run may be unfinished.
     """
 
@@ -62,7 +65,10 @@ class SceneModel(ModelSection):
     made_of_gaussians: ClassVar[bool] = True
 
     sh_degree: int = Field(
-        default=3, ge=0, le=4, description="degree of the spherical harmonics of a colour; 0: the same from all sides"
+        default=3,
+        ge=0,
+        le=4,
+        description="degree of the spherical harmonics of a colour; 0: the same from all sides",
     )
     rasterize_mode: RasterizeMode = Field(
         default=RasterizeMode.CLASSIC,
@@ -74,13 +80,18 @@ class SceneModel(ModelSection):
         le=3.4e38,
         description="variance of the 2D low-pass filter, px^2; Mip-Splatting: 0.1 with antialiased",
     )
-    filter_3d: bool = Field(default=False, description="3D smoothing filter of Mip-Splatting (Yu et al. 2024)")
+    filter_3d: bool = Field(
+        default=False, description="3D smoothing filter of Mip-Splatting (Yu et al. 2024)"
+    )
     near: Length = Field(
-        default="auto", description="near plane, in the unit of the capture; auto: a fraction of the scene extent"
+        default="auto",
+        description="near plane, in the unit of the capture; auto: a fraction of the scene extent",
     )
     alpha_min: CutOff = Field(
-        default=1 / 255, description="a pixel skips Gaussians with an alpha below this there; 1/255 in 3DGS"
+        default=1 / 255,
+        description="a pixel skips Gaussians with an alpha below this there; 1/255 in 3DGS",
     )
     transmittance_min: CutOff = Field(
-        default=1e-4, description="blending of a pixel ends when its transmittance falls below this; 1e-4 in 3DGS"
+        default=1e-4,
+        description="blending of a pixel ends when its transmittance falls below this; 1e-4 in 3DGS",
     )

@@ -1,4 +1,5 @@
-"""Named tensors with a role: what a scene, an optimizer or a strategy must keep to go on from where it is."""
+"""Named tensors with a role: what a scene, an optimizer or a strategy must keep to go on from where
+it is."""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def moved_to(value: T, device: torch.device | str) -> T:
-    """Return a copy of ``value`` with its tensors on ``device``: by its own ``to`` if it has one, else by its parts."""
+    """Return a copy of ``value`` with its tensors on ``device``: by its own ``to`` if it has one,
+    else by its parts."""
     own: Any = value
     if hasattr(value, "to"):
         return own.to(device=device)
@@ -71,8 +73,11 @@ def moved_to(value: T, device: torch.device | str) -> T:
     return value
 
 
-def fields_moved_to(value: T, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> T:
-    """Return a copy of the dataclass ``value`` with its fields on ``device``, as ``moved_to`` has them.
+def fields_moved_to(
+    value: T, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+) -> T:
+    """Return a copy of the dataclass ``value`` with its fields on ``device``, as ``moved_to`` has
+    them.
 
     Args:
         value: tensors, and parts with tensors.

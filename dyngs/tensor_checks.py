@@ -1,6 +1,7 @@
 """Checks of tensors read from a file, before anything is computed with them.
 
-A checksum finds accidents, not a file made to do harm: kernels and indexing rely on what is checked here.
+A checksum finds accidents, not a file made to do harm: kernels and indexing rely on what is checked
+here.
 """
 
 from __future__ import annotations
@@ -13,9 +14,14 @@ from torch import Tensor
 REAL = torch.float32
 
 
-def require_tensor(name: str, x: Tensor, shape: Sequence[int | None], dtype: torch.dtype | None = REAL) -> Tensor:
-    """Return ``x`` if it has this shape (None: any size) and dtype (None: any floating point), and is finite."""
-    fits = len(x.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, x.shape, strict=True))
+def require_tensor(
+    name: str, x: Tensor, shape: Sequence[int | None], dtype: torch.dtype | None = REAL
+) -> Tensor:
+    """Return ``x`` if it has this shape (None: any size) and dtype (None: any floating point), and
+    is finite."""
+    fits = len(x.shape) == len(shape) and all(
+        n in (None, m) for n, m in zip(shape, x.shape, strict=True)
+    )
     if not fits or (x.dtype != dtype if dtype is not None else not x.is_floating_point()):
         sizes = ", ".join("any" if n is None else str(n) for n in shape)
         wanted = "real numbers" if dtype is None else _said(dtype)
@@ -28,7 +34,8 @@ def require_tensor(name: str, x: Tensor, shape: Sequence[int | None], dtype: tor
 def require_indices(
     name: str, x: Tensor, shape: Sequence[int | None], count: int, dtype: torch.dtype = torch.int64
 ) -> Tensor:
-    """Return ``x`` if it holds whole numbers from 0 to ``count`` - 1 in this shape; else raise ValueError."""
+    """Return ``x`` if it holds whole numbers from 0 to ``count`` - 1 in this shape; else raise
+    ValueError."""
     require_tensor(name, x, shape, dtype)
     if bool(((x < 0) | (x >= count)).any()):
         raise ValueError(f"'{name}' names something beyond the {count} that there are")
@@ -43,7 +50,8 @@ def require_ascending(name: str, x: Tensor) -> Tensor:
 
 
 def require_moments(name: str, x: Tensor) -> Tensor:
-    """Return ``x`` (N,) if it holds distinct times from 0 to 1, ascending; else raise ValueError."""
+    """Return ``x`` (N,) if it holds distinct times from 0 to 1, ascending; else raise
+    ValueError."""
     require_ascending(name, require_tensor(name, x, (None,), None))
     if bool(((x < 0) | (x > 1)).any()):
         raise ValueError(f"'{name}' holds times outside [0, 1]")

@@ -1,4 +1,5 @@
-"""``python -m fuzz READER --minutes N``: fuzz readers, print one line for each, keep failures in the corpus."""
+"""``python -m fuzz READER --minutes N``: fuzz readers, print one line for each, keep failures in
+the corpus."""
 
 from __future__ import annotations
 
@@ -8,7 +9,16 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from fuzz.campaign import CORPUS, Tally, campaign, cpu_seconds, keep, run_cases, seeds_of, stored_cases
+from fuzz.campaign import (
+    CORPUS,
+    Tally,
+    campaign,
+    cpu_seconds,
+    keep,
+    run_cases,
+    seeds_of,
+    stored_cases,
+)
 from fuzz.readers import READERS
 from fuzz.verdict import Outcome, Verdict
 from fuzz.worker import Limits, import_everything
@@ -37,16 +47,32 @@ def main() -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
     parser.add_argument(
-        "readers", nargs="+", choices=[*READERS, "all"], metavar="READER", help="or all: " + ", ".join(READERS)
+        "readers",
+        nargs="+",
+        choices=[*READERS, "all"],
+        metavar="READER",
+        help="or all: " + ", ".join(READERS),
     )
-    parser.add_argument("--minutes", type=float, default=60.0, metavar="N", help="all readers together (default 60)")
-    parser.add_argument("--inputs", type=int, default=10**9, metavar="N", help="at most so many for each reader")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the changes (default 0)")
     parser.add_argument(
-        "--seconds", type=float, default=5.0, metavar="N", help="of processor time for a case (default 5)"
+        "--minutes", type=float, default=60.0, metavar="N", help="all readers together (default 60)"
+    )
+    parser.add_argument(
+        "--inputs", type=int, default=10**9, metavar="N", help="at most so many for each reader"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="of the changes (default 0)"
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=5.0,
+        metavar="N",
+        help="of processor time for a case (default 5)",
     )
     parser.add_argument("--replay", action="store_true", help="only the corpus")
-    parser.add_argument("--no-keep", dest="keep", action="store_false", help="leave the corpus as it is")
+    parser.add_argument(
+        "--no-keep", dest="keep", action="store_false", help="leave the corpus as it is"
+    )
     parser.add_argument("--verbose", action="store_true", help="say where failures come from")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write counts and failures there")
     return parser
@@ -65,7 +91,10 @@ def replayed(name: str) -> Tally:
     import tempfile
     import time
 
-    reader, tally, begin, before = READERS[name], Tally(name), time.monotonic(), cpu_seconds()
+    reader = READERS[name]
+    tally = Tally(name)
+    begin = time.monotonic()
+    before = cpu_seconds()
     left = list(enumerate(stored_cases(name, seeds_of(reader)).items()))
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         while left:
@@ -76,7 +105,11 @@ def replayed(name: str) -> Tally:
                 tally.outcomes[verdict.outcome] += 1
                 if verdict.outcome is Outcome.FAILED:
                     file, case = dict(left)[done]
-                    named = Verdict(verdict.outcome, verdict.reason, f"{CORPUS.name}/{name}/{file}: {verdict.detail}")
+                    named = Verdict(
+                        verdict.outcome,
+                        verdict.reason,
+                        f"{CORPUS.name}/{name}/{file}: {verdict.detail}",
+                    )
                     tally.failures.setdefault(verdict.reason, []).append((case, named))
             left = [pair for pair in left if pair[0] > done]
     tally.seconds = cpu_seconds() - before
@@ -84,8 +117,14 @@ def replayed(name: str) -> Tally:
 
 
 def _as_json(tally: Tally) -> dict[str, object]:
-    failures = {reason: [verdict.detail for _, verdict in found] for reason, found in tally.failures.items()}
-    return {"inputs": tally.inputs, **{o.value: tally.outcomes[o] for o in Outcome}, "failures": failures}
+    failures = {
+        reason: [verdict.detail for _, verdict in found] for reason, found in tally.failures.items()
+    }
+    return {
+        "inputs": tally.inputs,
+        **{o.value: tally.outcomes[o] for o in Outcome},
+        "failures": failures,
+    }
 
 
 def _explain(tally: Tally, verbose: bool) -> None:

@@ -34,7 +34,19 @@ _TYPES = (
     "<M8[ns]",
     "<u8",
 )
-_SHAPES = ((), (0,), (1,), (2**31,), (2**40,), (2**62, 4), (-1,), (2**20, 2**20), (0, 2**40), (3, 0), (1,) * 40)
+_SHAPES = (
+    (),
+    (0,),
+    (1,),
+    (2**31,),
+    (2**40,),
+    (2**62, 4),
+    (-1,),
+    (2**20, 2**20),
+    (0, 2**40),
+    (3, 0),
+    (1,) * 40,
+)
 _ODD = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e300, -1e30, 1e-310, 1e19, 1e9, 1e-30, 5e-324)
 _BLOCK = 1 << 20
 _LARGEST = 1 << 24
@@ -84,14 +96,18 @@ def npz_changed(data: bytes, rng: Random) -> bytes:
         return bytes_changed(data, rng)
     if not members:
         return bytes_changed(data, rng)
-    i, change = rng.randrange(len(members)), rng.randrange(30)
+    i = rng.randrange(len(members))
+    change = rng.randrange(30)
     name, content = members[i]
     if change == 0:
         return bytes_changed(data, rng)
     if change == 1:
         del members[i]
     elif change == 2:
-        members[i] = (rng.choice(("x.npy", "../x.npy", name.removesuffix(".npy"), "a" * 300, "")), content)
+        members[i] = (
+            rng.choice(("x.npy", "../x.npy", name.removesuffix(".npy"), "a" * 300, "")),
+            content,
+        )
     elif change == 3:
         members.append(members[rng.randrange(len(members))])
     elif change == 4:
@@ -117,7 +133,9 @@ def _parts(data: bytes) -> tuple[bytes, dict, bytes]:
 def _joined(version: bytes, header: dict, body: bytes) -> bytes:
     text = repr(header).encode()
     text += b" " * (-(len(text) + 11) % 64) + b"\n"
-    return _MAGIC + version + len(text).to_bytes(2 if version[0] == 1 else 4, "little") + text + body
+    return (
+        _MAGIC + version + len(text).to_bytes(2 if version[0] == 1 else 4, "little") + text + body
+    )
 
 
 def _values_changed(data: bytes, rng: Random) -> bytes:
@@ -131,13 +149,27 @@ def _values_changed(data: bytes, rng: Random) -> bytes:
     change = rng.randrange(5)
     with np.errstate(all="ignore"):
         if change == 0:
-            array = array.astype(rng.choice(("f2", "f4", "f8", "i4", "u1", "b1", "c16", "U4", "S3")))
+            array = array.astype(
+                rng.choice(("f2", "f4", "f8", "i4", "u1", "b1", "c16", "U4", "S3"))
+            )
         elif change == 1:
-            array = rng.choice((array[:-1], array[None], array.ravel(), array.T)) if array.ndim else array[None]
+            array = (
+                rng.choice((array[:-1], array[None], array.ravel(), array.T))
+                if array.ndim
+                else array[None]
+            )
         else:
-            array = array.astype("f8") if array.dtype.kind != "f" and rng.random() < 0.5 else array.copy()
+            array = (
+                array.astype("f8")
+                if array.dtype.kind != "f" and rng.random() < 0.5
+                else array.copy()
+            )
             for _ in range(rng.choice((1, 1, 4))):
-                value = rng.choice(_ODD) if array.dtype.kind == "f" else rng.choice((0, -1, 1, 127, 2**31 - 1, 255))
+                value = (
+                    rng.choice(_ODD)
+                    if array.dtype.kind == "f"
+                    else rng.choice((0, -1, 1, 127, 2**31 - 1, 255))
+                )
                 array.reshape(-1)[rng.randrange(array.size)] = np.array(value).astype(array.dtype)
             if change == 2:
                 array = np.full_like(array, array.reshape(-1)[rng.randrange(array.size)])
@@ -148,7 +180,9 @@ def _values_changed(data: bytes, rng: Random) -> bytes:
 
 def _archive(members: list[tuple[str, bytes]], rng: Random) -> bytes:
     buffer = io.BytesIO()
-    method = rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA))
+    method = rng.choice(
+        (zipfile.ZIP_STORED, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
+    )
     with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", method) as archive:
         warnings.simplefilter("ignore")  # of names that are there twice
         for name, content in members:
@@ -166,17 +200,27 @@ def _zeros() -> bytes:
 
 
 def _with_bomb(members: list[tuple[str, bytes]], which: int, rng: Random) -> bytes:
-    """An archive one of whose members is 2 GB of zeros in 2 MB, written by hand as zipfile would compress it slowly."""
+    """An archive one of whose members is 2 GB of zeros in 2 MB, written by hand as zipfile would
+    compress it slowly."""
     count = rng.choice((64, 2048))
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     block = _zeros()
     size = count * _BLOCK
-    header = _joined(b"\x01\x00", {"descr": "<f8", "fortran_order": False, "shape": (size // 8,)}, b"")
+    header = _joined(
+        b"\x01\x00", {"descr": "<f8", "fortran_order": False, "shape": (size // 8,)}, b""
+    )
     first = packer.compress(header) + packer.flush(zlib.Z_FULL_FLUSH)
     content = first + block * count + packer.flush()
     name = members[which][0].encode()
     total = size + len(header)
     fields = struct.pack("<HHHHHIIIHH", 20, 0, 8, 0, 33, 0, len(content), total, len(name), 0)
     local = b"PK\x03\x04" + fields + name + content
-    central = b"PK\x01\x02" + struct.pack("<H", 20) + fields + struct.pack("<HHHII", 0, 0, 0, 0, 0) + name
-    return local + central + b"PK\x05\x06" + struct.pack("<HHHHIIH", 0, 0, 1, 1, len(central), len(local), 0)
+    central = (
+        b"PK\x01\x02" + struct.pack("<H", 20) + fields + struct.pack("<HHHII", 0, 0, 0, 0, 0) + name
+    )
+    return (
+        local
+        + central
+        + b"PK\x05\x06"
+        + struct.pack("<HHHHIIH", 0, 0, 1, 1, len(central), len(local), 0)
+    )

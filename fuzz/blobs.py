@@ -7,15 +7,73 @@ import struct
 from random import Random
 
 NUMBERS = (
-    *("0", "-1", "1", "2", "-0.0", "0.5", "255", "256", "65536", "2147483647", "2147483648", "4294967295"),
-    *("9223372036854775807", "18446744073709551616", "1e-310", "5e-324", "1e-30", "1e9", "1e19", "1e38", "1e300"),
-    *("1e308", "1e999", "-1e999", "nan", "NaN", "inf", "-Infinity", "0x10", "0x_", "1_000", "1:30", "9" * 400),
+    *(
+        "0",
+        "-1",
+        "1",
+        "2",
+        "-0.0",
+        "0.5",
+        "255",
+        "256",
+        "65536",
+        "2147483647",
+        "2147483648",
+        "4294967295",
+    ),
+    *(
+        "9223372036854775807",
+        "18446744073709551616",
+        "1e-310",
+        "5e-324",
+        "1e-30",
+        "1e9",
+        "1e19",
+        "1e38",
+        "1e300",
+    ),
+    *(
+        "1e308",
+        "1e999",
+        "-1e999",
+        "nan",
+        "NaN",
+        "inf",
+        "-Infinity",
+        "0x10",
+        "0x_",
+        "1_000",
+        "1:30",
+        "9" * 400,
+    ),
 )
 """Numbers as text that parsers stumble over."""
 
 TEXTS = (
-    *("", " ", ".", "..", "/", "//", "../../precious/keep.txt", "/dev/null", "/dev/zero", "~", "~root/x", "a\x00b"),
-    *("\x1b[31mred\x1b[0m", "two\nlines", "tab\there", "caf\u00e9", "\u2028", "\u202eevil", "\ud800", "\U0001f600"),
+    *(
+        "",
+        " ",
+        ".",
+        "..",
+        "/",
+        "//",
+        "../../precious/keep.txt",
+        "/dev/null",
+        "/dev/zero",
+        "~",
+        "~root/x",
+        "a\x00b",
+    ),
+    *(
+        "\x1b[31mred\x1b[0m",
+        "two\nlines",
+        "tab\there",
+        "caf\u00e9",
+        "\u2028",
+        "\u202eevil",
+        "\ud800",
+        "\U0001f600",
+    ),
     *(
         "x" * 300,
         "a/" * 600,
@@ -39,14 +97,39 @@ _INTEGERS = {
     4: (0, 1, 2, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x10000, 0x00FFFFFF, 20000),
     8: (0, 1, 2**31, 2**32, 2**61, 2**62, 2**63 - 1, 2**63, 2**64 - 1, 2**40),
 }
-_FLOATS = (0.0, -0.0, -1.0, float("nan"), float("inf"), float("-inf"), 1e300, 1e-310, 3e38, 1e19, 1e-30)
+_FLOATS = (
+    0.0,
+    -0.0,
+    -1.0,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    1e300,
+    1e-310,
+    3e38,
+    1e19,
+    1e-30,
+)
 
 
 def bytes_changed(data: bytes, rng: Random) -> bytes:
     """Return ``data`` after one random mutation that knows nothing of its format."""
     if not data:
         return rng.choice((b"\0", b"{}", b"\xff" * 9))
-    change = rng.choice((_flipped, _flipped, _integer, _integer, _float, _cut, _doubled, _removed, _inserted, _zeroed))
+    change = rng.choice(
+        (
+            _flipped,
+            _flipped,
+            _integer,
+            _integer,
+            _float,
+            _cut,
+            _doubled,
+            _removed,
+            _inserted,
+            _zeroed,
+        )
+    )
     return change(data, rng)
 
 
@@ -63,7 +146,8 @@ def strings_changed(data: bytes, rng: Random) -> bytes:
     run = rng.choice(runs)
     new = rng.choice((*_LATIN, *(text.encode("utf-8", "surrogatepass") for text in TEXTS)))
     if rng.random() < 0.5:
-        new = (new + run[0])[: len(run[0])]  # of the same length, so that what follows stays in place
+        # of the same length, so that what follows stays in place
+        new = (new + run[0])[: len(run[0])]
     return data[: run.start()] + new + data[run.end() :]
 
 
@@ -71,7 +155,9 @@ def text_changed(data: bytes, rng: Random) -> bytes:
     """Return text with a number, a word or a line changed."""
     text = data.decode("utf-8", "surrogateescape")
     change = rng.choice((_number, _number, _number, _word, _word, _line, _line))
-    return change(text, rng).encode("utf-8", "surrogateescape" if "\ud800" not in text else "surrogatepass")
+    return change(text, rng).encode(
+        "utf-8", "surrogateescape" if "\ud800" not in text else "surrogatepass"
+    )
 
 
 def _number(text: str, rng: Random) -> str:
@@ -95,7 +181,8 @@ def _line(text: str, rng: Random) -> str:
     lines = text.splitlines(keepends=True)
     if not lines:
         return "\n"
-    i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
+    i = rng.randrange(len(lines))
+    j = rng.randrange(len(lines))
     change = rng.randrange(4)
     if change == 0:
         del lines[i]

@@ -1,4 +1,5 @@
-"""Fuzzing of one reader with many cases: workers are started, watched and replaced; failures are minimised and kept."""
+"""Fuzzing of one reader with many cases: workers are started, watched and replaced; failures are
+minimised and kept."""
 
 from __future__ import annotations
 
@@ -66,7 +67,9 @@ def seeds_of(reader: Reader) -> dict[str, Case]:
     return found
 
 
-def cases(seeds: dict[str, Case], name: str, seed: int, numbers: range) -> Iterator[tuple[int, Case]]:
+def cases(
+    seeds: dict[str, Case], name: str, seed: int, numbers: range
+) -> Iterator[tuple[int, Case]]:
     """Yield the cases with these ``numbers``; they depend on the arguments only."""
     for number in numbers:
         yield number, changed_case(seeds, Random(f"{name}/{seed}/{number}"))
@@ -87,11 +90,17 @@ def campaign(name: str, seed: int, inputs: int, seconds: float, limits: Limits =
     """Run ``inputs`` cases, or as many as ``seconds`` allow, and return their outcomes."""
     reader = READERS[name]
     seeds = seeds_of(reader)
-    tally, begin, number, before = Tally(name), time.monotonic(), 0, cpu_seconds()
+    tally = Tally(name)
+    begin = time.monotonic()
+    number = 0
+    before = cpu_seconds()
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
-        judged = dict(run_cases(reader, iter(enumerate(seeds.values())), Path(folder), limits, begin + 600))
+        judged = dict(
+            run_cases(reader, iter(enumerate(seeds.values())), Path(folder), limits, begin + 600)
+        )
     for i, case in enumerate(seeds.values()):
-        verdict = judged.get(i) or verdict_of(reader, case, limits)  # alone, if one before it ended the process
+        # alone, if one before it ended the process
+        verdict = judged.get(i) or verdict_of(reader, case, limits)
         if verdict.outcome is not Outcome.ACCEPTED:
             text = f"{verdict.reason} {verdict.detail}"
             tally.failures.setdefault(f"the seed {case.seed} is not accepted", []).append(
@@ -117,17 +126,20 @@ def campaign(name: str, seed: int, inputs: int, seconds: float, limits: Limits =
 def verdict_of(reader: Reader, case: Case, limits: Limits = STANDARD) -> Verdict:
     """Run one case in a process of its own and return its verdict."""
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
-        verdicts = list(run_cases(reader, iter([(0, case)]), Path(folder), limits, time.monotonic() + 600))
+        verdicts = list(
+            run_cases(reader, iter([(0, case)]), Path(folder), limits, time.monotonic() + 600)
+        )
     return verdicts[0][1]
 
 
 def run_cases(
     reader: Reader, numbered: Iterator[tuple[int, Case]], folder: Path, limits: Limits, until: float
 ) -> Iterator[tuple[int | None, Verdict]]:
-    """Yield numbers and verdicts up to the first case that ends the worker process, or the time ``until``.
+    """Yield numbers and verdicts up to the first case that ends the worker process, or the time
+    ``until``.
 
-    A case that ends the process, or hangs, is a failure; call again with the cases after it. If the process ends or
-    hangs between two cases, which is while the next is made, the number is None.
+    A case that ends the process, or hangs, is a failure; call again with the cases after it. If the
+    process ends or hangs between two cases, which is while the next is made, the number is None.
     """
     out, pipe = os.pipe()
     clear(folder)
@@ -164,7 +176,10 @@ def _verdicts(
             told = json.loads(line)
             begun = told[0]
             if len(told) > 1:
-                yield begun, Verdict(Outcome(told[1]["outcome"]), told[1]["reason"], told[1]["detail"])
+                yield (
+                    begun,
+                    Verdict(Outcome(told[1]["outcome"]), told[1]["reason"], told[1]["detail"]),
+                )
                 begun = None
                 if time.monotonic() > until:
                     return
@@ -178,9 +193,17 @@ def _death(status: int, folder: Path) -> Verdict:
     else:
         what = f"ends the process with {os.WEXITSTATUS(status)}"
     detail = _tail(folder)
-    own = [line for line in detail.splitlines() if line.startswith("  File") and f"{os.sep}dyngs{os.sep}" in line]
+    own = [
+        line
+        for line in detail.splitlines()
+        if line.startswith("  File") and f"{os.sep}dyngs{os.sep}" in line
+    ]
     where = own[0].rpartition("dyngs" + os.sep)[2].replace('"', "") if own else ""
-    return Verdict(Outcome.FAILED, f"{what} {where.split(',')[0]} {where.rpartition(' in ')[2]}".strip(), detail)
+    return Verdict(
+        Outcome.FAILED,
+        f"{what} {where.split(',')[0]} {where.rpartition(' in ')[2]}".strip(),
+        detail,
+    )
 
 
 def _tail(folder: Path) -> str:
@@ -201,7 +224,11 @@ def minimised(reader: Reader, case: Case, reason: str, seed: Case, tries: int = 
     for name in sorted(case.files.keys() | seed.files.keys()):
         if case.files.get(name) == seed.files.get(name):
             continue
-        files = {**case.files, name: seed.files[name]} if name in seed.files else _without(case.files, name)
+        files = (
+            {**case.files, name: seed.files[name]}
+            if name in seed.files
+            else _without(case.files, name)
+        )
         smaller = replace(case, files=files)
         if verdict_of(reader, smaller).reason == reason:
             case = smaller
@@ -213,8 +240,11 @@ def minimised(reader: Reader, case: Case, reason: str, seed: Case, tries: int = 
     return case
 
 
-def _nearer(reader: Reader, case: Case, reason: str, to: tuple[str, bytes], tries: int) -> tuple[Case, int]:
-    """Restore ranges of a file, if its length is unchanged, or else cut them out, as long as the case still fails."""
+def _nearer(
+    reader: Reader, case: Case, reason: str, to: tuple[str, bytes], tries: int
+) -> tuple[Case, int]:
+    """Restore ranges of a file, if its length is unchanged, or else cut them out, as long as the
+    case still fails."""
     name, original = to
     size = len(case.files[name])
     step = size // 2
@@ -241,13 +271,16 @@ def _without(files: dict[str, bytes], name: str) -> dict[str, bytes]:
 
 
 def keep(tally: Tally, known: set[str]) -> None:
-    """Add one minimised case of each kind of failure to the corpus, except for the reasons ``known``."""
+    """Add one minimised case of each kind of failure to the corpus, except for the reasons
+    ``known``."""
     reader = READERS[tally.reader]
     seeds = seeds_of(reader)
     for reason, failures in sorted(tally.failures.items()):
         if reason in known:
             continue
-        case, _ = min(failures, key=lambda failure: sum(len(data) for data in failure[0].files.values()))
+        case, _ = min(
+            failures, key=lambda failure: sum(len(data) for data in failure[0].files.values())
+        )
         small = minimised(reader, case, reason, seeds[case.seed])
         text = small.to_json(seeds[case.seed])
         path = CORPUS / tally.reader / f"{hashlib.sha256(text.encode()).hexdigest()[:12]}.json"

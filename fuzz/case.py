@@ -1,4 +1,5 @@
-"""Cases: inputs of a reader as files in a folder, seeds or mutated ones, and their form in the corpus."""
+"""Cases: inputs of a reader as files in a folder, seeds or mutated ones, and their form in the
+corpus."""
 
 from __future__ import annotations
 
@@ -27,9 +28,16 @@ class Case:
     links: dict[str, str] = field(default_factory=dict)
     steps: tuple[str, ...] = ()
 
-    def changed(self, step: str, files: dict[str, bytes], links: dict[str, str] | None = None) -> Case:
+    def changed(
+        self, step: str, files: dict[str, bytes], links: dict[str, str] | None = None
+    ) -> Case:
         """Return the case with other files, and other links if given."""
-        return replace(self, files=files, links=self.links if links is None else links, steps=(*self.steps, step))
+        return replace(
+            self,
+            files=files,
+            links=self.links if links is None else links,
+            steps=(*self.steps, step),
+        )
 
     def write(self, folder: Path, before: Case | None = None) -> None:
         """Write it to ``folder``; names that the file system refuses are left out.
@@ -38,7 +46,12 @@ class Case:
             folder: emptied first, unless it holds ``before``.
             before: case that lies in the folder; only files that differ are then written.
         """
-        if before is not None and not before.links and not self.links and before.files.keys() == self.files.keys():
+        if (
+            before is not None
+            and not before.links
+            and not self.links
+            and before.files.keys() == self.files.keys()
+        ):
             for name, content in self.files.items():
                 if before.files[name] != content:
                     _try(lambda path=folder / name, content=content: _write(path, content))
@@ -51,8 +64,14 @@ class Case:
 
     def to_json(self, seed: Case) -> str:
         """Return the differences from the seed, and the steps, as JSON; ``from_json`` reads it."""
-        different = {name: _text(data) for name, data in self.files.items() if seed.files.get(name) != data}
-        stored: dict[str, object] = {"seed": self.seed, "steps": list(self.steps), "files": different}
+        different = {
+            name: _text(data) for name, data in self.files.items() if seed.files.get(name) != data
+        }
+        stored: dict[str, object] = {
+            "seed": self.seed,
+            "steps": list(self.steps),
+            "files": different,
+        }
         stored["removed"] = sorted(seed.files.keys() - self.files.keys())
         stored["links"] = self.links
         return json.dumps(stored, indent=1, sort_keys=True) + "\n"
@@ -103,7 +122,8 @@ def _link(path: Path, target: str) -> None:
 
 
 def _text(data: bytes) -> object:
-    """Return short text as it is, so that the corpus can be reviewed, and anything else as base64."""
+    """Return short text as it is, so that the corpus can be reviewed, and anything else as
+    base64."""
     try:
         text = data.decode("ascii")
         return text if len(text) < 20_000 else {"base64": base64.b64encode(data).decode()}
@@ -112,4 +132,8 @@ def _text(data: bytes) -> object:
 
 
 def _bytes(stored: object) -> bytes:
-    return base64.b64decode(stored["base64"]) if isinstance(stored, dict) else str(stored).encode("ascii")
+    return (
+        base64.b64decode(stored["base64"])
+        if isinstance(stored, dict)
+        else str(stored).encode("ascii")
+    )

@@ -19,7 +19,8 @@ def png_changed(data: bytes, rng: Random) -> bytes:
     chunks = _png_chunks(data)
     if not chunks or rng.random() < 0.15:
         return bytes_changed(data, rng)
-    i, change = rng.randrange(len(chunks)), rng.randrange(8)
+    i = rng.randrange(len(chunks))
+    change = rng.randrange(8)
     kind, content = chunks[i]
     if change == 0:
         del chunks[i]
@@ -47,7 +48,8 @@ def jpeg_changed(data: bytes, rng: Random) -> bytes:
     marks = [m.start() for m in re.finditer(rb"\xff[\xc0-\xfe]", data)]
     if len(marks) < 2 or rng.random() < 0.2:
         return bytes_changed(data, rng)
-    change, at = rng.randrange(6), rng.choice(marks)
+    change = rng.randrange(6)
+    at = rng.choice(marks)
     if change == 0:
         after = next((m for m in marks if m > at), len(data))
         return data[:at] + data[after:]
@@ -57,10 +59,18 @@ def jpeg_changed(data: bytes, rng: Random) -> bytes:
     if change == 2:
         return data[: at + 1] + bytes([rng.randrange(0xC0, 0xFF)]) + data[at + 2 :]
     if change == 3:
-        return data[: at + 2] + rng.choice((0, 1, 2, 3, 255, 65535)).to_bytes(2, "big") + data[at + 4 :]
+        return (
+            data[: at + 2]
+            + rng.choice((0, 1, 2, 3, 255, 65535)).to_bytes(2, "big")
+            + data[at + 4 :]
+        )
     frame = next((m for m in marks if data[m + 1] in (0xC0, 0xC1, 0xC2)), at)
     place = frame + rng.choice((4, 5, 7, 9, 10, 11))
-    return data[:place] + rng.choice((0, 1, 3, 255, 65535, 20_000)).to_bytes(2, "big") + data[place + 2 :]
+    return (
+        data[:place]
+        + rng.choice((0, 1, 3, 255, 65535, 20_000)).to_bytes(2, "big")
+        + data[place + 2 :]
+    )
 
 
 def exr_changed(data: bytes, rng: Random) -> bytes:
@@ -89,16 +99,25 @@ def video_changed(data: bytes, rng: Random) -> bytes:
     if change == 1:
         return data[:end] + data[begin:end] + data[end:]
     if change == 2:
-        return data[:begin] + rng.choice((0, 1, 4, 7, 2**31, 2**32 - 1)).to_bytes(4, "big") + data[begin + 4 :]
+        return (
+            data[:begin]
+            + rng.choice((0, 1, 4, 7, 2**31, 2**32 - 1)).to_bytes(4, "big")
+            + data[begin + 4 :]
+        )
     if change == 3:
-        return data[: begin + 4] + rng.choice((b"free", b"moov", b"\xa9nam", b"caf\xe9")) + data[begin + 8 :]
+        return (
+            data[: begin + 4]
+            + rng.choice((b"free", b"moov", b"\xa9nam", b"caf\xe9"))
+            + data[begin + 8 :]
+        )
     if change == 4 and kind != b"mdat":
         return data[:begin] + strings_changed(data[begin:end], rng) + data[end:]
     return data[: begin + 8] + bytes_changed(data[begin + 8 : end], rng) + data[end:]
 
 
 def _png_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
-    chunks, at = [], len(_PNG)
+    chunks = []
+    at = len(_PNG)
     while data.startswith(_PNG) and at + 12 <= len(data):
         size = int.from_bytes(data[at : at + 4], "big")
         chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
@@ -107,7 +126,12 @@ def _png_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
 
 
 def _png_chunk(kind: bytes, content: bytes) -> bytes:
-    return len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
+    return (
+        len(content).to_bytes(4, "big")
+        + kind
+        + content
+        + zlib.crc32(kind + content).to_bytes(4, "big")
+    )
 
 
 def _extra_chunks() -> tuple[tuple[bytes, bytes], ...]:
@@ -128,9 +152,11 @@ def _extra_chunks() -> tuple[tuple[bytes, bytes], ...]:
 
 def _boxes(data: bytes, begin: int, end: int) -> list[tuple[int, int, bytes]]:
     """List begin, end and kind of all boxes, nested ones included."""
-    found, at = [], begin
+    found = []
+    at = begin
     while at + 8 <= end and len(found) < 500:
-        size, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        size = int.from_bytes(data[at : at + 4], "big")
+        kind = data[at + 4 : at + 8]
         if size < 8 or at + size > end:
             break
         found.append((at, at + size, kind))

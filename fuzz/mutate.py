@@ -52,7 +52,16 @@ CHANGES: Mapping[str, Change] = {
 """Mutations of files by suffix."""
 
 _IMAGES = (".png", ".jpg", ".exr", ".tif", ".bmp", ".webp")
-_LINKS = ("..", "../precious", ".", "../precious/keep.txt", "none", "/dev/zero", "/dev/null", "../capture")
+_LINKS = (
+    "..",
+    "../precious",
+    ".",
+    "../precious/keep.txt",
+    "none",
+    "/dev/zero",
+    "/dev/null",
+    "../capture",
+)
 
 
 def changed_case(seeds: Mapping[str, Case], rng: Random) -> Case:
@@ -60,7 +69,11 @@ def changed_case(seeds: Mapping[str, Case], rng: Random) -> Case:
     case = seeds[rng.choice(sorted(seeds))]
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         is_alone = len(case.files) == 1
-        case = _file_changed(case, rng) if is_alone or rng.random() < 0.88 else _folder_changed(case, rng)
+        case = (
+            _file_changed(case, rng)
+            if is_alone or rng.random() < 0.88
+            else _folder_changed(case, rng)
+        )
     return case
 
 
@@ -70,11 +83,14 @@ def _file_changed(case: Case, rng: Random) -> Case:
         return case
     suffix = "." + name.rpartition(".")[2].lower()
     change = bytes_changed if rng.random() < 0.05 else CHANGES.get(suffix, bytes_changed)
-    return case.changed(f"{change.__name__} {name}", {**case.files, name: change(case.files[name], rng)})
+    return case.changed(
+        f"{change.__name__} {name}", {**case.files, name: change(case.files[name], rng)}
+    )
 
 
 def _chosen(case: Case, rng: Random) -> str | None:
-    """Choose a file; all images together count as one, so that files that describe them are mutated more often."""
+    """Choose a file; all images together count as one, so that files that describe them are mutated
+    more often."""
     images = [name for name in sorted(case.files) if name.endswith(_IMAGES)]
     others = [name for name in sorted(case.files) if not name.endswith(_IMAGES)]
     choices = others + ([rng.choice(images)] if images else [])
@@ -83,7 +99,8 @@ def _chosen(case: Case, rng: Random) -> str | None:
 
 def _folder_changed(case: Case, rng: Random) -> Case:
     """Remove, rename, exchange or empty a file, or replace it by a folder or a link."""
-    name, other = rng.choice(sorted(case.files)), rng.choice(sorted(case.files))
+    name = rng.choice(sorted(case.files))
+    other = rng.choice(sorted(case.files))
     files = dict(case.files)
     change = rng.randrange(7)
     if change == 0:
@@ -92,7 +109,11 @@ def _folder_changed(case: Case, rng: Random) -> Case:
     if change == 1:
         folder, _, base = name.rpartition("/")
         new = f"{folder}/{rng.choice(TEXTS)}{base}".lstrip("/")
-        return case if ".." in new else case.changed(f"renamed {name}", {**files, new: files.pop(name)})
+        return (
+            case
+            if ".." in new
+            else case.changed(f"renamed {name}", {**files, new: files.pop(name)})
+        )
     if change == 2:
         files[name], files[other] = files[other], files[name]
         return case.changed(f"exchanged {name} and {other}", files)

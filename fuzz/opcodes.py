@@ -8,15 +8,48 @@ from random import Random
 from fuzz.blobs import bytes_changed
 
 _NAMES = (
-    *(b"numpy\nndarray", b"numpy\ndtype", b"numpy.core.multiarray\n_reconstruct", b"numpy.core.multiarray\nscalar"),
-    *(b"numpy._core.multiarray\n_reconstruct", b"numpy.core.numeric\n_frombuffer", b"builtins\ngetattr", b"os\nsystem"),
-    *(b"functools\npartial", b"collections\nOrderedDict", b"scipy.sparse.csc\ncsc_matrix", b"chumpy.ch\nCh"),
-    *(b"copy_reg\n_reconstructor", b"_codecs\nencode", b"builtins\nobject", b"builtins\nbytearray", b"builtins\nset"),
+    *(
+        b"numpy\nndarray",
+        b"numpy\ndtype",
+        b"numpy.core.multiarray\n_reconstruct",
+        b"numpy.core.multiarray\nscalar",
+    ),
+    *(
+        b"numpy._core.multiarray\n_reconstruct",
+        b"numpy.core.numeric\n_frombuffer",
+        b"builtins\ngetattr",
+        b"os\nsystem",
+    ),
+    *(
+        b"functools\npartial",
+        b"collections\nOrderedDict",
+        b"scipy.sparse.csc\ncsc_matrix",
+        b"chumpy.ch\nCh",
+    ),
+    *(
+        b"copy_reg\n_reconstructor",
+        b"_codecs\nencode",
+        b"builtins\nobject",
+        b"builtins\nbytearray",
+        b"builtins\nset",
+    ),
     *(b"scipy.sparse._csr\ncsr_matrix", b"builtins\neval", b"builtins\ncomplex", b"\xff\n\xff"),
 )
 _GLOBALS = tuple(b"c" + name + b"\n" for name in _NAMES)
 _VALUES = (
-    *(b"N", b"\x88", b"]", b"}", b")", b"\x8f", b"K\x05", b"J\xff\xff\xff\xff", b"G\x7f\xf8\0\0\0\0\0\0", b"(t", b"(l"),
+    *(
+        b"N",
+        b"\x88",
+        b"]",
+        b"}",
+        b")",
+        b"\x8f",
+        b"K\x05",
+        b"J\xff\xff\xff\xff",
+        b"G\x7f\xf8\0\0\0\0\0\0",
+        b"(t",
+        b"(l",
+    ),
     *(
         b"\x8a\x09" + b"\xff" * 9,
         b"\x8b\xff\xff\xff\x7f",
@@ -24,7 +57,14 @@ _VALUES = (
         b"U\x01a",
         b"T\0\0\0\x80",
     ),
-    *(b"X\xff\xff\xff\x7f", b"\x8d" + b"\xff" * 8, b"S'x'\n", b"I" + b"9" * 5000 + b"\n", b"Fnan\n", b"V\\ud800\n"),
+    *(
+        b"X\xff\xff\xff\x7f",
+        b"\x8d" + b"\xff" * 8,
+        b"S'x'\n",
+        b"I" + b"9" * 5000 + b"\n",
+        b"Fnan\n",
+        b"V\\ud800\n",
+    ),
     *(b"r\xff\xff\xff\x7f", b"j\xff\xff\xff\x7f", b"h\xff", b"q\x00", b"L1e5L\n"),
 )
 _ACTIONS = (
@@ -46,7 +86,19 @@ _ACTIONS = (
     b"\x85",
     b"\x86",
 )
-_ACTIONS += (b"\x87", b"\x90", b"\x91", b"\x93", b"\x94", b"Q", b"P1\n", b"\x97", b"\x98", b".", b"\x95" + bytes(8))
+_ACTIONS += (
+    b"\x87",
+    b"\x90",
+    b"\x91",
+    b"\x93",
+    b"\x94",
+    b"Q",
+    b"P1\n",
+    b"\x97",
+    b"\x98",
+    b".",
+    b"\x95" + bytes(8),
+)
 _HOSTILE = (
     b"\x80\x04)" + b"\x85" * 200_000 + b"}\x942\x94s.",
     b"\x80\x02)" + b"2\x86" * 40 + b".",
@@ -69,7 +121,8 @@ def pickle_changed(data: bytes, rng: Random) -> bytes:
     codes = _codes(data)
     if len(codes) < 2:
         return bytes_changed(data, rng)
-    i, j = rng.randrange(len(codes)), rng.randrange(len(codes))
+    i = rng.randrange(len(codes))
+    j = rng.randrange(len(codes))
     change = rng.randrange(7)
     if change == 0:
         del codes[i]
@@ -90,7 +143,8 @@ def pickle_changed(data: bytes, rng: Random) -> bytes:
 
 
 def _codes(data: bytes) -> list[bytes]:
-    """Split a pickle into opcodes with arguments as far as possible, without frames, which count bytes."""
+    """Split a pickle into opcodes with arguments as far as possible, without frames, which count
+    bytes."""
     codes: list[bytes] = []
     starts: list[int] = []
     names: list[str] = []

@@ -1,4 +1,5 @@
-"""The fuzzed readers: every reader of untrusted files or text, with its seeds and the first use of its result."""
+"""The fuzzed readers: every reader of untrusted files or text, with its seeds and the first use of
+its result."""
 
 from __future__ import annotations
 
@@ -8,7 +9,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from program_captures import write_metashape, write_odm, write_polycam, write_reality, write_record3d, write_shots
+from program_captures import (
+    write_metashape,
+    write_odm,
+    write_polycam,
+    write_reality,
+    write_record3d,
+    write_shots,
+)
 
 from fuzz import seed_files as files
 from fuzz.seeds import (
@@ -47,7 +55,8 @@ class Reader:
         seeds: name to function that writes the seed.
         read: reads the folder.
         writes: whether the reader may write into the folder, as into a run folder.
-        names_file: whether errors must name the file; those about arguments of the command line name the argument.
+        names_file: whether errors must name the file; those about arguments of the command line
+            name the argument.
         needs: optional package without which the reader cannot run.
     """
 
@@ -59,7 +68,8 @@ class Reader:
 
 
 def read_whole_capture(root: Path) -> object:
-    """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body, images."""
+    """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body,
+    images."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
     from dyngs.config import DataConfig
     from dyngs.data.loader import ImageLoader
@@ -98,7 +108,11 @@ def read_whole_capture(root: Path) -> object:
 
 def require_lines(report: str) -> None:
     """Check that no line of a report holds control characters."""
-    bad = [line for line in report.splitlines() if any(ord(c) < 32 or 0x7F <= ord(c) < 0xA0 for c in line)]
+    bad = [
+        line
+        for line in report.splitlines()
+        if any(ord(c) < 32 or 0x7F <= ord(c) < 0xA0 for c in line)
+    ]
     assert not bad, f"control characters in a report: {bad[0]!r}"
 
 
@@ -133,7 +147,8 @@ def read_2d_tracks(root: Path) -> object:
 
 
 def read_known_tracks(root: Path) -> object:
-    """Read the true tracks of a capture, which are NaN where a point does not exist, and measure a model by them."""
+    """Read the true tracks of a capture, which are NaN where a point does not exist, and measure a
+    model by them."""
     import numpy as np
     from moving_scene import camera, still_scene
 
@@ -141,7 +156,10 @@ def read_known_tracks(root: Path) -> object:
     from dyngs.data.tracks import read_true_tracks
     from dyngs.evaluate.tracks import track_scores
 
-    views = [View(name, Path(name), np.eye(4), np.eye(3), 8, 8, time=t) for name, t in (("a", 0.0), ("b", 1.0))]
+    views = [
+        View(name, Path(name), np.eye(4), np.eye(3), 8, 8, time=t)
+        for name, t in (("a", 0.0), ("b", 1.0))
+    ]
     tracks = read_true_tracks(Capture(root, "blender", {}))
     return vars(track_scores(still_scene(), tracks, [(view, camera()) for view in views], views))
 
@@ -209,7 +227,9 @@ def two_images(root: Path) -> Capture:
     from dyngs.data.capture import Capture, View
 
     intrinsics = np.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
-    views = [View(f"p{i}", root / f"p{i}.png", np.eye(4), intrinsics, 16, 12, frame=i) for i in range(2)]
+    views = [
+        View(f"p{i}", root / f"p{i}.png", np.eye(4), intrinsics, 16, 12, frame=i) for i in range(2)
+    ]
     return Capture(root, "x", {"train": tuple(views)})
 
 
@@ -285,7 +305,12 @@ def read_option_values(root: Path) -> object:
     from dyngs.tradeoff.variants import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
-    parsers = (parse_requirements, lambda word: parse_variations([word], trains=True), parse_frames, parse_times)
+    parsers = (
+        parse_requirements,
+        lambda word: parse_variations([word], trains=True),
+        parse_frames,
+        parse_times,
+    )
     return [parse(word) for parse, word in zip(parsers, words(root), strict=False)]
 
 
@@ -361,7 +386,9 @@ CAPTURES: dict[str, dict[str, Seed]] = {
 _NEEDS = {"people_snapshot": "h5py"}
 # USD is read in a process of its own, too slow for thousands of inputs.
 _PACKED = ("compressed-ply", "spz", "splat", "sog", "glb")
-_RUNS: dict[str, Seed] = {kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes")}
+_RUNS: dict[str, Seed] = {
+    kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes")
+}
 _JOINTS: dict[str, Seed] = {
     "npz": files.write_joints_npz,
     "json": files.write_joints_json,
@@ -369,7 +396,11 @@ _JOINTS: dict[str, Seed] = {
     "frame_data": files.write_frame_data,
     "sam_3d_body": files.write_sam_3d_body,
 }
-_IMAGES: dict[str, Seed] = {"png": files.write_png, "png16": files.write_png16, "jpeg": files.write_jpeg}
+_IMAGES: dict[str, Seed] = {
+    "png": files.write_png,
+    "png16": files.write_png16,
+    "jpeg": files.write_jpeg,
+}
 _IMAGES |= {"exr": files.write_exr, "tiff": files.write_tiff}
 _BODIES: dict[str, Seed] = {
     "npz": files.write_smpl_npz,
@@ -378,7 +409,10 @@ _BODIES: dict[str, Seed] = {
 }
 
 READERS: dict[str, Reader] = {
-    **{name: Reader(seeds, read_whole_capture, needs=_NEEDS.get(name)) for name, seeds in CAPTURES.items()},
+    **{
+        name: Reader(seeds, read_whole_capture, needs=_NEEDS.get(name))
+        for name, seeds in CAPTURES.items()
+    },
     "images": Reader(_IMAGES, read_a_image),
     "depth": Reader({"png16": files.write_png16, "npz": files.write_depth_npz}, read_a_depth_map),
     "flow": Reader({"npy": files.write_flow_npy, "flo": files.write_flo}, read_a_flow_field),
@@ -388,21 +422,31 @@ READERS: dict[str, Reader] = {
     "pickles": Reader({"new": files.write_fits, "old": files.write_old_fits}, read_a_pickle),
     "bodies": Reader(_BODIES, read_a_body),
     "joints": Reader(_JOINTS, read_given_joints),
-    "keypoints": Reader({"openpose": files.write_openpose, "coco": files.write_coco}, read_2d_key_points),
-    "amass": Reader({"smplh": files.write_smplh_motion, "own": files.write_own_motion}, read_a_motion),
+    "keypoints": Reader(
+        {"openpose": files.write_openpose, "coco": files.write_coco}, read_2d_key_points
+    ),
+    "amass": Reader(
+        {"smplh": files.write_smplh_motion, "own": files.write_own_motion}, read_a_motion
+    ),
     "bvh": Reader({"walk": files.write_walk_bvh}, read_a_motion),
     "gltf": Reader({"linear": files.write_walk_glb, "cubic": files.write_cubic_glb}, read_a_motion),
     "ply": Reader({"splats": files.write_splats}, read_splats),
     **{
-        name: Reader({"splats": partial(files.write_packed, name)}, read_splats, needs=_NEEDS.get(name))
+        name: Reader(
+            {"splats": partial(files.write_packed, name)}, read_splats, needs=_NEEDS.get(name)
+        )
         for name in _PACKED
     },
     "checkpoints": Reader({"still": files.write_still_run, **_RUNS}, read_a_run),
-    "scenes": Reader({"still": files.write_scene_file_still, "moving": files.write_scene_file_moving}, read_a_run),
+    "scenes": Reader(
+        {"still": files.write_scene_file_still, "moving": files.write_scene_file_moving}, read_a_run
+    ),
     "avatars": Reader({"person": files.write_person}, read_a_person),
     "presets": Reader({"preset": files.write_preset}, read_a_preset),
     "overrides": Reader({"lines": files.write_overrides}, read_override_lines, names_file=False),
-    "camera_paths": Reader({"frames": files.write_frames_path, "keyframes": files.write_keyframes}, read_a_path),
+    "camera_paths": Reader(
+        {"frames": files.write_frames_path, "keyframes": files.write_keyframes}, read_a_path
+    ),
     "points": Reader({"point": files.write_measurement}, read_a_point),
     "options": Reader({"words": files.write_words}, read_option_values, names_file=False),
     "logs": Reader({"log": files.write_log}, read_a_log, writes=True),

@@ -1,4 +1,5 @@
-"""Mutations of files of Gaussians, meshes and motions: PLY, BVH, glTF, COLMAP, safetensors, scene.dyngs, HDF5."""
+"""Mutations of files of Gaussians, meshes and motions: PLY, BVH, glTF, COLMAP, safetensors,
+scene.dyngs, HDF5."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ def ply_changed(data: bytes, rng: Random) -> bytes:
     end = data.find(b"end_header\n") + len(b"end_header\n")
     if end < 12 or rng.random() < 0.1:
         return bytes_changed(data, rng)
-    head, body = data[:end], data[end:]
+    head = data[:end]
+    body = data[end:]
     change = rng.randrange(6)
     if change == 0:
         lines = b"".join(b"property float extra%d\n" % i for i in range(rng.choice((1, 3, 2000))))
@@ -54,14 +56,18 @@ def bvh_changed(data: bytes, rng: Random) -> bytes:
         head, mark, rest = data.partition(b"Frames: ")
         return head + mark + rng.choice(NUMBERS).encode() + rest[rest.find(b"\n") :]
     if change == 3:
-        return data.replace(b"JOINT", b"JOINT a {\nOFFSET 0 0 0\nCHANNELS 0\n" * rng.choice((1, 300)) + b"JOINT", 1)
+        return data.replace(
+            b"JOINT", b"JOINT a {\nOFFSET 0 0 0\nCHANNELS 0\n" * rng.choice((1, 300)) + b"JOINT", 1
+        )
     return text_changed(data, rng)
 
 
 def glb_changed(data: bytes, rng: Random) -> bytes:
-    """Return a GLB after one mutation of its JSON or its numbers, the lengths of its chunks right."""
+    """Return a GLB after one mutation of its JSON or its numbers, the lengths of its chunks
+    right."""
     size = int.from_bytes(data[12:16], "little")
-    text, body = data[20 : 20 + size], data[20 + size + 8 :]
+    text = data[20 : 20 + size]
+    body = data[20 + size + 8 :]
     if rng.random() < 0.1 or not text.startswith(b"{"):
         return head_changed(data, rng, 20) if rng.random() < 0.5 else bytes_changed(data, rng)
     if rng.random() < 0.25:
@@ -70,7 +76,14 @@ def glb_changed(data: bytes, rng: Random) -> bytes:
         text = json_changed(text, rng)
     text += b" " * (-len(text) % 4)
     body += b"\0" * (-len(body) % 4)
-    content = len(text).to_bytes(4, "little") + b"JSON" + text + len(body).to_bytes(4, "little") + b"BIN\0" + body
+    content = (
+        len(text).to_bytes(4, "little")
+        + b"JSON"
+        + text
+        + len(body).to_bytes(4, "little")
+        + b"BIN\0"
+        + body
+    )
     return b"glTF" + (2).to_bytes(4, "little") + (12 + len(content)).to_bytes(4, "little") + content
 
 
@@ -110,7 +123,8 @@ def dyngs_changed(data: bytes, rng: Random) -> bytes:
         return bytes_changed(data, rng)
     start = len(MAGIC) + 4
     end = start + int.from_bytes(data[len(MAGIC) : start], "little")
-    header, blocks = data[start:end], data[end:-32]
+    header = data[start:end]
+    blocks = data[end:-32]
     if rng.random() < 0.6:
         try:
             tree = tree_changed(json.loads(decompressed(header, MAX_HEADER, exact=False)), rng)
@@ -144,7 +158,8 @@ def _data_set_changed(file: Any, name: str, rng: Random) -> None:
     import h5py
 
     found = file[name]
-    # A virtual data set, made by a mutation before, may be a view of itself: HDF5 reads it until the stack is full.
+    # A virtual data set, made by a mutation before, may be a view of itself: HDF5 reads it until
+    # the stack is full.
     readable = isinstance(found, h5py.Dataset) and not found.is_virtual and found.nbytes < 1e6
     values = found[()] if readable else np.zeros((2, 3, 4))
     del file[name]
@@ -154,28 +169,39 @@ def _data_set_changed(file: Any, name: str, rng: Random) -> None:
     elif change == 1:
         file[name] = h5py.SoftLink(rng.choice(("/" + name, "/none", "/")))
     elif change == 2:
-        file[name] = h5py.ExternalLink(rng.choice(("../precious/keep.h5", "/dev/zero", name)), "/" + name)
+        file[name] = h5py.ExternalLink(
+            rng.choice(("../precious/keep.h5", "/dev/zero", name)), "/" + name
+        )
     elif change == 3:
-        shape = rng.choice(((2**20, 2**20), (2**40,), (2**31, 12, 16), (6, 2**16, 2**16), (0, 12, 16), (6, 0)))
+        shape = rng.choice(
+            ((2**20, 2**20), (2**40,), (2**31, 12, 16), (6, 2**16, 2**16), (0, 12, 16), (6, 0))
+        )
         file.create_dataset(name, shape, rng.choice(("u1", "f8")), chunks=True, fillvalue=1)
     elif change == 4:
         values = values.astype(float)
         values.reshape(-1)[rng.randrange(max(values.size, 1)) :][:1] = rng.choice(_ODD)
         file[name] = values
     elif change == 5:
-        file[name] = rng.choice((values[:-1], values[None], values.ravel(), np.zeros(()), np.zeros((0,))))
+        file[name] = rng.choice(
+            (values[:-1], values[None], values.ravel(), np.zeros(()), np.zeros((0,)))
+        )
     elif change == 6:
         kinds = ("f2", "f4", ">f8", "c16", "S4", "i8", "?", [("a", "f8"), ("b", "i4")])
         file[name] = np.zeros(values.shape, kinds[rng.randrange(len(kinds))])
     elif change == 7:
-        file.create_dataset(name, data=[rng.choice(TEXTS).replace("\0", "").replace("\ud800", "")] * 3)
+        file.create_dataset(
+            name, data=[rng.choice(TEXTS).replace("\0", "").replace("\ud800", "")] * 3
+        )
     elif change == 8:
         file.create_dataset(name, (3,), h5py.vlen_dtype(np.float64))
     elif change == 9:
         file.create_dataset(name, (3,), h5py.ref_dtype)
     elif change == 10:
         file.create_dataset(
-            name, values.shape, "u1", external=[(rng.choice(("/dev/zero", "../precious/keep.txt")), 0, 10**9)]
+            name,
+            values.shape,
+            "u1",
+            external=[(rng.choice(("/dev/zero", "../precious/keep.txt")), 0, 10**9)],
         )
     elif change == 11:
         layout = h5py.VirtualLayout((6, 12, 16), "u1")
@@ -206,7 +232,10 @@ def _tensors_changed(data: bytes, rng: Random) -> bytes:
         header.pop("digest", None)
         text = json_bytes(header).decode()
         header["digest"] = _digest(tensors, json.loads(text))
-    return save({name: x.contiguous().clone() for name, x in tensors.items()}, {key: json_bytes(header).decode()})
+    return save(
+        {name: x.contiguous().clone() for name, x in tensors.items()},
+        {key: json_bytes(header).decode()},
+    )
 
 
 def _loaded(data: bytes) -> dict[str, torch.Tensor]:
@@ -217,15 +246,22 @@ def _loaded(data: bytes) -> dict[str, torch.Tensor]:
 
 def _one_tensor_changed(tensors: dict[str, torch.Tensor], rng: Random) -> None:
     name = rng.choice(sorted(tensors))
-    x, change = tensors[name], rng.randrange(9)
+    x = tensors[name]
+    change = rng.randrange(9)
     if change == 0:
         del tensors[name]
     elif change == 1:
-        tensors[rng.choice((name + "x", name.rpartition(".")[0], "", "model.field.x", "model.colour.x", "a\nb"))] = x
+        tensors[
+            rng.choice(
+                (name + "x", name.rpartition(".")[0], "", "model.field.x", "model.colour.x", "a\nb")
+            )
+        ] = x
     elif change == 2:
         tensors[name] = x.to(rng.choice(_DTYPES))
     elif change == 3:
-        tensors[name] = rng.choice((x[:0], x[None], x.reshape(-1), x.transpose(0, -1))) if x.dim() else x[None]
+        tensors[name] = (
+            rng.choice((x[:0], x[None], x.reshape(-1), x.transpose(0, -1))) if x.dim() else x[None]
+        )
     elif change == 4:
         tensors[name] = torch.cat([x, x]) if x.dim() else x.repeat(3)
     elif change == 5 and x.dim():
@@ -234,6 +270,10 @@ def _one_tensor_changed(tensors: dict[str, torch.Tensor], rng: Random) -> None:
         tensors[name] = tensors[rng.choice(sorted(tensors))].clone()
     elif x.numel():
         x = x.clone()
-        value = rng.choice(_ODD) if x.is_floating_point() else rng.choice((0, 1, -1, 2**31, -(2**63), 99, 255))
+        value = (
+            rng.choice(_ODD)
+            if x.is_floating_point()
+            else rng.choice((0, 1, -1, 2**31, -(2**63), 99, 255))
+        )
         x.reshape(-1)[rng.randrange(x.numel())] = torch.tensor(value).to(x.dtype)
         tensors[name] = x

@@ -52,14 +52,21 @@ def write_jpeg(root: Path) -> None:
 
 def write_joints_npz(root: Path) -> None:
     """Write 3D joints with their frames, order and space."""
-    arrays = {"joints": random_places(2, 17, 4), "frames": np.arange(2), "order": "coco17", "space": "world"}
+    arrays = {
+        "joints": random_places(2, 17, 4),
+        "frames": np.arange(2),
+        "order": "coco17",
+        "space": "world",
+    }
     np.savez(root / "a.npz", **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def write_joints_json(root: Path) -> None:
     """Write 3D joints by the names of images."""
     joints = {f"p{i}": row.tolist() for i, row in enumerate(random_places(2, 25, 3))}
-    (root / "a.json").write_text(json.dumps({"order": "openpose25", "space": "camera", "joints": joints}))
+    (root / "a.json").write_text(
+        json.dumps({"order": "openpose25", "space": "camera", "joints": joints})
+    )
 
 
 def write_vertices_npz(root: Path) -> None:
@@ -70,13 +77,18 @@ def write_vertices_npz(root: Path) -> None:
 def write_frame_data(root: Path) -> None:
     """Write posed vertices as semantic_human_texture_stitching has them."""
     vertices = tiny_body(24).vertices.numpy()[None].repeat(2, 0)
-    (root / "a.pkl").write_bytes(pickle.dumps({"vertices": vertices, "camera_f": np.ones(2), "width": 8}, 2))
+    (root / "a.pkl").write_bytes(
+        pickle.dumps({"vertices": vertices, "camera_f": np.ones(2), "width": 8}, 2)
+    )
 
 
 def write_sam_3d_body(root: Path) -> None:
     """Write the 3D key points of an image as SAM 3D Body has them."""
     (root / "a").mkdir()
-    fields = {"pred_keypoints_3d": random_places(1, 70, 3)[0], "pred_cam_t": np.array([0.0, 0.1, 4.0])}
+    fields = {
+        "pred_keypoints_3d": random_places(1, 70, 3)[0],
+        "pred_cam_t": np.array([0.0, 0.1, 4.0]),
+    }
     np.savez(root / "a" / "p0.npz", **fields)  # pyright: ignore[reportArgumentType]
 
 
@@ -84,13 +96,18 @@ def write_openpose(root: Path) -> None:
     """Write 2D key points of an image as OpenPose does."""
     (root / "a").mkdir()
     points = random_places(1, 25, 3)[0].ravel().tolist()
-    (root / "a" / "p0_keypoints.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": points}]}))
+    (root / "a" / "p0_keypoints.json").write_text(
+        json.dumps({"people": [{"pose_keypoints_2d": points}]})
+    )
 
 
 def write_coco(root: Path) -> None:
     """Write 2D key points of an image as COCO has them."""
     points = np.abs(random_places(1, 17, 3)[0]).ravel().tolist()
-    fields = {"images": [{"id": 1, "file_name": "p0.png"}], "annotations": [{"image_id": 1, "keypoints": points}]}
+    fields = {
+        "images": [{"id": 1, "file_name": "p0.png"}],
+        "annotations": [{"image_id": 1, "keypoints": points}],
+    }
     (root / "a.json").write_text(json.dumps(fields))
 
 
@@ -120,13 +137,19 @@ def write_flo(root: Path) -> None:
 def write_tracks(root: Path) -> None:
     """Write two tracks in three images."""
     names = np.array(["0", "1", "2"])
-    np.savez(root / "a.npz", xy=np.ones((3, 2, 2), np.float32), visible=np.ones((3, 2), bool), names=names)
+    np.savez(
+        root / "a.npz",
+        xy=np.ones((3, 2, 2), np.float32),
+        visible=np.ones((3, 2), bool),
+        names=names,
+    )
 
 
 def write_known_tracks(root: Path) -> None:
     """Write true tracks of two points at two times, each shown by one view."""
     points = np.array([[[0, 0, 2], [1, 0, 2]], [[0, 1, 2], [np.nan, 0, 2]]], np.float32)
-    views, seen = np.array(["a", "b"]), np.array([[True, True], [True, False]])
+    views = np.array(["a", "b"])
+    seen = np.array([[True, True], [True, False]])
     write_true_tracks(root, TrueTracks(points, np.array([0.0, 1.0]), views, np.array([0, 1]), seen))
 
 
@@ -173,21 +196,29 @@ def write_smpl_pickle(root: Path) -> None:
     import scipy.sparse
 
     arrays = model("smpl", directions=2)
-    write_pickle(root / "a.pkl", arrays | {"J_regressor": scipy.sparse.csc_matrix(arrays["J_regressor"])})
+    write_pickle(
+        root / "a.pkl", arrays | {"J_regressor": scipy.sparse.csc_matrix(arrays["J_regressor"])}
+    )
 
 
 def write_smplx_with_uv(root: Path) -> None:
     """Write an SMPL-X body, and an OBJ with its texture coordinates."""
     arrays = model("smplx", directions=2)
     write_npz(root / "a.npz", arrays)
-    write_obj(root / "uv.obj", arrays["f"].astype(np.int64), arrays["vt"], arrays["ft"].astype(np.int64))
+    write_obj(
+        root / "uv.obj", arrays["f"].astype(np.int64), arrays["vt"], arrays["ft"].astype(np.int64)
+    )
 
 
 def write_smplh_motion(root: Path) -> None:
     """Write a motion of SMPL-H as in AMASS."""
     motion = random_motion(3)
     poses = motion.for_joints(52).poses.reshape(3, -1).numpy()
-    rest = {"betas": np.zeros(16), "gender": np.array("neutral"), "mocap_framerate": np.array(120.0)}
+    rest = {
+        "betas": np.zeros(16),
+        "gender": np.array("neutral"),
+        "mocap_framerate": np.array(120.0),
+    }
     np.savez(root / "a.npz", poses=poses, trans=motion.trans.numpy(), **rest)
 
 
@@ -198,20 +229,28 @@ def write_own_motion(root: Path) -> None:
 
 def write_walk_bvh(root: Path) -> None:
     """Write a motion of SMPL's joints as BVH."""
-    own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
+    own = skeleton(JOINT_NAMES[:22])
+    motion = random_motion(3)
     write_bvh(root / "a.bvh", own, as_local(motion, own), motion.trans.double().numpy())
 
 
 def write_walk_glb(root: Path) -> None:
     """Write a motion of SMPL's joints as glTF, linear."""
-    own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
+    own = skeleton(JOINT_NAMES[:22])
+    motion = random_motion(3)
     glb_of(own, Clip(as_local(motion, own), motion.trans.double().numpy())).write(root / "a.glb")
 
 
 def write_cubic_glb(root: Path) -> None:
     """Write a motion of SMPL's joints as glTF, with cubic splines and a node above the root."""
-    own, motion = skeleton(JOINT_NAMES[:22]), random_motion(3)
-    clip = Clip(as_local(motion, own), motion.trans.double().numpy(), interpolation="CUBICSPLINE", above=np.eye(4))
+    own = skeleton(JOINT_NAMES[:22])
+    motion = random_motion(3)
+    clip = Clip(
+        as_local(motion, own),
+        motion.trans.double().numpy(),
+        interpolation="CUBICSPLINE",
+        above=np.eye(4),
+    )
     glb_of(own, clip).write(root / "a.glb")
 
 
@@ -221,7 +260,8 @@ def write_splats(root: Path) -> None:
 
 
 def write_packed(name: str, root: Path) -> None:
-    """Write a file of Gaussians in the format called ``name``, with harmonics where it holds any."""
+    """Write a file of Gaussians in the format called ``name``, with harmonics where it holds
+    any."""
     own = formats.format_named(name)
     splat = SplatFile(with_degree(row_of_balls(), min(own.max_degree, 1)), up="y")
     formats.write_splats(root / f"a{own.suffixes[0]}", splat)
@@ -229,7 +269,10 @@ def write_packed(name: str, root: Path) -> None:
 
 def write_still_run(root: Path) -> None:
     """Write a run of a static scene."""
-    save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=StaticModel()), root / RESOLVED_NAME)
+    save_config(
+        Config(data=DataConfig.model_validate({"root": "capture"}), model=StaticModel()),
+        root / RESOLVED_NAME,
+    )
     save_checkpoint(root, Checkpoint(_INFO, _gaussians()), 1.0)
 
 
@@ -243,7 +286,10 @@ def write_moving_runs(kind: str, root: Path) -> None:
 def write_scene_file_still(root: Path) -> None:
     """A run that is only ``scene.dyngs``."""
     model = StaticModel()
-    save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=model), root / RESOLVED_NAME)
+    save_config(
+        Config(data=DataConfig.model_validate({"root": "capture"}), model=model),
+        root / RESOLVED_NAME,
+    )
     (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(_gaussians(), model), {}))
 
 
@@ -251,27 +297,38 @@ def write_scene_file_moving(root: Path) -> None:
     """The same of a scene that moves, with steps."""
     config, tensors = _moving("control_nodes")
     save_config(config, root / RESOLVED_NAME)
-    steps = {f"gaussians.{name}": 0.01 for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")}
+    steps = {
+        f"gaussians.{name}": 0.01
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")
+    }
     (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(tensors, config.model), steps))
 
 
 def write_person(root: Path) -> None:
     """Write an avatar of three Gaussians on 24 joints."""
     n, k = 3, 2
-    joints, parents = tiny_body(24).joints, tiny_body(24).parents
+    joints = tiny_body(24).joints
+    parents = tiny_body(24).parents
     count = len(joints)
     generator = torch.Generator().manual_seed(0)
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1, 3)}
-    tensors = {f"gaussians.{name}": torch.rand(n, *shape, generator=generator) for name, shape in shapes.items()}
+    tensors = {
+        f"gaussians.{name}": torch.rand(n, *shape, generator=generator)
+        for name, shape in shapes.items()
+    }
     tensors |= {
-        f"anchors.{name}": torch.rand(n, width, generator=generator) for name, width in (("points", 3), ("uv", 2))
+        f"anchors.{name}": torch.rand(n, width, generator=generator)
+        for name, width in (("points", 3), ("uv", 2))
     }
     tensors |= {
         "anchors.size": torch.ones(n),
         "anchors.height": torch.zeros(n),
         "anchors.barycentric": torch.ones(n, 3) / 3,
     }
-    tensors |= {"anchors.weights": torch.full((n, k), 0.5), "anchors.joints": torch.tensor([[0, 1]] * n).byte()}
+    tensors |= {
+        "anchors.weights": torch.full((n, k), 0.5),
+        "anchors.joints": torch.tensor([[0, 1]] * n).byte(),
+    }
     tensors |= {"anchors.face": torch.zeros(n, dtype=torch.int32)}
     tensors |= {
         "skeleton.joints": joints,
@@ -295,7 +352,10 @@ def write_person(root: Path) -> None:
     template = {"file": "body.npz", "sha256": "0" * 64, "packaged": False}
     own = {name: x.contiguous().clone() for name, x in tensors.items()}
     write_tensors(
-        root / "a.safetensors", AVATAR_KIND, own, {**header, "rasterize_mode": "classic", "template": template}
+        root / "a.safetensors",
+        AVATAR_KIND,
+        own,
+        {**header, "rasterize_mode": "classic", "template": template},
     )
 
 
@@ -309,21 +369,42 @@ def write_preset(root: Path) -> None:
 
 def write_overrides(root: Path) -> None:
     """Write overrides of keys of every kind, one a line."""
-    lines = ("data.root=capture", "train.steps=2000", "model.kind=dynamic", "model.deform.kind=mlp", "run.name=night")
-    lines += ("data.frames=0:10:2", "model.deform={kind: hexplane, levels: [1, 2]}", "data.cache_mb=1e3", "run.dir=~/x")
+    lines = (
+        "data.root=capture",
+        "train.steps=2000",
+        "model.kind=dynamic",
+        "model.deform.kind=mlp",
+        "run.name=night",
+    )
+    lines += (
+        "data.frames=0:10:2",
+        "model.deform={kind: hexplane, levels: [1, 2]}",
+        "data.cache_mb=1e3",
+        "run.dir=~/x",
+    )
     (root / "a.overrides").write_text("\n".join(lines))
 
 
 def write_frames_path(root: Path) -> None:
     """Write a camera path of two frames."""
     one = camera()
-    poses, intrinsics = one.cam_from_world.expand(2, 4, 4).clone(), one.intrinsics.expand(2, 3, 3).clone()
-    write_path(root / "a.json", CameraPath(Cameras(poses, intrinsics, one.width, one.height), 30.0, (0.0, 1.0)))
+    poses = one.cam_from_world.expand(2, 4, 4).clone()
+    intrinsics = one.intrinsics.expand(2, 3, 3).clone()
+    write_path(
+        root / "a.json",
+        CameraPath(Cameras(poses, intrinsics, one.width, one.height), 30.0, (0.0, 1.0)),
+    )
 
 
 def write_keyframes(root: Path) -> None:
     """Write a camera path of keyframes."""
-    frame = {"cam_from_world": np.eye(4).tolist(), "fl_x": 20.0, "fl_y": 20.0, "cx": 10.0, "cy": 7.0}
+    frame = {
+        "cam_from_world": np.eye(4).tolist(),
+        "fl_x": 20.0,
+        "fl_y": 20.0,
+        "cx": 10.0,
+        "cy": 7.0,
+    }
     keys = [{**frame, "at": 0.0, "time": 0.0}, {**frame, "at": 0.2, "time": 1.0}]
     document = {"width": 20, "height": 14, "fps": 10, "loop": False, "keyframes": keys}
     (root / "a.json").write_text(json.dumps(document))
@@ -337,7 +418,9 @@ def write_measurement(root: Path) -> None:
     from dyngs.tradeoff.variants import Variant
 
     speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))
-    write(root / "a.json", Measurement(Variant(prune=0.5), 3, 30.0, 0.9, 0.1, 100, 1.5, 20.0, speed))
+    write(
+        root / "a.json", Measurement(Variant(prune=0.5), 3, 30.0, 0.9, 0.1, 100, 1.5, 20.0, speed)
+    )
 
 
 def write_words(root: Path) -> None:
@@ -358,7 +441,15 @@ def write_load(root: Path) -> None:
     pose[0, 2, 3] = 3
     k = np.array([[[20.0, 0, 10], [0, 20, 7], [0, 0, 1]]])
     points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
-    np.savez(root / "a.npz", means3d=points, colors=np.full((9, 3), 9), viewmats=pose, Ks=k, width=20, height=14)
+    np.savez(
+        root / "a.npz",
+        means3d=points,
+        colors=np.full((9, 3), 9),
+        viewmats=pose,
+        Ks=k,
+        width=20,
+        height=14,
+    )
 
 
 def _gaussians() -> dict[str, torch.Tensor]:
@@ -376,7 +467,10 @@ def _scene_info() -> CheckpointInfo:
 def _moving(kind: str) -> tuple[Config, dict[str, torch.Tensor]]:
     from tiny_fields import tiny_options
 
-    config = Config(data=DataConfig.model_validate({"root": "capture"}), model=DynamicModel(deform=tiny_options(kind)))
+    config = Config(
+        data=DataConfig.model_validate({"root": "capture"}),
+        model=DynamicModel(deform=tiny_options(kind)),
+    )
     state = tensors_of(field_state(stirred_field(kind, num_moving=2)))
     tensors = _gaussians() | {f"model.field.{name}": x.contiguous() for name, x in state.items()}
     tensors["model.rows"] = torch.tensor([1, 3])

@@ -45,21 +45,44 @@ def write_nerfstudio(root: Path) -> None:
     for i, name in enumerate(names):
         write_image(root / name, random_pixels(4, 6, 3, seed=i))
         write_image(root / f"masks/{i:02d}.png", random_pixels(4, 6, 1, seed=i))
-    fields = {**_LENS, "camera_model": "OPENCV", "k1": 0.1, "p2": -0.01, "ply_file_path": "points.ply"}
-    write_frames(root / "transforms.json", names, {**fields, "applied_transform": np.eye(4)[:3].tolist()})
+    fields = {
+        **_LENS,
+        "camera_model": "OPENCV",
+        "k1": 0.1,
+        "p2": -0.01,
+        "ply_file_path": "points.ply",
+    }
+    write_frames(
+        root / "transforms.json", names, {**fields, "applied_transform": np.eye(4)[:3].tolist()}
+    )
     content = json.loads((root / "transforms.json").read_text())
     for i, frame in enumerate(content["frames"]):
-        frame |= {"time": i / 2, "mask_path": f"masks/{i:02d}.png", "motion_mask_path": f"masks/{i:02d}.png"}
+        frame |= {
+            "time": i / 2,
+            "mask_path": f"masks/{i:02d}.png",
+            "motion_mask_path": f"masks/{i:02d}.png",
+        }
         frame |= {"depth_file_path": f"depth{i}.npy", "flow_file_path": f"flow{i}.npz"}
         np.save(root / f"depth{i}.npy", np.full((4, 6), 2.0, np.float32))
         np.savez(root / f"flow{i}.npz", flow=np.ones((4, 6, 2), np.float32))
     content["tracks_file_path"] = "tracks.npz"
-    tracks = {"xy": np.ones((3, 2, 2), np.float32), "visible": np.ones((3, 2), bool), "names": np.array(names)}
+    tracks = {
+        "xy": np.ones((3, 2, 2), np.float32),
+        "visible": np.ones((3, 2), bool),
+        "names": np.array(names),
+    }
     np.savez(root / "tracks.npz", **tracks)
     (root / "transforms.json").write_text(json.dumps(content))
-    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 3",
+        *(f"property float {axis}" for axis in "xyz"),
+    ]
     lines += [*(f"property uchar {name}" for name in ("red", "green", "blue")), "end_header"]
-    (root / "points.ply").write_text("\n".join([*lines, "0 0 0 1 2 3", "1 0 0 1 2 3", "0 1 0 9 9 9"]) + "\n")
+    (root / "points.ply").write_text(
+        "\n".join([*lines, "0 0 0 1 2 3", "1 0 0 1 2 3", "0 1 0 9 9 9"]) + "\n"
+    )
 
 
 def write_colmap_binary(root: Path) -> None:
@@ -108,22 +131,34 @@ def write_zju(root: Path) -> None:
         "R": [pose[:3, :3] for pose in poses],
         "T": [1000 * pose[:3, 3:] for pose in poses],
     }
-    frames = [{"ims": [f"Camera_B{camera + 1}/{frame:06d}.jpg" for camera in range(3)]} for frame in range(2)]
+    frames = [
+        {"ims": [f"Camera_B{camera + 1}/{frame:06d}.jpg" for camera in range(3)]}
+        for frame in range(2)
+    ]
     for name in (name for frame in frames for name in frame["ims"]):
         write_image(root / name, random_pixels(HEIGHT, WIDTH, 3))
-        write_image((root / "mask_cihp" / name).with_suffix(".png"), random_pixels(HEIGHT, WIDTH, 1))
+        write_image(
+            (root / "mask_cihp" / name).with_suffix(".png"), random_pixels(HEIGHT, WIDTH, 1)
+        )
     for frame in range(2):
-        _save_object(root / "new_params" / f"{frame}.npy", _smpl_of(frame) | {"shapes": np.ones((1, 10))})
+        _save_object(
+            root / "new_params" / f"{frame}.npy", _smpl_of(frame) | {"shapes": np.ones((1, 10))}
+        )
     _save_object(root / "annots.npy", {"cams": cams, "ims": frames})
 
 
 def write_zju_single(root: Path) -> None:
     """Write three frames of one camera, as ``cameras.pkl`` has them."""
-    cameras, meshes = {}, {}
+    cameras = {}
+    meshes = {}
     joints = np.random.default_rng(7).normal(size=(24, 3))
     for frame in range(3):
         name = f"frame_{frame:06d}"
-        cameras[name] = {"intrinsics": _intrinsics(), "extrinsics": _cam_from_world(1)[0], "distortions": np.zeros(5)}
+        cameras[name] = {
+            "intrinsics": _intrinsics(),
+            "extrinsics": _cam_from_world(1)[0],
+            "distortions": np.zeros(5),
+        }
         own = {key: value[0] for key, value in _smpl_of(frame).items()}
         meshes[name] = {**own, "joints": joints + 1, "tpose_joints": joints}
         write_image(root / "images" / f"{name}.png", random_pixels(HEIGHT, WIDTH, 3))
@@ -145,8 +180,15 @@ def write_neuman(root: Path) -> None:
 def write_neuman_aligned(root: Path) -> None:
     """Write four images with refined fits."""
     _write_neuman_images(root)
-    fields: dict[str, Any] = {"global_orient": np.full((4, 3), 0.1), "body_pose": np.full((4, 69), 0.2)}
-    fields |= {"betas": np.ones((4, 10)), "transl": np.arange(4)[:, None] * np.ones(3), "scale": np.full(4, 0.7)}
+    fields: dict[str, Any] = {
+        "global_orient": np.full((4, 3), 0.1),
+        "body_pose": np.full((4, 69), 0.2),
+    }
+    fields |= {
+        "betas": np.ones((4, 10)),
+        "transl": np.arange(4)[:, None] * np.ones(3),
+        "scale": np.full(4, 0.7),
+    }
     (root / "4d_humans").mkdir()
     np.savez(root / "4d_humans/smpl_optimized_aligned_scale.npz", **fields)
 
@@ -169,26 +211,48 @@ def write_people_snapshot(root: Path) -> None:
     for name, values in arrays.items():
         with h5py.File(root / name, "w") as file:
             for key, value in values.items():
-                file.create_dataset(key, data=value, compression="lzf" if name.startswith("m") else None)
+                file.create_dataset(
+                    key, data=value, compression="lzf" if name.startswith("m") else None
+                )
     camera = {"camera_t": np.array([0.1, 0.2, 0.3]), "camera_rt": np.array([0.0, 0.4, 0.0])}
-    camera |= {"camera_f": np.array([20.0, 21.0]), "camera_c": np.array([8.0, 6.0]), "camera_k": np.zeros(5)}
+    camera |= {
+        "camera_f": np.array([20.0, 21.0]),
+        "camera_c": np.array([8.0, 6.0]),
+        "camera_k": np.zeros(5),
+    }
     (root / "camera.pkl").write_bytes(pickle.dumps({**camera, "width": WIDTH, "height": HEIGHT}, 2))
 
 
 def write_body_json(root: Path) -> None:
     """Write two frames by two cameras to train on and one to test, with SMPL-X poses."""
     for split, cameras in (("train", (0, 1)), ("test", (2,))):
-        names = [f"images/{split}/f{frame}_c{camera}.png" for frame in range(2) for camera in cameras]
+        names = [
+            f"images/{split}/f{frame}_c{camera}.png" for frame in range(2) for camera in cameras
+        ]
         path = root / f"transforms_{split}.json"
         write_frames(path, names, _LENS)
         content = json.loads(path.read_text())
         for i, own in enumerate(content["frames"]):
-            own |= {"frame": i // len(cameras), "camera": cameras[i % len(cameras)], "time": float(i // len(cameras))}
+            own |= {
+                "frame": i // len(cameras),
+                "camera": cameras[i % len(cameras)],
+                "time": float(i // len(cameras)),
+            }
             write_image(root / names[i], random_pixels(4, 6, 4, seed=i))
         path.write_text(json.dumps(content))
     numbers = np.arange(2, dtype=np.float32)[:, None]
-    fields: dict[str, Any] = {"poses": numbers * np.ones(165), "trans": numbers * np.ones(3), "betas": np.zeros(10)}
-    np.savez(root / "body_train.npz", **fields, scale=1.5, mocap_frame_rate=12.0, surface_model_type="smplx")
+    fields: dict[str, Any] = {
+        "poses": numbers * np.ones(165),
+        "trans": numbers * np.ones(3),
+        "betas": np.zeros(10),
+    }
+    np.savez(
+        root / "body_train.npz",
+        **fields,
+        scale=1.5,
+        mocap_frame_rate=12.0,
+        surface_model_type="smplx",
+    )
 
 
 def _write_neuman_images(root: Path) -> None:

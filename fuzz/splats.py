@@ -54,7 +54,9 @@ def sog_changed(data: bytes, rng: Random) -> bytes:
     else:
         members[name] = bytes_changed(members.get(name, b""), rng)
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+    with zipfile.ZipFile(
+        buffer, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))
+    ) as archive:
         for own, content in members.items():
             archive.writestr(own, content)
     return buffer.getvalue()

@@ -41,7 +41,8 @@ _DEEP = "[" * 3000 + "]" * 3000
 
 
 def json_changed(data: bytes, rng: Random) -> bytes:
-    """Return a JSON file after one mutation of a value, a key or the nesting, or of its text if it is broken."""
+    """Return a JSON file after one mutation of a value, a key or the nesting, or of its text if it
+    is broken."""
     try:
         tree = json.loads(data)
     except (ValueError, RecursionError):
@@ -52,7 +53,8 @@ def json_changed(data: bytes, rng: Random) -> bytes:
 
 
 def json_bytes(tree: object) -> bytes:
-    """Return the tree as JSON; texts ``RAW:x`` become x without quotes, keys ``AGAIN:x`` a second x."""
+    """Return the tree as JSON; texts ``RAW:x`` become x without quotes, keys ``AGAIN:x`` a second
+    x."""
     try:
         text = json.dumps(tree)
     except (TypeError, ValueError, RecursionError):
@@ -90,7 +92,9 @@ def _change(parent: Any, key: Any, places: list[Place], rng: Random) -> None:
     if change == 0:
         del parent[key]
     elif change == 1 and isinstance(parent, dict):
-        parent[rng.choice((_AGAIN + str(key), rng.choice(TEXTS), str(key) + "x"))] = rng.choice(_VALUES)
+        parent[rng.choice((_AGAIN + str(key), rng.choice(TEXTS), str(key) + "x"))] = rng.choice(
+            _VALUES
+        )
     elif change == 1:
         parent.insert(key, value)
     elif change == 2 and isinstance(value, list) and value:
@@ -112,12 +116,23 @@ def _other_value(value: Any, rng: Random) -> Any:
     if isinstance(value, (int, float)) and rng.random() < 0.6:
         factor = rng.choice((-1, 0, 2, 1e-3, 1e3, 1e9, 1e-9, 1e150, 1e-300))
         value = max(min(value, 1e100), -1e100) if isinstance(value, int) else value
-        return rng.choice((value * factor, value + 1, int(value) if math.isfinite(value) else 0, str(value), [value]))
-    return rng.choice((*_VALUES, rng.choice(TEXTS), "RAW:" + rng.choice(NUMBERS), rng.randint(-3, 70_000)))
+        return rng.choice(
+            (
+                value * factor,
+                value + 1,
+                int(value) if math.isfinite(value) else 0,
+                str(value),
+                [value],
+            )
+        )
+    return rng.choice(
+        (*_VALUES, rng.choice(TEXTS), "RAW:" + rng.choice(NUMBERS), rng.randint(-3, 70_000))
+    )
 
 
 def _places(tree: Any) -> Iterator[Place]:
-    """List the nodes of the tree; long lists of numbers are thinned out, so that names are chosen often enough."""
+    """List the nodes of the tree; long lists of numbers are thinned out, so that names are chosen
+    often enough."""
     if isinstance(tree, dict):
         for key, value in list(tree.items()):
             yield tree, key
@@ -141,7 +156,22 @@ _TAGS = (
     "!!null 5",
     "!!set {a}",
 )
-_SCALARS = ("2024-02-30", "2024-01-01", "0x_", "0b", "0o9", "1:2:3", "*a", "&a b", "'", '"\\x"', "|", ">", "? a", "- b")
+_SCALARS = (
+    "2024-02-30",
+    "2024-01-01",
+    "0x_",
+    "0b",
+    "0o9",
+    "1:2:3",
+    "*a",
+    "&a b",
+    "'",
+    '"\\x"',
+    "|",
+    ">",
+    "? a",
+    "- b",
+)
 _SCALARS += (
     "\t",
     "\x07",
@@ -167,9 +197,9 @@ def _yaml_text_changed(data: bytes, rng: Random) -> bytes:
     if not found or rng.random() < 0.4:
         return text_changed(data, rng)
     value = rng.choice(found)
-    return (text[: value.start()] + " " + rng.choice((*_TAGS, *_SCALARS)) + text[value.end() :]).encode(
-        "utf-8", "surrogateescape"
-    )
+    return (
+        text[: value.start()] + " " + rng.choice((*_TAGS, *_SCALARS)) + text[value.end() :]
+    ).encode("utf-8", "surrogateescape")
 
 
 def override_changed(data: bytes, rng: Random) -> bytes:
@@ -177,8 +207,21 @@ def override_changed(data: bytes, rng: Random) -> bytes:
     lines = data.decode("utf-8", "surrogateescape").split("\n")
     i = rng.randrange(len(lines))
     key, _, value = lines[i].partition("=")
-    value = rng.choice((value, rng.choice(NUMBERS), rng.choice(_SCALARS), rng.choice(_TAGS), rng.choice(TEXTS)))
+    value = rng.choice(
+        (value, rng.choice(NUMBERS), rng.choice(_SCALARS), rng.choice(_TAGS), rng.choice(TEXTS))
+    )
     if rng.random() < 0.2:
-        key = rng.choice((key[:-1], key + ".x", "." + key, key.partition(".")[0], key.replace(".", ".."), "\u0663.a"))
+        key = rng.choice(
+            (
+                key[:-1],
+                key + ".x",
+                "." + key,
+                key.partition(".")[0],
+                key.replace(".", ".."),
+                "\u0663.a",
+            )
+        )
     lines[i] = (key + rng.choice(("=", "=", "=", "==", "")) + value).replace("\n", " ")
-    return "\n".join(lines).encode("utf-8", "backslashreplace" if "\ud800" in lines[i] else "surrogateescape")
+    return "\n".join(lines).encode(
+        "utf-8", "backslashreplace" if "\ud800" in lines[i] else "surrogateescape"
+    )

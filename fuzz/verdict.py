@@ -1,4 +1,5 @@
-"""Verdicts: a reader must return finite values or refuse with one clear line, and must change no other files."""
+"""Verdicts: a reader must return finite values or refuse with one clear line, and must change no
+other files."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ import torch
 from torch import Tensor
 
 LONGEST = 800
-"""Longest error in characters, paths in the case's folder counted as one; lists of configuration keys take 600."""
+"""Longest error in characters, paths in the case's folder counted as one; lists of configuration
+keys take 600."""
 _WAY = re.compile(r"F/\S*")
 
 
@@ -50,16 +52,25 @@ def fault_of_message(message: str, folder: Path, names: set[str] | None) -> str 
     Args:
         message: the text.
         folder: folder of the case.
-        names: names of its files; the text must contain one of them or the folder. None: it need not.
+        names: names of its files; the text must contain one of them or the folder. None: it need
+            not.
     """
     odd = [c for c in message if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in _BIDI]
     if odd:
-        return "the error holds a line break" if odd[0] in "\n\r" else "the error holds a control character"
+        return (
+            "the error holds a line break"
+            if odd[0] in "\n\r"
+            else "the error holds a control character"
+        )
     if len(_WAY.sub("F", message.replace(str(folder), "F"))) > LONGEST:
         return "the error is too long"
     if not message.strip():
         return "the error is empty"
-    if names is not None and str(folder) not in message and not any(name in message for name in names):
+    if (
+        names is not None
+        and str(folder) not in message
+        and not any(name in message for name in names)
+    ):
         return "the error names no file"
     return None
 
@@ -110,7 +121,12 @@ def snapshot(folder: Path) -> Snapshot:
                     found[entry.path] = (state.st_mode,)
                     stack.append(entry.path)
                 else:
-                    found[entry.path] = (state.st_mode, state.st_size, state.st_mtime_ns, state.st_ino)
+                    found[entry.path] = (
+                        state.st_mode,
+                        state.st_size,
+                        state.st_mtime_ns,
+                        state.st_ino,
+                    )
     return found
 
 
@@ -131,9 +147,11 @@ class Forbidden(BaseException):
 
 
 class Guard:
-    """Audit hook that refuses forbidden operations: writing outside some folders, starting programs, opening sockets.
+    """Audit hook that refuses forbidden operations: writing outside some folders, starting
+    programs, opening sockets.
 
-    The hook stays until the process ends. It does not see what a library does in C: ``snapshot`` does.
+    The hook stays until the process ends. It does not see what a library does in C: ``snapshot``
+    does.
     """
 
     _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -166,16 +184,29 @@ class Guard:
             self._refuse(f"{event} {arguments[:1]}")
         elif event == "open":
             flags = arguments[2]
-            if isinstance(flags, int) and flags & self._WRITES and isinstance(arguments[0], (str, bytes, os.PathLike)):
+            if (
+                isinstance(flags, int)
+                and flags & self._WRITES
+                and isinstance(arguments[0], (str, bytes, os.PathLike))
+            ):
                 self._check(event, arguments[0], None)
         elif event in self._CHANGES:
-            places = arguments[:2] if event in ("os.rename", "os.link", "shutil.move") else arguments[:1]
+            places = (
+                arguments[:2] if event in ("os.rename", "os.link", "shutil.move") else arguments[:1]
+            )
             if event == "os.symlink":
                 places = arguments[1:2]
-            folder = next((a for a in arguments[1:] if type(a) is int and a >= 0 and event != "os.chmod"), None)
+            folder = next(
+                (a for a in arguments[1:] if type(a) is int and a >= 0 and event != "os.chmod"),
+                None,
+            )
             for place in places:
                 if isinstance(place, (str, bytes, os.PathLike)):
-                    self._check(event, place, folder if event in ("os.remove", "os.rmdir", "os.mkdir") else None)
+                    self._check(
+                        event,
+                        place,
+                        folder if event in ("os.remove", "os.rmdir", "os.mkdir") else None,
+                    )
 
     def _check(self, event: str, place: str | bytes | os.PathLike, folder: int | None) -> None:
         path = os.fsdecode(place)

@@ -1,7 +1,7 @@
 """Worker process: runs cases of one reader, one after the other, with limits on time and memory.
 
-It is forked from a process that has imported everything, and reports over a pipe each case that it begins and its
-verdict; the reader of the pipe starts another worker when this one dies or hangs.
+It is forked from a process that has imported everything, and reports over a pipe each case that it
+begins and its verdict; the reader of the pipe starts another worker when this one dies or hangs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,16 @@ from typing import NoReturn
 from dyngs.errors import DyngsError
 from fuzz.case import Case, clear
 from fuzz.readers import Reader
-from fuzz.verdict import Forbidden, Guard, Outcome, Verdict, difference, fault_of_message, not_finite, snapshot
+from fuzz.verdict import (
+    Forbidden,
+    Guard,
+    Outcome,
+    Verdict,
+    difference,
+    fault_of_message,
+    not_finite,
+    snapshot,
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +45,8 @@ class Limits:
 
     Attributes:
         seconds: processor time; ten times as much wall time.
-        memory_mb: memory beyond that of the process before the case, of address space and of resident memory.
+        memory_mb: memory beyond that of the process before the case, of address space and of
+            resident memory.
     """
 
     seconds: float = 5.0
@@ -46,8 +56,11 @@ class Limits:
 STANDARD = Limits()
 
 
-def run_child(reader: Reader, cases: Iterable[tuple[int, Case]], folder: Path, pipe: int, limits: Limits) -> NoReturn:
-    """Run the cases and end the process; write lines of JSON to ``pipe``: the number of a case, then its verdict."""
+def run_child(
+    reader: Reader, cases: Iterable[tuple[int, Case]], folder: Path, pipe: int, limits: Limits
+) -> NoReturn:
+    """Run the cases and end the process; write lines of JSON to ``pipe``: the number of a case,
+    then its verdict."""
     try:
         _prepare(folder, limits)
         own = (folder / "box" / "capture",) if reader.writes else ()
@@ -85,7 +98,9 @@ def judge(reader: Reader, case: Case, folder: Path, guard: Guard, limits: Limits
         return Verdict(Outcome.FAILED, f"forbidden: {guard.tried.split()[0]}", guard.tried)
     after = snapshot(box)
     ours = tuple(str(path) for path in guard.given)
-    changed = difference(*({p: s for p, s in x.items() if not p.startswith(ours)} for x in (before, after)))
+    changed = difference(
+        *({p: s for p, s in x.items() if not p.startswith(ours)} for x in (before, after))
+    )
     if changed is not None:
         return Verdict(Outcome.FAILED, f"outside the output folder: {changed.split()[0]}", changed)
     grown = (_peak() - peak) / 1024
@@ -98,7 +113,11 @@ def _run(reader: Reader, capture: Path, case: Case) -> Verdict:
     try:
         found = reader.read(capture)
     except DyngsError as error:
-        names = {"data.root", *(name.rpartition("/")[2] for name in case.files)} if reader.names_file else None
+        names = (
+            {"data.root", *(name.rpartition("/")[2] for name in case.files)}
+            if reader.names_file
+            else None
+        )
         fault = fault_of_message(str(error), capture, names)
         if fault is None:
             return Verdict(Outcome.REFUSED, str(error))
@@ -115,8 +134,13 @@ def _run(reader: Reader, capture: Path, case: Case) -> Verdict:
 
 
 def _place(error: BaseException) -> str:
-    """Return the innermost function of dyngs in the traceback, by which failures are distinguished."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f"{os.sep}dyngs{os.sep}" in f.filename]
+    """Return the innermost function of dyngs in the traceback, by which failures are
+    distinguished."""
+    frames = [
+        f
+        for f in traceback.extract_tb(error.__traceback__)
+        if f"{os.sep}dyngs{os.sep}" in f.filename
+    ]
     return f"{Path(frames[-1].filename).stem}.{frames[-1].name}" if frames else "outside dyngs"
 
 
@@ -125,7 +149,9 @@ def _prepare(folder: Path, limits: Limits) -> None:
     errors = os.open(folder / "stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
     os.dup2(errors, 2)
     os.dup2(errors, 1)
-    sys.stdout = sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
+    sys.stdout = sys.stderr = os.fdopen(
+        2, "w", buffering=1, errors="backslashreplace", closefd=False
+    )
     faulthandler.enable(sys.stderr)
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
     faulthandler.register(signal.SIGPROF, sys.stderr, chain=True)
@@ -175,7 +201,8 @@ def _tell(pipe: int, what: object) -> None:
 
 
 def import_everything() -> None:
-    """Import dyngs and the libraries that it imports on first use, so that forked workers share them; one thread."""
+    """Import dyngs and the libraries that it imports on first use, so that forked workers share
+    them; one thread."""
     import torch
 
     import dyngs
@@ -189,6 +216,15 @@ def import_everything() -> None:
             continue
 
 
-_LIBRARIES = ("OpenImageIO", "av", "pycolmap", "trimesh", "kornia", "scipy.sparse", "scipy.spatial.transform", "h5py")
+_LIBRARIES = (
+    "OpenImageIO",
+    "av",
+    "pycolmap",
+    "trimesh",
+    "kornia",
+    "scipy.sparse",
+    "scipy.spatial.transform",
+    "h5py",
+)
 _RUNS_ON_IMPORT = re.compile(r"__main__$|\._core")
 """The command line, and native cores of which only one may suit this processor."""

@@ -1,4 +1,5 @@
-"""A person on the free template without training: Gaussians on its texels, in colours of their places."""
+"""A person on the free template without training: Gaussians on its texels, in colours of their
+places."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def atlas(resolution: int = RESOLUTION) -> Texels:
 
 
 def bands(points: Tensor) -> Tensor:
-    """Colours (P, 3) that change smoothly: red from foot to head, green from right to left, blue from back to front."""
+    """Colours (P, 3) that change smoothly: red from foot to head, green from right to left, blue
+    from back to front."""
     x, y, z = points.unbind(-1)
     return torch.stack([0.5 + 0.4 * y, 0.5 + 0.4 * x, 0.5 + 1.5 * z], dim=-1).clamp(0.05, 0.95)
 
@@ -45,7 +47,9 @@ def random_clip(frames: int = 3, scale: float = 1.0, seed: int = 0) -> MotionCli
     """Poses of all 55 joints by up to about half a radian."""
     make = torch.Generator().manual_seed(seed)
     return MotionClip(
-        times=torch.linspace(0, 1, frames, dtype=torch.float64) if frames > 1 else torch.zeros(1, dtype=torch.float64),
+        times=torch.linspace(0, 1, frames, dtype=torch.float64)
+        if frames > 1
+        else torch.zeros(1, dtype=torch.float64),
         poses=torch.rand(frames, 55, 3, generator=make) - 0.5,
         trans=torch.rand(frames, 3, generator=make),
         scale=torch.full((frames,), scale),
@@ -58,8 +62,10 @@ def bare_scene(
     resolution: int = RESOLUTION,
     light: bool = False,
 ) -> HumanScene:
-    """Opaque discs on the skin; the joints are moved, the pose turned and the size changed by what was learned."""
-    body, texels = template(), atlas(resolution)
+    """Opaque discs on the skin; the joints are moved, the pose turned and the size changed by what
+    was learned."""
+    body = template()
+    texels = atlas(resolution)
     gaussians, anchors = texel_gaussians(texels, [0.0], 0)
     gaussians = gaussians.replace(
         sh=((colours(anchors.points) - 0.5) / SH_C0)[:, None],
@@ -75,7 +81,11 @@ def bare_scene(
     values["log_scale"] = torch.full((1,), 0.1)
     values["weights"] = 0.3 * torch.randn(values["weights"].shape, generator=make)
     return HumanScene(
-        gaussians=gaussians, anchors=anchors, skeleton=skeleton, clip=clip, learned=learned.restored(values)
+        gaussians=gaussians,
+        anchors=anchors,
+        skeleton=skeleton,
+        clip=clip,
+        learned=learned.restored(values),
     )
 
 

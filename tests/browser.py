@@ -8,8 +8,8 @@
             image = page.screenshot()
             assert page.errors == [] and page.requests == ["file:///tmp/page.html"]
 
-Several pages of one ``Browser`` are strangers to each other, as in private windows. WebGL runs on the CPU
-(SwiftShader).
+Several pages of one ``Browser`` are strangers to each other, as in private windows. WebGL runs on
+the CPU (SwiftShader).
 """
 
 from __future__ import annotations
@@ -32,10 +32,17 @@ if TYPE_CHECKING:
 
 Button = Literal["left", "middle", "right"]
 
-CHROMIUM = os.environ.get("DYNGS_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+CHROMIUM = (
+    os.environ.get("DYNGS_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+)
 """The browser's program; None where there is none."""
 
-ARGUMENTS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--mute-audio")
+ARGUMENTS = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--mute-audio",
+)
 """WebGL without a GPU."""
 
 
@@ -43,7 +50,9 @@ def missing() -> str | None:
     """Return why no browser can be driven here; None where one can."""
     if CHROMIUM is None:
         return "no chromium here (apt install chromium, or DYNGS_CHROMIUM=PATH)"
-    return None if find_spec("playwright") else "playwright is not installed (pip install playwright)"
+    return (
+        None if find_spec("playwright") else "playwright is not installed (pip install playwright)"
+    )
 
 
 needs_browser = pytest.mark.skipif(missing() is not None, reason=missing() or "")
@@ -54,10 +63,11 @@ class Page:
     """One page in a browser, with all that it complained about and asked for.
 
     Attributes:
-        errors: texts of errors in the console, of uncaught exceptions and of failed requests, in order.
+        errors: texts of errors in the console, of uncaught exceptions and of failed requests, in
+            order.
         warnings: texts of warnings in the console.
-        requests: addresses of all requests, that of the page itself first, and of websockets; data: and blob: are
-            left out, since they reach no host.
+        requests: addresses of all requests, that of the page itself first, and of websockets; data:
+            and blob: are left out, since they reach no host.
         driven: the page as playwright has it, for all that has no method here.
     """
 
@@ -70,15 +80,18 @@ class Page:
         driven.set_default_timeout(1000 * timeout)
         driven.on("console", self._heard)
         driven.on("pageerror", lambda error: self.errors.append(f"uncaught: {error.message}"))
-        driven.on("requestfailed", lambda request: self.errors.append(f"failed: {request.url} ({request.failure})"))
+        driven.on(
+            "requestfailed",
+            lambda request: self.errors.append(f"failed: {request.url} ({request.failure})"),
+        )
         driven.on("request", lambda request: self._asked(request.url))
         driven.on("websocket", lambda socket: self._asked(socket.url))
 
     def wait_for(self, expression: str, timeout: float | None = None) -> None:
         """Return once a JavaScript ``expression`` is true. Raises TimeoutError after ``timeout`` s.
 
-        Asked again from here: playwright's own wait_for_function evaluates the text inside the page from its second
-        try on, which the content security policy of our pages forbids.
+        Asked again from here: playwright's own wait_for_function evaluates the text inside the page
+        from its second try on, which the content security policy of our pages forbids.
         """
         end = time.monotonic() + (self._timeout if timeout is None else timeout)
         while not self.driven.evaluate(expression):
@@ -87,12 +100,18 @@ class Page:
             self.driven.wait_for_timeout(20)
 
     def evaluate(self, expression: str, argument: Any = None) -> Any:
-        """Return the value of a JavaScript expression, or of a function of ``argument``; a promise is awaited."""
+        """Return the value of a JavaScript expression, or of a function of ``argument``; a promise
+        is awaited."""
         return self.driven.evaluate(expression, argument)
 
     def screenshot(self, selector: str | None = None) -> NDArray[np.uint8]:
-        """Return (H, W, 3) what is seen of the page, or of the element that a CSS ``selector`` names."""
-        png = self.driven.screenshot() if selector is None else self.driven.locator(selector).screenshot()
+        """Return (H, W, 3) what is seen of the page, or of the element that a CSS ``selector``
+        names."""
+        png = (
+            self.driven.screenshot()
+            if selector is None
+            else self.driven.locator(selector).screenshot()
+        )
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
     def click(self, selector: str) -> None:
@@ -103,7 +122,9 @@ class Page:
         """Press a key, by its name in the browser: "Space", "ArrowLeft", "r"."""
         self.driven.keyboard.press(key)
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], button: Button = "left") -> None:
+    def drag(
+        self, start: tuple[float, float], end: tuple[float, float], button: Button = "left"
+    ) -> None:
         """Drag the mouse from ``start`` to ``end``, CSS pixels of the page, with a button held."""
         mouse = self.driven.mouse
         mouse.move(*start)
@@ -112,7 +133,8 @@ class Page:
         mouse.up(button=button)
 
     def scroll(self, place: tuple[float, float], amount: float) -> None:
-        """Turn the mouse wheel by ``amount`` pixels, down where positive, at a ``place`` of the page."""
+        """Turn the mouse wheel by ``amount`` pixels, down where positive, at a ``place`` of the
+        page."""
         self.driven.mouse.move(*place)
         self.driven.mouse.wheel(0, amount)
 
@@ -160,20 +182,28 @@ class Browser:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._chromium.close()
         self._manager.__exit__(kind, error, trace)
 
-    def open(self, address: str | None, width: int = 640, height: int = 480, *, touch: bool = False) -> Page:
-        """Return a new page of ``width`` x ``height`` CSS pixels that has loaded ``address``; None: nothing yet.
+    def open(
+        self, address: str | None, width: int = 640, height: int = 480, *, touch: bool = False
+    ) -> Page:
+        """Return a new page of ``width`` x ``height`` CSS pixels that has loaded ``address``; None:
+        nothing yet.
 
         Args:
             address: http://... or file://...
             width, height: of what is seen of the page; a CSS pixel is one of the screenshot.
             touch: the screen is touched, as a phone's.
         """
-        context = self._chromium.new_context(viewport={"width": width, "height": height}, has_touch=touch)
+        context = self._chromium.new_context(
+            viewport={"width": width, "height": height}, has_touch=touch
+        )
         page = Page(context.new_page(), self.timeout)
         if address is not None:
             page.driven.goto(address)

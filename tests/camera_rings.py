@@ -19,14 +19,19 @@ def cameras_at(world_from_cam: np.ndarray) -> Cameras:
 
 def ring_of(count: int, target: np.ndarray, radius: float = 4.0, height: float = 1.5) -> Cameras:
     angles = 2 * np.pi * np.arange(count) / count
-    eyes = target + np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, height)], axis=-1)
+    eyes = target + np.stack(
+        [radius * np.cos(angles), radius * np.sin(angles), np.full(count, height)], axis=-1
+    )
     return cameras_at(np.stack([look_at(eye, target, UP) for eye in eyes]))
 
 
 def forward_facing(count: int) -> Cameras:
     rng = np.random.default_rng(0)
     poses = np.stack(
-        [look_at(np.array([x, 0.0, z]), np.array([x, 5.0, z]), UP) for x, z in rng.normal(size=(count, 2))]
+        [
+            look_at(np.array([x, 0.0, z]), np.array([x, 5.0, z]), UP)
+            for x, z in rng.normal(size=(count, 2))
+        ]
     )
     return cameras_at(poses)
 

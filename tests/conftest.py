@@ -1,7 +1,8 @@
 """How the tests draw their examples, and fixtures that several folders of tests share.
 
-Examples of property tests are fixed by default (profile ``ci``): a run passes or fails whoever starts it. The profile
-``random`` draws as many at random, ``long`` ten times as many; they say how to draw a failing one again::
+Examples of property tests are fixed by default (profile ``ci``): a run passes or fails whoever
+starts it. The profile ``random`` draws as many at random, ``long`` ten times as many; they say how
+to draw a failing one again::
 
     HYPOTHESIS_PROFILE=random pytest -m hypothesis --hypothesis-seed=3
     HYPOTHESIS_PROFILE=long pytest tests/ops
@@ -14,9 +15,11 @@ from __future__ import annotations
 import gc
 import os
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # `pytest -n 2`: processes share the cores, their threads would fight for them
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # `pytest -n 2`: processes share the cores, their threads would fight for them
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # Commands and runs that name no number of threads take all cores; where these wait for work they must not spin.
+    # Commands and runs that name no number of threads take all cores; where these wait for work
+    # they must not spin.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from collections.abc import Callable, Iterator
@@ -56,8 +59,12 @@ LONGEST = (
 FEW, MANY = 100, 1000  # examples of a test that does not say how many
 # No deadlines: whether a busy machine is slow says nothing about what is tested.
 settings.register_profile("ci", derandomize=True, max_examples=FEW, deadline=None)
-settings.register_profile("random", derandomize=False, max_examples=FEW, print_blob=True, deadline=None)
-settings.register_profile("long", derandomize=False, max_examples=MANY, print_blob=True, deadline=None)
+settings.register_profile(
+    "random", derandomize=False, max_examples=FEW, print_blob=True, deadline=None
+)
+settings.register_profile(
+    "long", derandomize=False, max_examples=MANY, print_blob=True, deadline=None
+)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
@@ -66,21 +73,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     Tests that say how many examples they need in ``ci`` draw more by the same factor in ``long``.
     """
-    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+    items.sort(
+        key=lambda item: (
+            LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST)
+        )
+    )
     factor = settings.default.max_examples // FEW
-    for test in {id(item.obj): item.obj for item in items if isinstance(item, pytest.Function)}.values():
-        own = getattr(test, "_hypothesis_internal_use_settings", None)  # hypothesis has no public way to reach these
+    for test in {
+        id(item.obj): item.obj for item in items if isinstance(item, pytest.Function)
+    }.values():
+        # hypothesis has no public way to reach these
+        own = getattr(test, "_hypothesis_internal_use_settings", None)
         if factor > 1 and own is not None and own.max_examples < settings.default.max_examples:
-            test._hypothesis_internal_use_settings = settings(own, max_examples=factor * own.max_examples)
+            test._hypothesis_internal_use_settings = settings(
+                own, max_examples=factor * own.max_examples
+            )
 
 
 def pytest_collection() -> None:
-    """Modules and tests are no garbage: to look for it among them takes a third of the collection."""
+    """Modules and tests are no garbage: to look for it among them takes a third of the
+    collection."""
     gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """From here on garbage is looked for, among what tests make, and less often than usual, which takes a twentieth."""
+    """From here on garbage is looked for, among what tests make, and less often than usual, which
+    takes a twentieth."""
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
     gc.enable()
@@ -93,7 +111,8 @@ def pytest_sessionfinish() -> None:
 
 @pytest.fixture(scope="session")
 def numbered_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Empty folders. (Each numbered folder of pytest lists all before it: a minute, for those of all tests.)"""
+    """Empty folders. (Each numbered folder of pytest lists all before it: a minute, for those of
+    all tests.)"""
     base = tmp_path_factory.mktemp("tests")
 
     def made(number: int) -> Path:
@@ -112,8 +131,9 @@ def tmp_path(numbered_folders: Iterator[Path]) -> Path:
 
 @pytest.fixture(autouse=True)
 def empty_folder(numbered_folders: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every test runs in an empty folder, as a user would: nothing is left in the checkout, and processes that a test
-    starts import the installed package, not the sources beside them. The user's cache is another empty folder."""
+    """Every test runs in an empty folder, as a user would: nothing is left in the checkout, and
+    processes that a test starts import the installed package, not the sources beside them. The
+    user's cache is another empty folder."""
     monkeypatch.chdir(next(numbered_folders))
     monkeypatch.setenv("DYNGS_CACHE_DIR", str(next(numbered_folders)))
 
@@ -122,7 +142,8 @@ def empty_folder(numbered_folders: Iterator[Path], monkeypatch: pytest.MonkeyPat
 def same_numbers() -> None:
     """What a test draws without a generator of its own does not depend on the tests before it.
 
-    Of the CPU alone: ``torch.manual_seed`` keeps a stack of calls for each kind of device that is not here, each time.
+    Of the CPU alone: ``torch.manual_seed`` keeps a stack of calls for each kind of device that is
+    not here, each time.
     """
     torch.default_generator.manual_seed(0)
 
@@ -145,7 +166,8 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def one_thread(set_threads: Callable[[int], None]) -> None:
-    """For tests of tiny images, where waking threads would take most of the time, above all on a busy machine."""
+    """For tests of tiny images, where waking threads would take most of the time, above all on a
+    busy machine."""
     set_threads(1)
 
 
@@ -175,7 +197,9 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def person(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three cameras, three frames of 32 px."""
     folder = tmp_path_factory.mktemp("capture") / "person"
-    return write_human_capture(folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1))
+    return write_human_capture(
+        folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1)
+    )
 
 
 @pytest.fixture
@@ -195,7 +219,15 @@ def nerfstudio_root(tmp_path: Path) -> Path:
     names = [f"images/{i:02d}.jpg" for i in range(10)]
     for i, name in enumerate(names):
         write_image(tmp_path / name, random_pixels(8, 12, 3, seed=i))
-    fields = {"w": 12, "h": 8, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.5, "cy": 3.5, "camera_model": "OPENCV"}
+    fields = {
+        "w": 12,
+        "h": 8,
+        "fl_x": 10.0,
+        "fl_y": 11.0,
+        "cx": 6.5,
+        "cy": 3.5,
+        "camera_model": "OPENCV",
+    }
     write_frames(tmp_path / "transforms.json", names, {**fields, "k1": 0.1, "p2": -0.01})
     return tmp_path
 
@@ -211,12 +243,15 @@ def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bodies are fitted to captures in two steps, on squares of 32 px."""
     effort = FitEffort(side=32, steps=2, visits=0)
     for name in ("fit_capture", "placed_clip"):
-        monkeypatch.setattr(fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort))
+        monkeypatch.setattr(
+            fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort)
+        )
 
 
 @pytest.fixture(scope="session")
 def smpl_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A file in the layout of SMPL with the mesh of the free template, and the .obj with its texture coordinates."""
+    """A file in the layout of SMPL with the mesh of the free template, and the .obj with its
+    texture coordinates."""
     return write_smpl_like(tmp_path_factory.mktemp("bodies"), "smpl")
 
 

@@ -1,4 +1,5 @@
-"""The core for CUDA GPUs, compiled over the emulation of csrc/tests, so that a CPU runs its whole Python path."""
+"""The core for CUDA GPUs, compiled over the emulation of csrc/tests, so that a CPU runs its whole
+Python path."""
 
 from __future__ import annotations
 
@@ -28,13 +29,15 @@ KERNELS = tuple(sorted((ROOT / "csrc/cuda").glob("*.cu")))
 BINDINGS = tuple(sorted((ROOT / "csrc/bind").glob("bind_*.cpp")))
 NAME = "_core_emulated"
 OWN_NAME = re.compile(
-    r"^struct (?:alignas\(\d+\) )?(\w+)|\b(k[A-Z]\w*) = |^(?:__device__|constexpr|DYNGS_HD|inline) [^=]*?(\w+)\(", re.M
+    r"^struct (?:alignas\(\d+\) )?(\w+)|\b(k[A-Z]\w*) = |^(?:__device__|constexpr|DYNGS_HD|inline) [^=]*?(\w+)\(",
+    re.M,
 )
 """Constants, structures and functions of one source, as they are defined in csrc."""
 
 
 def compiler() -> str:
-    """The C++ compiler: Clang, if it is here, in two thirds of the time of GCC. Skips the test where there is none."""
+    """The C++ compiler: Clang, if it is here, in two thirds of the time of GCC. Skips the test
+    where there is none."""
     found = shutil.which("clang++") or shutil.which("c++") or shutil.which("g++")
     if found is None:
         pytest.skip("no C++ compiler here")
@@ -55,13 +58,17 @@ def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str]) -> lis
 
 
 def as_one(file: Path, sources: Iterable[Path]) -> Path:
-    """A source that includes the others: what their headers hold is compiled once, in a quarter of the time.
+    """A source that includes the others: what their headers hold is compiled once, in a quarter of
+    the time.
 
     Headers come first, so that names that a source defines for itself alone can be made its own.
     """
     texts = {source: source.read_text(encoding="utf-8") for source in sources}
     lines = dict.fromkeys(
-        line for text in texts.values() for line in text.splitlines() if line.startswith('#include "')
+        line
+        for text in texts.values()
+        for line in text.splitlines()
+        if line.startswith('#include "')
     )
     parts = [*lines]
     for source, text in texts.items():
@@ -75,9 +82,18 @@ def as_one(file: Path, sources: Iterable[Path]) -> Path:
 def digest_of_all(folders: Iterable[Path]) -> str:
     """A number that differs as soon as a source, this file, the compiler, or Python does."""
     found = hashlib.sha256()
-    below = (x for folder in folders for x in sorted(folder.rglob("*")) if x.is_file() and x.suffix != ".pyc")
+    below = (
+        x
+        for folder in folders
+        for x in sorted(folder.rglob("*"))
+        if x.is_file() and x.suffix != ".pyc"
+    )
     version = subprocess.run([compiler(), "--version"], capture_output=True, check=True).stdout
-    for text in (sys.version.encode(), version, *(x.read_bytes() for x in (Path(__file__), *below))):
+    for text in (
+        sys.version.encode(),
+        version,
+        *(x.read_bytes() for x in (Path(__file__), *below)),
+    ):
         found.update(len(text).to_bytes(8, "little") + text)
     return found.hexdigest()[:20]
 
@@ -104,14 +120,23 @@ def build_module(cache: Path) -> ModuleType:
         pytest.skip("Python's headers are not here")
     sources = Path(nanobind.source_dir())
     includes = (nanobind.include_dir(), sources / "../ext/robin_map/include", python)
-    names = {"DYNGS_GPU": 1, "DYNGS_EMULATED": 1, "DYNGS_MODULE": NAME, "NB_DOMAIN": "dyngs_emulated"}
+    names = {
+        "DYNGS_GPU": 1,
+        "DYNGS_EMULATED": 1,
+        "DYNGS_MODULE": NAME,
+        "NB_DOMAIN": "dyngs_emulated",
+    }
     flags = [
         "-fvisibility=hidden",
         "-ffp-contract=off",
         *(f"-I{x}" for x in includes),
         *(f"-D{k}={v}" for k, v in names.items()),
     ]
-    own = [*sorted((ROOT / "csrc/bind_cuda").glob("*.cpp")), *BINDINGS, ROOT / "csrc/cpu/memory.cpp"]
+    own = [
+        *sorted((ROOT / "csrc/bind_cuda").glob("*.cpp")),
+        *BINDINGS,
+        ROOT / "csrc/cpu/memory.cpp",
+    ]
     library = cache / f"{digest_of_all([ROOT / 'csrc', Path(nanobind.__file__).parent])}.so"
     with alone_in(cache):
         if library.exists():
@@ -120,7 +145,8 @@ def build_module(cache: Path) -> ModuleType:
             old.unlink()
         with TemporaryDirectory(dir=cache) as work:
             bindings, kernels = (
-                as_one(Path(work) / f"{name}.cpp", x) for name, x in (("bind", own), ("cuda", KERNELS))
+                as_one(Path(work) / f"{name}.cpp", x)
+                for name, x in (("bind", own), ("cuda", KERNELS))
             )
             objects = compiled(Path(work), [bindings, kernels, sources / "nb_combined.cpp"], flags)
             linked = Path(work) / library.name
@@ -140,7 +166,8 @@ def loaded(library: Path) -> ModuleType:
 
 
 def on_emulated_gpu(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> None:
-    """Make ops of CPU tensors run on the emulated GPU: kernels see only memory that an op has handed to them."""
+    """Make ops of CPU tensors run on the emulated GPU: kernels see only memory that an op has
+    handed to them."""
     to_dlpack: Callable[[Tensor], object] = native.to_dlpack
 
     def noted(x: Tensor) -> object:

@@ -15,7 +15,8 @@ PRIMES = 1, 2654435761, 805459861
 
 def reference_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
     """The value of ``hash_features`` by its formula, any order of derivatives by the table."""
-    found, first = [], 0
+    found = []
+    first = 0
     for scale, size, rows in zip(levels.scales, levels.sizes, levels.rows, strict=True):
         at = coords.clamp(0, 1) * scale + 0.5
         below = at.floor()
@@ -43,7 +44,8 @@ def reference_composite(
     seen = []
     for begin, end in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
         through = torch.ones((), dtype=densities.dtype)
-        colour, depth = torch.zeros(3, dtype=densities.dtype), torch.zeros((), dtype=densities.dtype)
+        colour = torch.zeros(3, dtype=densities.dtype)
+        depth = torch.zeros((), dtype=densities.dtype)
         for i in range(begin, end):
             if float(through.detach()) < transmittance_min:
                 break
@@ -62,7 +64,9 @@ def cell_of(space: Space, point: Tensor) -> tuple[int, int, int, int] | None:
     y = (point - torch.tensor(space.centre, dtype=point.dtype)) / space.half
     for cascade in range(space.cascades):
         if float(y.abs().max()) <= 2**cascade:
-            x, y_, z = (((y / 2**cascade + 1) / 2 * space.cells).long().clamp(0, space.cells - 1)).tolist()
+            x, y_, z = (
+                ((y / 2**cascade + 1) / 2 * space.cells).long().clamp(0, space.cells - 1)
+            ).tolist()
             return cascade, z, y_, x
     return None
 
@@ -73,10 +77,13 @@ def reference_march(
     """Starts of the samples of a ray with samples of one length: every step is tried."""
     assert steps.cone == 0
     offset = origin - torch.tensor(space.centre, dtype=origin.dtype)
-    walls = torch.stack([(-space.outermost - offset) / direction, (space.outermost - offset) / direction])
+    walls = torch.stack(
+        [(-space.outermost - offset) / direction, (space.outermost - offset) / direction]
+    )
     begin = max(steps.near, float(walls.amin(0).max()))
     end = float(walls.amax(0).min())
-    starts, number = [], 0
+    starts = []
+    number = 0
     while (at := begin + (shift + number) * steps.length) < end:
         cell = cell_of(space, origin + (at + steps.length / 2) * direction)
         if cell is not None and bool(occupied[cell]):

@@ -1,4 +1,5 @@
-"""A wall whose images are known: cameras that stand side by side before it, and what they and a model see."""
+"""A wall whose images are known: cameras that stand side by side before it, and what they and a
+model see."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ BLACK = torch.zeros(3)
 
 
 def cameras_before_wall(count: int, step: float = 0.15) -> list[Cameras]:
-    """Return cameras that look at the wall z = ``DISTANCE`` from x = 0, ``step``, 2 ``step``, ..."""
+    """Return cameras that look at the wall z = ``DISTANCE`` from x = 0, ``step``, 2 ``step``,
+    ..."""
     width, height = SIZE
     intrinsics = torch.tensor([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1.0]])
     found = []
@@ -41,12 +43,16 @@ def places(camera: Cameras) -> tuple[Tensor, Tensor]:
 def wall(camera: Cameras) -> Tensor:
     """Return the (H, W, 3) image of a wall of soft colours."""
     x, y = places(camera)
-    return torch.stack([0.5 + 0.2 * torch.sin(2 * x), 0.5 + 0.2 * torch.cos(1.5 * y + x), 0.5 + 0 * x], -1)
+    return torch.stack(
+        [0.5 + 0.2 * torch.sin(2 * x), 0.5 + 0.2 * torch.cos(1.5 * y + x), 0.5 + 0 * x], -1
+    )
 
 
 def seen_from(cameras: Sequence[Cameras]) -> list[Image]:
     """Return the images of the wall."""
-    return [Image(f"{i}", camera, wall(camera), None, None, None) for i, camera in enumerate(cameras)]
+    return [
+        Image(f"{i}", camera, wall(camera), None, None, None) for i, camera in enumerate(cameras)
+    ]
 
 
 def with_block(image: Image, rows: slice, columns: slice) -> Image:

@@ -1,4 +1,5 @@
-"""Files whose checksum fits and whose contents do not: tensors and headers, mutated by somebody who knows them."""
+"""Files whose checksum fits and whose contents do not: tensors and headers, mutated by somebody who
+knows them."""
 
 from __future__ import annotations
 
@@ -30,13 +31,39 @@ CONTENTS = ("static", "network", "masked", "windowed", *ALL_KINDS)
 _ROWS = (0, 2, 3, 6)
 
 _VALUES = (torch.nan, torch.inf, -torch.inf, 3e38, -3e38, 1e20, 1e-45, -1.0, 0.0, 1e9, 255.0)
-_TYPES = (torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.uint8, torch.bool)
-_WRONG = (None, "", "x" * 300, -1, 0, 2**70, 1e308, float("nan"), float("inf"), True, [], {}, [[1]], "\x00\n\x1b[31m")
+_TYPES = (
+    torch.float64,
+    torch.float16,
+    torch.bfloat16,
+    torch.int64,
+    torch.int32,
+    torch.uint8,
+    torch.bool,
+)
+_WRONG = (
+    None,
+    "",
+    "x" * 300,
+    -1,
+    0,
+    2**70,
+    1e308,
+    float("nan"),
+    float("inf"),
+    True,
+    [],
+    {},
+    [[1]],
+    "\x00\n\x1b[31m",
+)
 
 
-def forged(tensors: Mapping[str, Tensor], header: Mapping[str, Any], chance: random.Random) -> tuple[Tensors, Header]:
+def forged(
+    tensors: Mapping[str, Tensor], header: Mapping[str, Any], chance: random.Random
+) -> tuple[Tensors, Header]:
     """The contents of a file with one to three things wrong."""
-    changed, told = {name: x.clone() for name, x in tensors.items()}, dict(header)
+    changed = {name: x.clone() for name, x in tensors.items()}
+    told = dict(header)
     for _ in range(chance.choice((1, 1, 1, 2, 3))):
         if chance.random() < 0.15:
             key = chance.choice(sorted(told)) if told else "step"
@@ -104,11 +131,15 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
     Raises:
         ValueError: the format cannot say that.
     """
-    kept = {name: x for name, x in tensors.items() if str(x.dtype).removeprefix("torch.") in _DTYPES}
+    kept = {
+        name: x for name, x in tensors.items() if str(x.dtype).removeprefix("torch.") in _DTYPES
+    }
     stored = [_stored(name, x, Coding(TensorKind.EXACT), None) for name, x in sorted(kept.items())]
     header = _Header(info=_Info(**info), tensors=tuple(entry for entry, _ in stored))
     packed = compressed(header.model_dump_json().encode(), room=MAX_HEADER)
-    body = b"".join([MAGIC, len(packed).to_bytes(4, "little"), packed, *(block for _, block in stored)])
+    body = b"".join(
+        [MAGIC, len(packed).to_bytes(4, "little"), packed, *(block for _, block in stored)]
+    )
     return body + hashlib.sha256(body).digest()
 
 
@@ -121,30 +152,46 @@ def require_drawable(scene: GaussianScene) -> None:
 
 
 def one_line(error: Exception, path: Path) -> None:
-    """Nothing, if the message is one line of printable characters that names the file or says what is not drawn."""
+    """Nothing, if the message is one line of printable characters that names the file or says what
+    is not drawn."""
     text = str(error)
     assert text.isprintable(), text
-    assert str(path) in text or "render" in text or "clean the input" in text or "not finite" in text, text
+    assert (
+        str(path) in text or "render" in text or "clean the input" in text or "not finite" in text
+    ), text
 
 
 def contents(kind: str) -> tuple[Tensors, SceneModel]:
-    """Of a checkpoint of nine Gaussians: "static", "network", "masked", "windowed", or a field's kind; and its
-    model."""
-    gaussians, model = cloud(9), StaticModel()
+    """Of a checkpoint of nine Gaussians: "static", "network", "masked", "windowed", or a field's
+    kind; and its model."""
+    gaussians = cloud(9)
+    model = StaticModel()
     state: Tensors = {"filter_std": torch.rand(9, generator=torch.Generator().manual_seed(1))}
     if kind == "network":
         gaussians = gaussians.replace(sh=gaussians.sh[:, :1].contiguous())
-        box, options = torch.stack([torch.zeros(3), torch.ones(3)]), NetworkColour(width=8, depth=2)
-        colours = NetworkTraining(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
+        box = torch.stack([torch.zeros(3), torch.ones(3)])
+        options = NetworkColour(width=8, depth=2)
+        colours = NetworkTraining(
+            options, 10, box, torch.Generator().manual_seed(0), sees_time=True
+        )
         state |= tensors_of(prefixed("colour", colours.network.state() | colours.state()))
     elif kind != "static":
         name = "control_nodes" if kind in ("masked", "windowed") else kind
-        model, field = DynamicModel(deform=tiny_options(name)), stirred_field(name, len(_ROWS))
+        model = DynamicModel(deform=tiny_options(name))
+        field = stirred_field(name, len(_ROWS))
         field = WindowedField(field, len(_ROWS)) if kind == "windowed" else field
         state |= tensors_of(prefixed("field", field_state(field)))
-        state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}
+        state |= {
+            "rows": torch.tensor(_ROWS),
+            "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64),
+        }
     if kind == "masked":
-        masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
+        masks = VisibilityMasks.pack(
+            (0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None]
+        )
         state |= tensors_of(prefixed("masks", masks.state()))
     tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
-    return {name: x.contiguous() for name, x in (tensors | {f"model.{n}": x for n, x in state.items()}).items()}, model
+    return {
+        name: x.contiguous()
+        for name, x in (tensors | {f"model.{n}": x for n, x in state.items()}).items()
+    }, model

@@ -1,4 +1,5 @@
-"""A reader of glTF skins in plain numpy, as the standard describes them: positions of vertices in frames of a clip."""
+"""A reader of glTF skins in plain numpy, as the standard describes them: positions of vertices in
+frames of a clip."""
 
 from __future__ import annotations
 
@@ -36,10 +37,13 @@ class SkinnedGlb:
         """The rows of an accessor."""
         accessor = self.json["accessors"][index]
         view = self.json["bufferViews"][accessor["bufferView"]]
-        dtype, width = np.dtype(TYPES[accessor["componentType"]]), WIDTHS[accessor["type"]]
+        dtype = np.dtype(TYPES[accessor["componentType"]])
+        width = WIDTHS[accessor["type"]]
         assert view["byteOffset"] % 4 == 0
         assert view["byteLength"] == accessor["count"] * width * dtype.itemsize
-        found = np.frombuffer(self._data, dtype, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)
+        found = np.frombuffer(
+            self._data, dtype, accessor["count"] * width, view["byteOffset"]
+        ).reshape(-1, width)
         if "min" in accessor:
             np.testing.assert_array_equal(found.min(axis=0), np.array(accessor["min"], dtype))
             np.testing.assert_array_equal(found.max(axis=0), np.array(accessor["max"], dtype))
@@ -68,7 +72,8 @@ class SkinnedGlb:
         return joints, np.concatenate([self.attribute(f"WEIGHTS_{k}") for k in sets], axis=1)
 
     def skin_matrices(self, frame: int | None) -> np.ndarray:
-        """The matrices (J, 4, 4) of the skin at a key of the animation; None: as the nodes stand."""
+        """The matrices (J, 4, 4) of the skin at a key of the animation; None: as the nodes
+        stand."""
         nodes = [dict(node) for node in self.json["nodes"]]
         if frame is not None:
             animation = self.json["animations"][0]
@@ -78,7 +83,8 @@ class SkinnedGlb:
         world: dict[int, np.ndarray] = {}
 
         def place(index: int, above: np.ndarray) -> None:
-            node, own = nodes[index], np.eye(4)
+            node = nodes[index]
+            own = np.eye(4)
             own[:3, :3] = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
             own[:3, :3] *= node.get("scale", [1, 1, 1])
             own[:3, 3] = node.get("translation", [0, 0, 0])
@@ -95,6 +101,8 @@ class SkinnedGlb:
     def posed(self, frame: int | None) -> np.ndarray:
         """Positions (V, 3) in the scene."""
         joints, weights = self.weights()
-        blend = np.einsum("vk,vkab->vab", weights.astype(np.float64), self.skin_matrices(frame)[joints])
+        blend = np.einsum(
+            "vk,vkab->vab", weights.astype(np.float64), self.skin_matrices(frame)[joints]
+        )
         points = self.attribute("POSITION").astype(np.float64)
         return np.einsum("vab,vb->va", blend[:, :3, :3], points) + blend[:, :3, 3]

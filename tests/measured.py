@@ -8,12 +8,14 @@ from collections.abc import Callable
 
 
 def cost_of(call: Callable[[], object]) -> tuple[int, float]:
-    """Bytes at the peak beyond what was there before, and processor seconds, of a call that may raise nothing.
+    """Bytes at the peak beyond what was there before, and processor seconds, of a call that may
+    raise nothing.
 
     Memory of Python and NumPy; tracing makes the call several times slower than it is.
     """
     tracemalloc.start()
-    before, start = tracemalloc.get_traced_memory()[0], time.process_time()
+    before = tracemalloc.get_traced_memory()[0]
+    start = time.process_time()
     try:
         call()
         return tracemalloc.get_traced_memory()[1] - before, time.process_time() - start

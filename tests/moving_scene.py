@@ -11,7 +11,14 @@ from scaled_captures import scaled_capture
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, ControlNodesField, DataConfig, DynamicModel, StaticModel, TrainConfig
+from dyngs.config import (
+    Config,
+    ControlNodesField,
+    DataConfig,
+    DynamicModel,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.control_nodes import ControlNodes
@@ -43,7 +50,9 @@ class Sliding(DeformationField):
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         self.calls += 1
-        return Offsets(torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(chosen(means, rows)), 3))
+        return Offsets(
+            torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(chosen(means, rows)), 3)
+        )
 
 
 @dataclass
@@ -55,11 +64,14 @@ class Blinking(Sliding):
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         odd = round(time * (self.num_times - 1)) % 2
         means = chosen(means, rows)
-        return Offsets(torch.zeros(len(means), 3), colors=torch.full((len(means), 3), self.speed * odd))
+        return Offsets(
+            torch.zeros(len(means), 3), colors=torch.full((len(means), 3), self.speed * odd)
+        )
 
 
 class Lines(DeformationField):
-    """Each of M Gaussians goes along a line of its own, from -x at time 0 to x at time 1; what is learned is x."""
+    """Each of M Gaussians goes along a line of its own, from -x at time 0 to x at time 1; what is
+    learned is x."""
 
     def __init__(self, setup: FieldSetup = SETUP) -> None:
         self.setup = setup
@@ -78,7 +90,13 @@ def row_of_balls(count: int = 5) -> Gaussians:
     means = torch.zeros(count, 3)
     means[:, 0] = torch.linspace(-1, 1, count)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    return Gaussians(means, quats, torch.full((count, 3), -1.6), torch.full((count,), 3.0), torch.zeros(count, 1, 3))
+    return Gaussians(
+        means,
+        quats,
+        torch.full((count, 3), -1.6),
+        torch.full((count,), 3.0),
+        torch.zeros(count, 1, 3),
+    )
 
 
 SLIDING = ControlNodesField(nodes=2, pieces=1, move_rotations=False, move_scales=False)
@@ -101,10 +119,14 @@ def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> StaticScene:
 
 
 def moving_scene(
-    motion: DeformationField, rows: tuple[int, ...] = MOVING_ROWS, times: tuple[float, ...] = TRAIN_TIMES
+    motion: DeformationField,
+    rows: tuple[int, ...] = MOVING_ROWS,
+    times: tuple[float, ...] = TRAIN_TIMES,
 ) -> DynamicScene:
     """Five balls of which ``rows`` follow ``motion``."""
-    return DynamicScene(gaussians=row_of_balls(), seen_at=times, field=motion, moving=torch.tensor(rows))
+    return DynamicScene(
+        gaussians=row_of_balls(), seen_at=times, field=motion, moving=torch.tensor(rows)
+    )
 
 
 def camera(width: int = 20, height: int = 14) -> Cameras:
@@ -116,7 +138,8 @@ def camera(width: int = 20, height: int = 14) -> Cameras:
 
 
 def write_timed_capture(root: Path, *, standing: bool = False) -> Path:
-    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test images from one pose."""
+    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test images
+    from one pose."""
     options = StillOptions(size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1)
     write_still_capture(root, options)
     for split, times in (("train", TRAIN_TIMES), ("test", TEST_TIMES)):
@@ -137,17 +160,24 @@ def write_moving_run(
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     standing: bool = False,
 ) -> Path:
-    """A run with a capture beside it: of five balls the second and fourth go 1 along x over time, if ``moves``."""
-    root = write_timed_capture(folder / "at_origin" if any(offset) else folder / "capture", standing=standing)
+    """A run with a capture beside it: of five balls the second and fourth go 1 along x over time,
+    if ``moves``."""
+    root = write_timed_capture(
+        folder / "at_origin" if any(offset) else folder / "capture", standing=standing
+    )
     if any(offset):
         root = scaled_capture(root, folder / "capture", 1.0, offset)
     model = DynamicModel(deform=SLIDING) if moves else StaticModel()
-    config = Config(data=DataConfig.model_validate({"root": root}), model=model, train=TrainConfig(steps=7))
+    config = Config(
+        data=DataConfig.model_validate({"root": root}), model=model, train=TrainConfig(steps=7)
+    )
     save_config(config, folder / "run" / RESOLVED_NAME)
     gaussians = row_of_balls()
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}
     if moves:
-        tensors |= {f"model.field.{name}": x for name, x in tensors_of(field_state(sliding_nodes())).items()}
+        tensors |= {
+            f"model.field.{name}": x for name, x in tensors_of(field_state(sliding_nodes())).items()
+        }
         tensors["model.rows"] = torch.tensor(MOVING_ROWS)
         tensors["model.times"] = torch.tensor(TRAIN_TIMES, dtype=torch.float64)
     info = CheckpointInfo(7, 1.0, offset, "white", "classic")

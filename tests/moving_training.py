@@ -52,7 +52,9 @@ def flat_cloud(count: int = 9) -> Gaussians:
 
 
 def leaves(gaussians: Gaussians) -> Gaussians:
-    return Gaussians(**{name: x.clone().requires_grad_() for name, x in gaussians.tensors().items()})
+    return Gaussians(
+        **{name: x.clone().requires_grad_() for name, x in gaussians.tensors().items()}
+    )
 
 
 def alike(errors: Tensor) -> StillErrors:
@@ -78,7 +80,8 @@ class Run:
         return self.time_step(time, STEPS).gaussians.detach()
 
     def after_step(self, step: int, result: EditResult | None = None) -> int:
-        """Optimize, follow ``result``, bring up to date; the number of rows left out for bad gradients."""
+        """Optimize, follow ``result``, bring up to date; the number of rows left out for bad
+        gradients."""
         left_out = self.training.optimize(self.scene, step)
         if result is not None and result.edit is not None:
             edited = self.scene.edited(result.edit)
@@ -118,7 +121,9 @@ def new_run(
     capture = TrainingViews(times, [camera()], 1.0, still_errors, cameras_stay)
     schedule = DeformSchedule(FINE, FINE, full, FINE, (SPLIT,), Rates(STEPS))
     model = DynamicModel.model_validate(defaults | options)
-    training = DynamicTraining(model, schedule, capture, update or FilterUpdate(), torch.Generator())
+    training = DynamicTraining(
+        model, schedule, capture, update or FilterUpdate(), torch.Generator()
+    )
     return Run(training, training.first_scene(gaussians))
 
 

@@ -27,19 +27,26 @@ def reference_values(values: Tensor, ids: Tensor, uv: Tensor) -> Tensor:
     return (bernstein(uv[:, 0], uv[:, 1])[..., None] * values[ids.long()]).sum(1)
 
 
-def reference_visible(points: Tensor, cameras: Cameras, near: float, segments: int) -> tuple[Tensor, Tensor, Tensor]:
-    """(V, H, W) ids, (V, H, W, 2) places and (V, H, W) depth: each ray with each face, by Cramer's rule."""
+def reference_visible(
+    points: Tensor, cameras: Cameras, near: float, segments: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(V, H, W) ids, (V, H, W, 2) places and (V, H, W) depth: each ray with each face, by Cramer's
+    rule."""
     places, faces = lattice(segments)
     corners = torch.einsum("kb,pbc->pkc", bernstein(places[:, 0], places[:, 1]), points.double())
     shape = len(cameras), cameras.height, cameras.width
-    ids, uv = torch.full(shape, -1, dtype=torch.int32), torch.zeros(*shape, 2, dtype=torch.float64)
+    ids = torch.full(shape, -1, dtype=torch.int32)
+    uv = torch.zeros(*shape, 2, dtype=torch.float64)
     depth = torch.full(shape, math.inf, dtype=torch.float64)
     for view in range(len(cameras)):
-        pose, inner = cameras.cam_from_world[view].double(), cameras.intrinsics[view].double()
+        pose = cameras.cam_from_world[view].double()
+        inner = cameras.intrinsics[view].double()
         seen = corners @ pose[:3, :3].T + pose[:3, 3]
         for y in range(cameras.height):
             for x in range(cameras.width):
-                ray = torch.linalg.solve(inner, torch.tensor([x + 0.5, y + 0.5, 1.0], dtype=torch.float64))
+                ray = torch.linalg.solve(
+                    inner, torch.tensor([x + 0.5, y + 0.5, 1.0], dtype=torch.float64)
+                )
                 for patch in range(len(points)):
                     for face in faces:
                         a = seen[patch][face].T
@@ -56,7 +63,8 @@ def reference_visible(points: Tensor, cameras: Cameras, near: float, segments: i
 
 
 def reference_blend(colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
-    """As ``blend_patches``, by its definition; what a pixel shows is a row of colours and of how much is nothing."""
+    """As ``blend_patches``, by its definition; what a pixel shows is a row of colours and of how
+    much is nothing."""
     views, height, width = places.rows.shape
     shown = torch.cat([colours, torch.zeros_like(colours[:, :1])], 1)
     nothing = torch.nn.functional.pad(colours.new_zeros(colours.shape[1]), (0, 1), value=1.0)
@@ -78,7 +86,9 @@ def reference_blend(colours: Tensor, crossings: Tensor, places: Places) -> tuple
                         covered = (crossings[view, axis, y - dy, x - dx] - 0.5).clamp_min(0)
                         shares.append((covered, at(x - dx, y - dy)))
                 total = sum((share for share, _ in shares), colours.new_zeros(()))
-                mixed = (1 - total).clamp_min(0) * at(x, y) + sum((share * c for share, c in shares), nothing * 0)
+                mixed = (1 - total).clamp_min(0) * at(x, y) + sum(
+                    (share * c for share, c in shares), nothing * 0
+                )
                 pixels.append(mixed / total.clamp_min(1))
     image = torch.stack(pixels).view(views, height, width, -1)
     return image[..., :-1], image[..., -1]

@@ -1,4 +1,5 @@
-"""A person drawn in its own poses, as images to fit to, and the same person with joints turned away from them."""
+"""A person drawn in its own poses, as images to fit to, and the same person with joints turned away
+from them."""
 
 from __future__ import annotations
 
@@ -21,7 +22,16 @@ from dyngs.metrics import psnr
 
 WHITE = torch.ones(3)
 SIZE = 64
-MOVED = ("pelvis", "left_hip", "right_knee", "spine2", "left_shoulder", "right_shoulder", "left_elbow", "head")
+MOVED = (
+    "pelvis",
+    "left_hip",
+    "right_knee",
+    "spine2",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "head",
+)
 
 
 class Shown:
@@ -46,13 +56,17 @@ def person_and_cameras(person: Path) -> tuple[HumanScene, list[Cameras]]:
     )
     trainer = assemble(config)
     assert isinstance(trainer.model.scene, HumanScene)
-    cameras = {tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.images)}
+    cameras = {
+        tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.images)
+    }
     grow = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None]
     larger = [Cameras(x.cam_from_world, grow * x.intrinsics, SIZE, SIZE) for x in cameras.values()]
     return trainer.model.scene, larger
 
 
-def images_of(scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None) -> list[Image]:
+def images_of(
+    scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None
+) -> list[Image]:
     found = []
     for time in times:
         for i, camera in enumerate(cameras):
@@ -64,17 +78,22 @@ def images_of(scene: HumanScene, cameras: list[Cameras], times: list[float], mas
 
 
 def disturbed(scene: HumanScene) -> HumanScene:
-    """The same person with some joints turned by 9 degrees about some axis, 3 cm from where it was."""
+    """The same person with some joints turned by 9 degrees about some axis, 3 cm from where it
+    was."""
     random = torch.Generator().manual_seed(2)
     clip = scene.clip
     rows = [JOINT_NAMES.index(name) for name in MOVED]
-    poses, away = clip.poses.clone(), torch.randn(len(clip), len(rows), 3, generator=random)
+    poses = clip.poses.clone()
+    away = torch.randn(len(clip), len(rows), 3, generator=random)
     poses[:, rows] += 0.15 * away / away.norm(dim=2, keepdim=True)
-    return scene.playing(replace(clip, poses=poses, trans=clip.trans + torch.tensor([0.03, 0.0, 0.0])))
+    return scene.playing(
+        replace(clip, poses=poses, trans=clip.trans + torch.tensor([0.03, 0.0, 0.0]))
+    )
 
 
 def joints_of(scene: HumanScene, clip: MotionClip, row: int) -> Tensor:
-    posing, skeleton = frame_pose(clip, row), scene.learned_skeleton
+    posing = frame_pose(clip, row)
+    skeleton = scene.learned_skeleton
     moved = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
     return posing.scale * apply_transforms(moved, skeleton.joints)[:22] + posing.trans
 
@@ -82,4 +101,6 @@ def joints_of(scene: HumanScene, clip: MotionClip, row: int) -> Tensor:
 def mean_psnr(scene: HumanScene, images: list[Image]) -> float:
     with torch.no_grad():
         drawn = [scene.render(x.cameras, x.time, background=WHITE).rgb[0] for x in images]
-    return sum(psnr(a, x.composite(WHITE)) for a, x in zip(drawn, images, strict=True)) / len(images)
+    return sum(psnr(a, x.composite(WHITE)) for a, x in zip(drawn, images, strict=True)) / len(
+        images
+    )

@@ -1,7 +1,9 @@
-"""Tensors that lie on a device of their own, computed with on the CPU: what a GPU does not forgive shows without one.
+"""Tensors that lie on a device of their own, computed with on the CPU: what a GPU does not forgive
+shows without one.
 
-As torch does with real ones, an operator refuses tensors of both devices (but for numbers, and for indices and copies,
-for which torch takes both), and NumPy gets none. Whatever makes the host wait for a GPU is counted.
+As torch does with real ones, an operator refuses tensors of both devices (but for numbers, and for
+indices and copies, for which torch takes both), and NumPy gets none. Whatever makes the host wait
+for a GPU is counted.
 """
 
 from __future__ import annotations
@@ -20,7 +22,14 @@ from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_a
 aten: Any = torch.ops.aten
 GPU = torch.device("meta")
 """The only device beside the CPU that autograd takes where torch was built without CUDA."""
-TAKES_BOTH = (aten._to_copy, aten.copy_, aten.index, aten.index_put_, aten.index_put, aten._index_put_impl_)
+TAKES_BOTH = (
+    aten._to_copy,
+    aten.copy_,
+    aten.index,
+    aten.index_put_,
+    aten.index_put,
+    aten._index_put_impl_,
+)
 READS_BACK = {
     aten._local_scalar_dense: "item",
     aten.nonzero: "nonzero",
@@ -46,7 +55,12 @@ class OnGpu(Tensor):
     @staticmethod
     def __new__(cls, held: Tensor) -> OnGpu:
         made = Tensor._make_wrapper_subclass(
-            cls, held.size(), strides=held.stride(), storage_offset=held.storage_offset(), dtype=held.dtype, device=GPU
+            cls,
+            held.size(),
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            device=GPU,
         )
         made.held = held
         return made
@@ -67,23 +81,34 @@ class OnGpu(Tensor):
 
 def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) -> Any:
     """The result of an operator, on the device where torch would put it."""
-    each = (y for x in (*args, *kwargs.values()) for y in (x if isinstance(x, list | tuple) else (x,)))
+    each = (
+        y for x in (*args, *kwargs.values()) for y in (x if isinstance(x, list | tuple) else (x,))
+    )
     given = [x for x in each if isinstance(x, Tensor)]
-    on_gpu, device = any(isinstance(x, OnGpu) for x in given), kwargs.get("device")
+    on_gpu = any(isinstance(x, OnGpu) for x in given)
+    device = kwargs.get("device")
     to_gpu = on_gpu if device is None else torch.device(device) == GPU
     if not on_gpu and not to_gpu:
         return func(*args, **kwargs)
     packet = func.overloadpacket
     both = on_gpu and any(not isinstance(x, OnGpu) and x.ndim > 0 for x in given)
-    if both and (packet not in TAKES_BOTH or not (isinstance(args[0], OnGpu) or packet is aten.copy_)):
+    if both and (
+        packet not in TAKES_BOTH or not (isinstance(args[0], OnGpu) or packet is aten.copy_)
+    ):
         raise MixedDevices(f"{func}: {[(str(x.device), tuple(x.shape)) for x in given]}")
     note(packet, args, kwargs, on_gpu, to_gpu, waits)
-    options = {name: torch.device("cpu") if name == "device" else held(x) for name, x in kwargs.items()}
+    options = {
+        name: torch.device("cpu") if name == "device" else held(x) for name, x in kwargs.items()
+    }
     result = func(*map(held, args), **options)
     if not to_gpu:
         return result
     there = lies_there(result)
-    return return_and_correct_aliasing(func, args, kwargs, there) if on_gpu and returns_given(func) else there
+    return (
+        return_and_correct_aliasing(func, args, kwargs, there)
+        if on_gpu and returns_given(func)
+        else there
+    )
 
 
 def lies_there(x: Any) -> Any:
@@ -106,8 +131,11 @@ def held(x: Any) -> Any:
     return [held(y) for y in x] if isinstance(x, list | tuple) else x
 
 
-def note(packet: Any, args: Any, kwargs: dict[str, Any], on_gpu: bool, to_gpu: bool, waits: Counter[str]) -> None:
-    """Count what makes the host wait: numbers read from the GPU, sizes that depend on them; and what is queued."""
+def note(
+    packet: Any, args: Any, kwargs: dict[str, Any], on_gpu: bool, to_gpu: bool, waits: Counter[str]
+) -> None:
+    """Count what makes the host wait: numbers read from the GPU, sizes that depend on them; and
+    what is queued."""
     if on_gpu and packet in READS_BACK:
         waits[READS_BACK[packet]] += 1
     elif on_gpu and not to_gpu:
@@ -117,7 +145,11 @@ def note(packet: Any, args: Any, kwargs: dict[str, Any], on_gpu: bool, to_gpu: b
         waits["queued to the GPU" if queued else "to the GPU"] += 1
     elif packet is aten.copy_ and isinstance(args[1], OnGpu) and not isinstance(args[0], OnGpu):
         waits["to the CPU"] += 1
-    elif packet is aten.index and any(x is not None and x.dtype == torch.bool for x in args[1]) and on_gpu:
+    elif (
+        packet is aten.index
+        and any(x is not None and x.dtype == torch.bool for x in args[1])
+        and on_gpu
+    ):
         waits["mask"] += 1
 
 
@@ -137,9 +169,15 @@ def pretend_gpu() -> Iterator[PretendGpu]:
     """Inside, tensors may lie on ``CARD``, where all ops compute."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch, "tensor", made)
-        patch.setattr(torch, "as_tensor", lambda x, **how: x.to(**how) if isinstance(x, Tensor) else made(x, **how))
         patch.setattr(
-            Tensor, "new_tensor", lambda x, data, **how: made(data, **{"device": x.device, "dtype": x.dtype} | how)
+            torch,
+            "as_tensor",
+            lambda x, **how: x.to(**how) if isinstance(x, Tensor) else made(x, **how),
+        )
+        patch.setattr(
+            Tensor,
+            "new_tensor",
+            lambda x, data, **how: made(data, **{"device": x.device, "dtype": x.dtype} | how),
         )
         with PretendGpu() as gpu:
             yield gpu
@@ -156,5 +194,6 @@ _torch_tensor = torch.tensor
 
 
 def made(data: Any, *, device: Any = None, requires_grad: bool = False, **how: Any) -> Tensor:
-    """``torch.tensor``, which as it is makes one without numbers where the device is called meta."""
+    """``torch.tensor``, which as it is makes one without numbers where the device is called
+    meta."""
     return _torch_tensor(data, **how).to(device or "cpu").requires_grad_(requires_grad)

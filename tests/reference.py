@@ -1,11 +1,12 @@
 """Slow, obvious versions of the native ops in plain torch: what the kernels are tested against.
 
-Everything is dense: every pixel looks at every Gaussian. Meant for float64 and a few Gaussians on a few pixels.
-Gradients come from autograd. Sources: Zwicker et al. 2001, Kerbl et al. 2023, Yu et al. 2024 (compensation).
+Everything is dense: every pixel looks at every Gaussian. Meant for float64 and a few Gaussians on a
+few pixels. Gradients come from autograd. Sources: Zwicker et al. 2001, Kerbl et al. 2023, Yu et al.
+2024 (compensation).
 """
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
+# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 
@@ -20,18 +21,31 @@ from dyngs.ops.rasterization import Blended, BlendOptions
 from dyngs.ops.shading import Sight
 
 
-def covariances2d(means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return 2D covariances (V, N, 2, 2) in px^2 without low-pass, and centres in the camera (V, N, 3)."""
-    rotation, translation = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
+def covariances2d(
+    means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras
+) -> tuple[Tensor, Tensor]:
+    """Return 2D covariances (V, N, 2, 2) in px^2 without low-pass, and centres in the camera (V, N,
+    3)."""
+    rotation = cameras.cam_from_world[:, :3, :3]
+    translation = cameras.cam_from_world[:, :3, 3]
     centers = torch.einsum("vij,nj->vni", rotation, means) + translation[:, None]
     x, y, z = centers.unbind(-1)
-    fx, fy = cameras.intrinsics[:, 0, 0, None], cameras.intrinsics[:, 1, 1, None]
-    cx, cy = cameras.intrinsics[:, 0, 2, None], cameras.intrinsics[:, 1, 2, None]
-    margin_x, margin_y = 0.15 * cameras.width / fx, 0.15 * cameras.height / fy
-    tan_x = torch.minimum(torch.maximum(x / z, -cx / fx - margin_x), (cameras.width - cx) / fx + margin_x)
-    tan_y = torch.minimum(torch.maximum(y / z, -cy / fy - margin_y), (cameras.height - cy) / fy + margin_y)
+    fx = cameras.intrinsics[:, 0, 0, None]
+    fy = cameras.intrinsics[:, 1, 1, None]
+    cx = cameras.intrinsics[:, 0, 2, None]
+    cy = cameras.intrinsics[:, 1, 2, None]
+    margin_x = 0.15 * cameras.width / fx
+    margin_y = 0.15 * cameras.height / fy
+    tan_x = torch.minimum(
+        torch.maximum(x / z, -cx / fx - margin_x), (cameras.width - cx) / fx + margin_x
+    )
+    tan_y = torch.minimum(
+        torch.maximum(y / z, -cy / fy - margin_y), (cameras.height - cy) / fy + margin_y
+    )
     zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * tan_x / z, zero, fy / z, -fy * tan_y / z], -1).unflatten(-1, (2, 3))
+    jacobian = torch.stack(
+        [fx / z, zero, -fx * tan_x / z, zero, fy / z, -fy * tan_y / z], -1
+    ).unflatten(-1, (2, 3))
     half = jacobian @ rotation[:, None] @ (rotation_matrices(quats) * scales[:, None, :])
     return half @ half.transpose(-1, -2), centers
 
@@ -51,7 +65,9 @@ def project(
     det = cov[..., 0, 0] * cov[..., 1, 1] - cov[..., 0, 1] ** 2
     bare_det = bare[..., 0, 0] * bare[..., 1, 1] - bare[..., 0, 1] ** 2
     compensation = (bare_det / det).clamp_min(0).sqrt()
-    var_x, var_y, mixed = cov[..., 0, 0], cov[..., 1, 1], cov[..., 0, 1]
+    var_x = cov[..., 0, 0]
+    var_y = cov[..., 1, 1]
+    mixed = cov[..., 0, 1]
     factors = torch.stack([(var_y / det).sqrt(), -mixed / (var_y * det).sqrt(), var_y.rsqrt()], -1)
     x, y, z = centers.unbind(-1)
     means2d = torch.stack(
@@ -63,10 +79,24 @@ def project(
     )
     with torch.no_grad():
         shown = opacities * compensation if options.antialiased else opacities.expand_as(z)
-        reach = 2 * (shown / options.alpha_min).log() if options.alpha_min > 0 else torch.full_like(z, float("inf"))
-        extents = (reach.clamp_min(0)[..., None] * torch.stack([var_x, var_y], -1)).sqrt().ceil().clamp_max(1e9)
+        reach = (
+            2 * (shown / options.alpha_min).log()
+            if options.alpha_min > 0
+            else torch.full_like(z, float("inf"))
+        )
+        extents = (
+            (reach.clamp_min(0)[..., None] * torch.stack([var_x, var_y], -1))
+            .sqrt()
+            .ceil()
+            .clamp_max(1e9)
+        )
         size = torch.tensor([cameras.width, cameras.height], device=means.device)
-        visible = (z > options.near) & (z < options.far) & (reach > 0) & (extents > options.radius_clip).any(-1)
+        visible = (
+            (z > options.near)
+            & (z < options.far)
+            & (reach > 0)
+            & (extents > options.radius_clip).any(-1)
+        )
         visible &= ((means2d + extents > 0) & (means2d - extents < size)).all(-1)
     keep = visible[..., None]
     return Projection(
@@ -78,7 +108,9 @@ def project(
     )
 
 
-def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
+def evaluate_harmonics(
+    means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int
+) -> Tensor:
     """As ``dyngs.ops.harmonics.evaluate_harmonics``."""
     offsets = means[None] - centers[:, None]
     directions = offsets / offsets.norm(dim=-1, keepdim=True).clamp_min(1e-12)
@@ -96,7 +128,8 @@ def rasterize(
     background: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
 ) -> Blended:
-    """As ``dyngs.ops.rasterization.rasterize``, without probe: a loop over Gaussians, vectorised over pixels."""
+    """As ``dyngs.ops.rasterization.rasterize``, without probe: a loop over Gaussians, vectorised
+    over pixels."""
     raised = colors.new_zeros(*opacities.shape, size[1], size[0])
     return _rasterize(projection, opacities, colors, raised, background, options)
 
@@ -110,9 +143,12 @@ def squared_slopes(
     background: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
 ) -> Tensor:
-    """As ``dyngs.ops.rasterization.tally`` of ``SQUARED_SLOPES``: (V, N), from autograd pixel for pixel."""
+    """As ``dyngs.ops.rasterization.tally`` of ``SQUARED_SLOPES``: (V, N), from autograd pixel for
+    pixel."""
     raised = colors.new_zeros(*opacities.shape, size[1], size[0], requires_grad=True)
-    image = _rasterize(projection, opacities.detach(), colors.detach(), raised, background, options).color
+    image = _rasterize(
+        projection, opacities.detach(), colors.detach(), raised, background, options
+    ).color
     (slopes,) = torch.autograd.grad(image.sum(), raised)  # a pixel depends on its own values only
     return slopes.square().sum((2, 3))
 
@@ -125,9 +161,12 @@ def _rasterize(
     background: Tensor | None,
     options: BlendOptions,
 ) -> Blended:
-    """As ``rasterize``, with ``raised`` (V, N, H, W) added to each 2D Gaussian's value in each pixel."""
+    """As ``rasterize``, with ``raised`` (V, N, H, W) added to each 2D Gaussian's value in each
+    pixel."""
     height, width = raised.shape[2:]
-    rows, columns = (torch.arange(n, dtype=colors.dtype, device=colors.device) + 0.5 for n in (height, width))
+    rows, columns = (
+        torch.arange(n, dtype=colors.dtype, device=colors.device) + 0.5 for n in (height, width)
+    )
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     images: list[Tensor] = []
     remains: list[Tensor] = []
@@ -138,7 +177,8 @@ def _rasterize(
         visible = torch.nonzero((projection.radii[v] > 0).all(-1))[:, 0]
         for i in visible[projection.depths[v, visible].argsort(stable=True)]:
             u_x, u_y, v_y = projection.factors[v, i]
-            dx, dy = projection.means2d[v, i, 0] - x, projection.means2d[v, i, 1] - y
+            dx = projection.means2d[v, i, 0] - x
+            dy = projection.means2d[v, i, 1] - y
             power = -0.5 * ((u_x * dx + u_y * dy) ** 2 + (v_y * dy) ** 2)
             alpha = (opacities[v, i] * (power.exp() + raised[v, i])).clamp_max(options.alpha_max)
             alpha = torch.where((alpha >= options.alpha_min) & ~full, alpha, 0.0)
@@ -157,9 +197,9 @@ def _rasterize(
 def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
     """As ``dyngs.ops.shading.shading_inputs``.
 
-    Place in the box (contracted), direction from the eye, |cosine| between the shortest axis and the direction, the
-    direction mirrored at that axis, base colour less 1/2, time in [-1, 1]. A body at rest knows places, directions and
-    normals as they are there.
+    Place in the box (contracted), direction from the eye, |cosine| between the shortest axis and
+    the direction, the direction mirrored at that axis, base colour less 1/2, time in [-1, 1]. A
+    body at rest knows places, directions and normals as they are there.
     """
     means = sight.means[sight.rows]
     directions = torch.nn.functional.normalize(means - sight.eye, dim=1)
@@ -167,7 +207,9 @@ def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
     places = means
     if sight.rest is not None:
         at_rest, turn = sight.rest
-        places, directions, normals = at_rest[sight.rows], directions @ turn, normals @ turn
+        places = at_rest[sight.rows]
+        directions = directions @ turn
+        normals = normals @ turn
     center, half_size = sight.box
     inputs = [contracted((places - center) / half_size), directions]
     if sight.normals:
@@ -180,15 +222,18 @@ def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
 
 
 def contracted(points: Tensor) -> Tensor:
-    """Return ``points`` (M, 3) with all of space contracted into a ball of radius 2; the unit ball stays as it is.
+    """Return ``points`` (M, 3) with all of space contracted into a ball of radius 2; the unit ball
+    stays as it is.
 
-    (2 - 1 / |x|) x / |x|, the contraction of Barron et al. 2022 (mip-NeRF 360): far things stay bounded inputs.
+    (2 - 1 / |x|) x / |x|, the contraction of Barron et al. 2022 (mip-NeRF 360): far things stay
+    bounded inputs.
     """
     length = points.norm(dim=1, keepdim=True).clamp_min(1)
     return points * (2 - 1 / length) / length
 
 
 def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
-    """Return (M, 3) unit vectors along the shortest axis of each Gaussian: the normal of a flat one, up to its sign."""
+    """Return (M, 3) unit vectors along the shortest axis of each Gaussian: the normal of a flat
+    one, up to its sign."""
     shortest = log_scales.argmin(dim=1)
     return rotation_matrices(quats).gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]

@@ -1,4 +1,5 @@
-"""A textured ball that moves on or above a plate before a camera that is elsewhere at each time: exact images."""
+"""A textured ball that moves on or above a plate before a camera that is elsewhere at each time:
+exact images."""
 
 from __future__ import annotations
 
@@ -18,8 +19,11 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @functools.cache
-def rolling(count: int = 24, size: int = 72, turns: bool = True) -> tuple[Shots, np.ndarray, np.ndarray]:
-    """The images, and the ball's true (T, 3) centres and (T, 3, 3) rotations; without ``turns`` it slides."""
+def rolling(
+    count: int = 24, size: int = 72, turns: bool = True
+) -> tuple[Shots, np.ndarray, np.ndarray]:
+    """The images, and the ball's true (T, 3) centres and (T, 3, 3) rotations; without ``turns`` it
+    slides."""
     balls = []
     for time in np.linspace(0.0, 1.0, count):
         _, ball = scene_at("roll", 0.45 * time).primitives
@@ -30,12 +34,15 @@ def rolling(count: int = 24, size: int = 72, turns: bool = True) -> tuple[Shots,
 
 @functools.cache
 def hopping(count: int = 48, size: int = 64) -> tuple[Shots, np.ndarray, np.ndarray]:
-    """The same of a ball that hops on the spot four times, and spins by two turns about a tilted axis."""
+    """The same of a ball that hops on the spot four times, and spins by two turns about a tilted
+    axis."""
     balls = []
     for time in np.linspace(0.0, 1.0, count):
         _, ball = scene_at("roll", 0.0).primitives
         assert isinstance(ball, Sphere)
-        center = np.array([0.8 * time - 0.4, 0.1, ball.center[2] + 0.7 * abs(np.sin(4 * np.pi * time))])
+        center = np.array(
+            [0.8 * time - 0.4, 0.1, ball.center[2] + 0.7 * abs(np.sin(4 * np.pi * time))]
+        )
         axis = np.array([0.3, 0.9, 0.3]) / np.linalg.norm([0.3, 0.9, 0.3])
         turn = Rotation.from_rotvec(4 * np.pi * time * axis).as_matrix()
         balls.append(replace(ball, center=center, turn=turn))
@@ -48,7 +55,9 @@ def seen(balls: Sequence[Sphere], size: int) -> tuple[Shots, np.ndarray, np.ndar
     times = np.linspace(0.0, 1.0, count)
     plate, _ = scene_at("roll", 0.0).primitives
     poses = np.random.default_rng(0).permutation(hemisphere_cameras(count, 4.0, 0))
-    images = [_shown(Scene((plate, ball)), pose, size) for ball, pose in zip(balls, poses, strict=True)]
+    images = [
+        _shown(Scene((plate, ball)), pose, size) for ball, pose in zip(balls, poses, strict=True)
+    ]
     still = [_shown(Scene((plate,)), pose, size) for pose in poses]
     focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
     lens = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])

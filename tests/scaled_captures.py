@@ -13,10 +13,14 @@ from dyngs.data.images.maps import read_depth
 from dyngs.splats.ply_header import double_ply
 
 
-def scaled_capture(source: Path, out: Path, scale: float, offset: tuple[float, float, float] = (0, 0, 0)) -> Path:
-    """Write a copy of a capture, or of a folder of captures, in which a point x is ``scale * (x + offset)``.
+def scaled_capture(
+    source: Path, out: Path, scale: float, offset: tuple[float, float, float] = (0, 0, 0)
+) -> Path:
+    """Write a copy of a capture, or of a folder of captures, in which a point x is ``scale * (x +
+    offset)``.
 
-    Poses of transforms files, points (as .ply in double precision), body parameters and depth maps change.
+    Poses of transforms files, points (as .ply in double precision), body parameters and depth maps
+    change.
     """
     shutil.copytree(source, out)
     for file in out.rglob("transforms*.json"):

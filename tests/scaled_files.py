@@ -21,17 +21,23 @@ FAR = (500_123.25, 4_600_321.5, 117.0)
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
     """Return the same scene in a unit of length that is ``factor`` times smaller."""
-    return gaussians.replace(means=gaussians.means * factor, log_scales=gaussians.log_scales + math.log(factor))
+    return gaussians.replace(
+        means=gaussians.means * factor, log_scales=gaussians.log_scales + math.log(factor)
+    )
 
 
 def write_scaled(path: Path, source: Path, factor: float) -> Path:
-    """Write the file ``source`` of Gaussians in a unit of length that is ``factor`` times smaller."""
+    """Write the file ``source`` of Gaussians in a unit of length that is ``factor`` times
+    smaller."""
     splat = read_splats(source)
-    return write_splats(path, SplatFile(scaled(splat.gaussians, factor), splat.mode, splat.eps2d, up=splat.up)).path
+    return write_splats(
+        path, SplatFile(scaled(splat.gaussians, factor), splat.mode, splat.eps2d, up=splat.up)
+    ).path
 
 
 def write_far_ply(path: Path, splat: SplatFile, offset: Sequence[float] = FAR) -> np.ndarray:
-    """Write a .ply with doubles, ``offset`` (3,) from where the Gaussians are; return its positions (N, 3)."""
+    """Write a .ply with doubles, ``offset`` (3,) from where the Gaussians are; return its positions
+    (N, 3)."""
     write_ply(path, splat)
     with path.open("rb") as file:
         header = read_header(file, path)
@@ -42,6 +48,8 @@ def write_far_ply(path: Path, splat: SplatFile, offset: Sequence[float] = FAR) -
         far[name] = rows[name]
     for name, shift in zip("xyz", offset, strict=True):
         far[name] += shift
-    head = header_bytes([("vertex", len(far), [("double", name) for name in names])], header.comments)
+    head = header_bytes(
+        [("vertex", len(far), [("double", name) for name in names])], header.comments
+    )
     path.write_bytes(head + far.tobytes())
     return np.stack([far[name] for name in "xyz"], axis=1)

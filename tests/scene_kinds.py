@@ -36,8 +36,9 @@ PERSON = HumanModel(sh_degree=0)
 
 
 def scene_of_kind(kind: str) -> GaussianScene:
-    """Nine Gaussians with a 3D filter, of which four may move, or a person; ``masked`` is a hexplane with masks,
-    ``windowed`` are nodes of which each Gaussian is there for a part of the clip."""
+    """Nine Gaussians with a 3D filter, of which four may move, or a person; ``masked`` is a
+    hexplane with masks, ``windowed`` are nodes of which each Gaussian is there for a part of the
+    clip."""
     std = 0.01 + torch.arange(9.0) / 100
     if kind == "static":
         return StaticScene(gaussians=cloud(), filter_std=std, seen_at=SEEN_AT)
@@ -52,14 +53,21 @@ def scene_of_kind(kind: str) -> GaussianScene:
         field = WindowedField(field, len(MOVING))
         field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN])
     return DynamicScene(
-        gaussians=cloud(), seen_at=SEEN_AT, field=field, moving=MOVING, filter_std=std, masks=masks, colour=_network()
+        gaussians=cloud(),
+        seen_at=SEEN_AT,
+        field=field,
+        moving=MOVING,
+        filter_std=std,
+        masks=masks,
+        colour=_network(),
     )
 
 
 def restored(kind: str, state: State) -> GaussianScene:
     """The scene of what is stored, but for its colours."""
     tensors = {name: x.clone() for name, x in tensors_of(state).items()}
-    gaussians, own = Gaussians.stored(part_of(tensors, "gaussians")), part_of(tensors, "model")
+    gaussians = Gaussians.stored(part_of(tensors, "gaussians"))
+    own = part_of(tensors, "model")
     if kind == "static":
         return StaticScene.restored(gaussians, own)
     if kind == "human":
@@ -81,19 +89,30 @@ def _network() -> ColourNetwork:
     generator = torch.Generator().manual_seed(5)
     inputs = num_inputs(sees_time=True, sees_normals=True)
     sizes = ((8, inputs), (3, 8))
-    layers = [Layer(0.3 * torch.randn(size, generator=generator), torch.zeros(size[0])) for size in sizes]
+    layers = [
+        Layer(0.3 * torch.randn(size, generator=generator), torch.zeros(size[0])) for size in sizes
+    ]
     return ColourNetwork(tuple(layers), box_around(cloud().means), True, True)
 
 
 def _person() -> HumanScene:
-    generator, body = torch.Generator().manual_seed(1), default_template()
+    generator = torch.Generator().manual_seed(1)
+    body = default_template()
     gaussians, anchors = texel_gaussians(atlas_texels(body, 16), (0.0,), 0)
     gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=generator))
-    times, poses = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64), torch.randn(3, 55, 3, generator=generator)
-    clip = MotionClip(times, 0.3 * poses, 0.1 * torch.randn(3, 3, generator=generator), torch.ones(3))
-    directions = (0.02 * torch.randn(9 * 54, 9, generator=torch.Generator().manual_seed(2))).half().float()
-    shapes = PoseBlendShapes(directions, torch.arange(3).repeat(len(body.faces), 1))  # of a body of three vertices
-    subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)), shapes)
+    times = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+    poses = torch.randn(3, 55, 3, generator=generator)
+    clip = MotionClip(
+        times, 0.3 * poses, 0.1 * torch.randn(3, 3, generator=generator), torch.ones(3)
+    )
+    directions = (
+        (0.02 * torch.randn(9 * 54, 9, generator=torch.Generator().manual_seed(2))).half().float()
+    )
+    # of a body of three vertices
+    shapes = PoseBlendShapes(directions, torch.arange(3).repeat(len(body.faces), 1))
+    subject = Subject(
+        Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)), shapes
+    )
     scene = HumanTraining(PERSON, (0, 1, 2), Rates(10)).first_scene(gaussians, subject)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)

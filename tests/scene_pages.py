@@ -33,16 +33,25 @@ Failure = Literal["cut", "404", "503", "silent", "damaged"]
 
 
 def write(
-    scene: GaussianScene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
+    scene: GaussianScene,
+    path: Path,
+    view: Cameras,
+    title: str = "a scene",
+    options: RenderOptions | None = None,
 ) -> WrittenPage:
     scene = replace(scene, options=options or scene.options, background=torch.ones(3))
-    return write_page(replace(opened_scene(scene), stated_up="-y"), path, title=title, views=(view,))
+    return write_page(
+        replace(opened_scene(scene), stated_up="-y"), path, title=title, views=(view,)
+    )
 
 
 def shown(page: Page, view: Cameras, time: float, which: int = 0) -> torch.Tensor:
     """What a scene of the page draws, (H, W, 3)."""
     ((fx, _, cx), (_, fy, cy), _) = view.intrinsics[0].tolist()
-    asked = {"camFromWorld": view.cam_from_world[0].flatten().tolist(), "intrinsics": [fx, fy, cx, cy]}
+    asked = {
+        "camFromWorld": view.cam_from_world[0].flatten().tolist(),
+        "intrinsics": [fx, fy, cx, cy],
+    }
     asked |= {"width": view.width, "height": view.height, "time": time}
     show = "([view, which]) => document.querySelectorAll('dyngs-scene')[which].show(view)"
     address: str = page.evaluate(show, [asked, which])
@@ -60,7 +69,9 @@ def wait_for_line(page: Page, part: str, which: int = 0) -> str:
 def large(view: Cameras, factor: int = 4) -> Cameras:
     """The same view with more pixels."""
     scale = torch.tensor([factor, factor, 1.0])[:, None]
-    return Cameras(view.cam_from_world, view.intrinsics * scale, view.width * factor, view.height * factor)
+    return Cameras(
+        view.cam_from_world, view.intrinsics * scale, view.width * factor, view.height * factor
+    )
 
 
 @dataclass
@@ -109,7 +120,9 @@ class Served(SimpleHTTPRequestHandler):
 def served(folder: Path) -> Iterator[Server]:
     """Put a folder on a web server of this machine."""
     state = Server("")
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Served, directory=str(folder), state=state)) as server:
+    with ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Served, directory=str(folder), state=state)
+    ) as server:
         state.address = f"http://127.0.0.1:{server.server_port}/"
         Thread(target=server.serve_forever, daemon=True).start()
         yield state
@@ -119,9 +132,13 @@ def served(folder: Path) -> Iterator[Server]:
 def levels_of_a_cloud(folder: Path, most: int | None = None) -> tuple[LevelScene, Cameras]:
     """Five blocks of ``BLOCK`` Gaussians or fewer."""
     gaussians = cloud(14_000, degree=1)
-    still = StaticScene(gaussians=gaussians.replace(log_scales=gaussians.log_scales - 1), background=torch.ones(3))
+    still = StaticScene(
+        gaussians=gaussians.replace(log_scales=gaussians.log_scales - 1), background=torch.ones(3)
+    )
     view = large(camera(), 6)
-    written = write_folder(replace(opened_scene(still), stated_up="-y"), folder, most=most, views=(view,))
+    written = write_folder(
+        replace(opened_scene(still), stated_up="-y"), folder, most=most, views=(view,)
+    )
     assert written.num_bytes == sum(file.stat().st_size for file in folder.iterdir())
     blocks = [*(f"0-{i}.bin" for i in range(4)), "1-0.bin"]
     assert sorted(file.name for file in folder.iterdir()) == [*blocks, ELEMENT, PAGE]

@@ -1,4 +1,5 @@
-"""Small random scenes, and the three ops in a row, native or reference, for the tests of the rasterizer."""
+"""Small random scenes, and the three ops in a row, native or reference, for the tests of the
+rasterizer."""
 
 from __future__ import annotations
 
@@ -75,7 +76,10 @@ class Scene:
         return self.map(lambda x: x.detach().clone().requires_grad_())
 
     def view(self, index: int) -> Scene:
-        picked = {k: getattr(self, k)[index : index + 1] for k in ("cam_from_world", "intrinsics", "background")}
+        picked = {
+            k: getattr(self, k)[index : index + 1]
+            for k in ("cam_from_world", "intrinsics", "background")
+        }
         return replace(self, **picked)
 
 
@@ -83,7 +87,8 @@ def look_around(views: int, dtype: torch.dtype = torch.float64) -> Tensor:
     """(V, 4, 4) cameras 3 units from the origin, turned by 0.3 rad from one to the next."""
     poses = torch.eye(4, dtype=dtype).repeat(views, 1, 1)
     for v in range(views):
-        c, s = math.cos(0.3 * v), math.sin(0.3 * v)
+        c = math.cos(0.3 * v)
+        s = math.sin(0.3 * v)
         poses[v, :3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=dtype)
     poses[:, :3, 3] = torch.tensor([0.1, 0.0, 3.0], dtype=dtype)
     return poses
@@ -92,7 +97,8 @@ def look_around(views: int, dtype: torch.dtype = torch.float64) -> Tensor:
 def random_scene(
     n: int = 20, views: int = 2, size: tuple[int, int] = (37, 29), seed: int = 0, degree: int = 1
 ) -> Scene:
-    """Gaussians of 1 to 10 px around the origin, float64; no dimension of the image is a multiple of the tile."""
+    """Gaussians of 1 to 10 px around the origin, float64; no dimension of the image is a multiple
+    of the tile."""
     g = torch.Generator().manual_seed(seed)
     width, height = size
 
@@ -103,7 +109,9 @@ def random_scene(
         return torch.randn(shape, generator=g, dtype=torch.float64)
 
     focal = 0.8 * max(width, height)
-    intrinsics = torch.tensor([[focal, 0, width / 2 + 1], [0, 1.1 * focal, height / 2 - 1], [0, 0, 1]])
+    intrinsics = torch.tensor(
+        [[focal, 0, width / 2 + 1], [0, 1.1 * focal, height / 2 - 1], [0, 0, 1]]
+    )
     return Scene(
         means=0.7 * normal(n, 3),
         quats=normal(n, 4),
@@ -140,12 +148,18 @@ class Drawn:
 
 def draw(scene: Scene, ops: Ops = NATIVE, limits: Limits = USUAL) -> Drawn:
     """The scene through all three ops, opacities compensated in antialiased mode."""
-    p = ops.project(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, limits.projecting)
-    colors = ops.evaluate_harmonics(scene.means, scene.cameras.centers, scene.sh, p.radii, scene.degree)
+    p = ops.project(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, limits.projecting
+    )
+    colors = ops.evaluate_harmonics(
+        scene.means, scene.cameras.centers, scene.sh, p.radii, scene.degree
+    )
     opacities = scene.opacities.expand_as(p.depths)
     if limits.projecting.antialiased:
         opacities = opacities * p.compensations
-    blended = ops.rasterize(p, opacities, colors, scene.size, background=scene.background, options=limits.blending)
+    blended = ops.rasterize(
+        p, opacities, colors, scene.size, background=scene.background, options=limits.blending
+    )
     return Drawn(p, colors, blended)
 
 
@@ -172,4 +186,6 @@ def relative_error(x: Tensor, truth: Tensor) -> float:
     """Largest difference, relative to the largest value."""
     if truth.numel() == 0:
         return 0.0
-    return float((x.double() - truth.double()).abs().max() / truth.double().abs().max().clamp_min(1e-300))
+    return float(
+        (x.double() - truth.double()).abs().max() / truth.double().abs().max().clamp_min(1e-300)
+    )

@@ -11,7 +11,8 @@ from dyngs.camera import Cameras
 from dyngs.gaussians.fusion import Seen
 
 RADIUS, SIZE = 0.8, 48
-LOW, HIGH = torch.full((3,), -1.0), torch.full((3,), 1.0)  # Corners of a box around it
+LOW = torch.full((3,), -1.0)
+HIGH = torch.full((3,), 1.0)  # Corners of a box around it
 
 
 def seen_from(turn: torch.Tensor) -> Seen:
@@ -21,8 +22,11 @@ def seen_from(turn: torch.Tensor) -> Seen:
     pose[0, :3, :3] = turn
     inner = looking.intrinsics[0]
     y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
-    ray = torch.stack([(x - inner[0, 2]) / inner[0, 0], (y - inner[1, 2]) / inner[1, 1], torch.ones_like(x)], -1)
-    a, b = ray.square().sum(-1), 4.0 * ray[..., 2]
+    ray = torch.stack(
+        [(x - inner[0, 2]) / inner[0, 0], (y - inner[1, 2]) / inner[1, 1], torch.ones_like(x)], -1
+    )
+    a = ray.square().sum(-1)
+    b = 4.0 * ray[..., 2]
     inside = b**2 - a * (16 - RADIUS**2)
     depth = (b - inside.clamp_min(0).sqrt()) / a
     world = (depth[..., None] * ray - torch.tensor([0.0, 0, 4])) @ turn
@@ -38,6 +42,7 @@ def views() -> list[Seen]:
         for cosine, sine in ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)):
             turn = torch.eye(3)
             turn[axis, axis] = turn[other, other] = cosine
-            turn[axis, other], turn[other, axis] = sine, -sine
+            turn[axis, other] = sine
+            turn[other, axis] = -sine
             turns.append(turn)
     return [seen_from(turn) for turn in turns]

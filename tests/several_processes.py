@@ -29,8 +29,11 @@ from dyngs.training.processes import Processes
 from dyngs.training.trainer import StepReport, Trainer
 
 
-def run_in(count: int, target: Callable[..., int], folder: Path, *arguments: Any) -> tuple[list[int], list[str]]:
-    """Call ``target`` in ``count`` connected processes; return the exit codes and what each has printed.
+def run_in(
+    count: int, target: Callable[..., int], folder: Path, *arguments: Any
+) -> tuple[list[int], list[str]]:
+    """Call ``target`` in ``count`` connected processes; return the exit codes and what each has
+    printed.
 
     Args:
         count: of processes.
@@ -46,7 +49,9 @@ def run_in(count: int, target: Callable[..., int], folder: Path, *arguments: Any
         port = found.getsockname()[1]
     started = []
     for rank in range(count):
-        process = context.Process(target=_begin, args=(rank, count, port, folder, target, arguments))
+        process = context.Process(
+            target=_begin, args=(rank, count, port, folder, target, arguments)
+        )
         process.start()
         started.append(process)
     for process in started:
@@ -54,10 +59,14 @@ def run_in(count: int, target: Callable[..., int], folder: Path, *arguments: Any
     codes = [-1 if process.exitcode is None else process.exitcode for process in started]
     for process in started:
         process.kill()
-    return codes, [(folder / f"said_{rank}.txt").read_text(encoding="utf-8") for rank in range(count)]
+    return codes, [
+        (folder / f"said_{rank}.txt").read_text(encoding="utf-8") for rank in range(count)
+    ]
 
 
-def _begin(rank: int, count: int, port: int, folder: Path, target: Callable[..., int], arguments: Any) -> None:
+def _begin(
+    rank: int, count: int, port: int, folder: Path, target: Callable[..., int], arguments: Any
+) -> None:
     names = {"RANK": rank, "WORLD_SIZE": count, "LOCAL_WORLD_SIZE": count, "MASTER_PORT": port}
     os.environ |= {name: str(value) for name, value in names.items()} | {"MASTER_ADDR": "127.0.0.1"}
     torch.set_num_threads(1)
@@ -80,7 +89,8 @@ def _begin(rank: int, count: int, port: int, folder: Path, target: Callable[...,
 def trained(configs: list[Config], fails: str = "") -> int:
     """Train all of ``configs``.
 
-    ``fails``: "step" in the last process, "weights" of the last process go astray, or it dies or is told to end.
+    ``fails``: "step" in the last process, "weights" of the last process go astray, or it dies or is
+    told to end.
     """
     last = int(os.environ["RANK"]) == int(os.environ["WORLD_SIZE"]) - 1
     if fails == "step" and last:
@@ -116,12 +126,14 @@ def summed() -> int:
     """Sum tensors and gradients over the processes, and compare what is the same in all."""
     module.CHUNK = 5  # so that small tensors go through in parts
     with Processes.of_torchrun() as processes:
-        rank, size = processes.rank, processes.size
+        rank = processes.rank
+        size = processes.size
         values = torch.tensor([0.1, 1e8, -1e8, 3.0, 1e-8, 7.0, 2.0]) * (1 + rank)
         expected = torch.zeros(7)
         for k in range(size):
             expected += torch.tensor([0.1, 1e8, -1e8, 3.0, 1e-8, 7.0, 2.0]) * (1 + k)
-        table, none = torch.full((2, 3), float(rank)), torch.zeros(0, 3)
+        table = torch.full((2, 3), float(rank))
+        none = torch.zeros(0, 3)
         processes.sum_([values, none, table])
         assert torch.equal(values, expected)
         assert torch.equal(table, torch.full((2, 3), float(sum(range(size)))))

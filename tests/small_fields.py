@@ -15,7 +15,14 @@ NGP = [
     "model.log2_samples=12",
     "model.cells=32",
 ]
-NERF = ["model.kind=nerf", "model.width=32", "model.coarse=12", "model.fine=12", "model.rays=64", "model.lr=2e-3"]
+NERF = [
+    "model.kind=nerf",
+    "model.width=32",
+    "model.coarse=12",
+    "model.fine=12",
+    "model.rays=64",
+    "model.lr=2e-3",
+]
 
 
 def config_of(capture: Path, *keys: str) -> Config:

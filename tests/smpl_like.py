@@ -1,7 +1,8 @@
-"""Body files in the layout of SMPL and SMPL-X made of the free template, as the real ones may not be passed on.
+"""Body files in the layout of SMPL and SMPL-X made of the free template, as the real ones may not
+be passed on.
 
-Mesh and atlas are the free template's; joints are regressed from vertices, the ten shape directions are the body shapes
-of the free template, and pose blend shapes are smooth bulges around the joints.
+Mesh and atlas are the free template's; joints are regressed from vertices, the ten shape directions
+are the body shapes of the free template, and pose blend shapes are smooth bulges around the joints.
 """
 
 from __future__ import annotations
@@ -21,23 +22,31 @@ from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
 
 NEAR = 60  # vertices that a joint is regressed from
-BULGE, WIDTH = 0.01, 0.08  # spread of the pose blend shapes per unit of a rotation, and how far they reach, m
+# spread of the pose blend shapes per unit of a rotation, and how far they reach, m
+BULGE, WIDTH = 0.01, 0.08
 _BODY = 22  # joints that SMPL and SMPL-X share
 
 
 def smpl_like(kind: str) -> dict[str, Any]:
     """The arrays of a file of ``kind`` "smpl" (24 joints) or "smplx" (55)."""
     body = default_template()
-    vertices, joints = body.vertices.double().numpy(), body.joints.double().numpy()
+    vertices = body.vertices.double().numpy()
+    joints = body.joints.double().numpy()
     weights = body.weights.double().numpy()
     if kind == "smpl":  # hands in the place of fingers, no face
-        hands = [[JOINT_NAMES.index(f"{side}_{x}1") for x in ("index", "middle", "ring")] for side in ("left", "right")]
+        hands = [
+            [JOINT_NAMES.index(f"{side}_{x}1") for x in ("index", "middle", "ring")]
+            for side in ("left", "right")
+        ]
         of_hand = [
-            [i for i, name in enumerate(JOINT_NAMES) if i > 24 and name.startswith(s)] for s in ("left", "right")
+            [i for i, name in enumerate(JOINT_NAMES) if i > 24 and name.startswith(s)]
+            for s in ("left", "right")
         ]
         own = [weights[:, rows].sum(1) for rows in of_hand]
         joints = np.concatenate([joints[:_BODY], [joints[rows].mean(0) for rows in hands]])
-        head = weights[:, [JOINT_NAMES.index(name) for name in ("jaw", "left_eye", "right_eye")]].sum(1)
+        head = weights[
+            :, [JOINT_NAMES.index(name) for name in ("jaw", "left_eye", "right_eye")]
+        ].sum(1)
         weights = np.concatenate([weights[:, :_BODY], np.stack(own, 1)], axis=1)
         weights[:, JOINT_NAMES.index("head")] += head
     assert body.shape_dirs is not None
@@ -51,7 +60,11 @@ def smpl_like(kind: str) -> dict[str, Any]:
         system = np.concatenate([vertices[near].T, np.ones((1, NEAR))])
         regressor[j, near] = np.linalg.lstsq(system, wanted, rcond=None)[0]
         if 0 < j < _BODY:
-            bulge = BULGE * generator.standard_normal((3, 9)) * np.exp(-((away / WIDTH) ** 2) / 2)[:, None, None]
+            bulge = (
+                BULGE
+                * generator.standard_normal((3, 9))
+                * np.exp(-((away / WIDTH) ** 2) / 2)[:, None, None]
+            )
             pose_dirs[..., 9 * (j - 1) : 9 * j] = bulge
     parents = np.array(parents_of(kind), dtype=np.int64)
     parents[0] = 2**32 - 1
@@ -79,9 +92,15 @@ def write_smpl_like(folder: Path, kind: str) -> tuple[Path, Path]:
 
 
 def write_capture_of(
-    file: Path, uv: Path, out: Path, options: HumanOptions, betas: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+    file: Path,
+    uv: Path,
+    out: Path,
+    options: HumanOptions,
+    betas: torch.Tensor,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Path:
-    """Write a synthetic capture of the body of a file of 55 joints in the shape ``betas`` (10,), with exact poses."""
+    """Write a synthetic capture of the body of a file of 55 joints in the shape ``betas`` (10,),
+    with exact poses."""
     body = read_body(file, uv)
     vertices, joints = apply_shape(body, betas)
     shaped = synthetic.replace(body, vertices=vertices, joints=joints)

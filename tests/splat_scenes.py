@@ -19,7 +19,8 @@ AROUND = cameras_around(3, 48, 36)
 
 
 def cloud(count: int = 400, degree: int = 3, seed: int = 0) -> Gaussians:
-    """Return Gaussians of all sizes and rotations around the origin, seen by ``AROUND``, with strong harmonics."""
+    """Return Gaussians of all sizes and rotations around the origin, seen by ``AROUND``, with
+    strong harmonics."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -27,7 +28,9 @@ def cloud(count: int = 400, degree: int = 3, seed: int = 0) -> Gaussians:
 
     quats = torch.nn.functional.normalize(normal(count, 4), dim=1)
     sh = normal(count, num_sh_terms(degree), 3) * 0.15
-    return Gaussians(normal(count, 3) * 0.6, quats, normal(count, 3) * 0.5 - 2.5, normal(count) * 2, sh)
+    return Gaussians(
+        normal(count, 3) * 0.6, quats, normal(count, 3) * 0.5 - 2.5, normal(count) * 2, sh
+    )
 
 
 def seen(gaussians: Gaussians, cameras: Cameras = AROUND) -> torch.Tensor:

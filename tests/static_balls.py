@@ -19,7 +19,8 @@ BLACK = torch.zeros(3)
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball of one colour, or with one of another colour on the side of +x turned by ``turn`` radians about z."""
+    """A ball of one colour, or with one of another colour on the side of +x turned by ``turn``
+    radians about z."""
 
     center: tuple[float, float, float]
     radius: float = 0.2
@@ -29,7 +30,8 @@ class Ball:
 
 
 Balls = Callable[[float], Sequence[Ball]]
-"""Function of a time that returns the balls that there are then; the nearest to a camera hides the others."""
+"""Function of a time that returns the balls that there are then; the nearest to a camera hides the
+others."""
 
 
 def cameras(count: int) -> list[Cameras]:
@@ -37,9 +39,12 @@ def cameras(count: int) -> list[Cameras]:
     intrinsics = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
     found = []
     for i in range(count):
-        azimuth, elevation = 2 * math.pi * i / max(count, 1), 0.2 + 0.4 * (i % 2)
+        azimuth = 2 * math.pi * i / max(count, 1)
+        elevation = 0.2 + 0.4 * (i % 2)
         flat = math.cos(elevation)
-        forward = -torch.tensor([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
+        forward = -torch.tensor(
+            [flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)]
+        )
         right = torch.tensor([-math.sin(azimuth), math.cos(azimuth), 0.0])
         pose = torch.eye(4)
         pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
@@ -48,9 +53,13 @@ def cameras(count: int) -> list[Cameras]:
     return found
 
 
-def drawn(camera: Cameras, balls: Sequence[Ball], noise: float = 0.0, seed: int = 0) -> torch.Tensor:
-    """Return the (H, W, 3) image before a wall of grey stripes, which each camera sees elsewhere."""
-    pose, intrinsics = camera.cam_from_world[0].double().numpy(), camera.intrinsics[0].double().numpy()
+def drawn(
+    camera: Cameras, balls: Sequence[Ball], noise: float = 0.0, seed: int = 0
+) -> torch.Tensor:
+    """Return the (H, W, 3) image before a wall of grey stripes, which each camera sees
+    elsewhere."""
+    pose = camera.cam_from_world[0].double().numpy()
+    intrinsics = camera.intrinsics[0].double().numpy()
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(intrinsics).T @ pose[:3, :3]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -66,12 +75,16 @@ def drawn(camera: Cameras, balls: Sequence[Ball], noise: float = 0.0, seed: int 
         nearest[hit] = distance[hit]
         local = origin + distance[hit][:, None] * rays[hit] - np.array(ball.center)
         lit = local @ np.array([math.cos(ball.turn), math.sin(ball.turn), 0.0]) > 0.3 * ball.radius
-        rgb[hit] = np.where(lit[:, None] & (ball.other is not None), ball.other or ball.color, ball.color)
+        rgb[hit] = np.where(
+            lit[:, None] & (ball.other is not None), ball.other or ball.color, ball.color
+        )
     rgb += noise * np.random.default_rng(seed).standard_normal(rgb.shape)
     return torch.from_numpy(rgb.clip(0, 1)).float()
 
 
-def filmed(balls: Balls, times: Sequence[float], count: int = 6, noise: float = 0.01) -> list[Footage]:
+def filmed(
+    balls: Balls, times: Sequence[float], count: int = 6, noise: float = 0.01
+) -> list[Footage]:
     """Return the footage of ``count`` cameras."""
     return [
         footage_of(

@@ -44,7 +44,8 @@ class Counting:
 
 
 def report_of(step: int, difference: float = 0.1, finding: str | None = None) -> StepReport:
-    """The report of ``step``: a loss of 0.5 and an image that is wrong by ``difference`` everywhere."""
+    """The report of ``step``: a loss of 0.5 and an image that is wrong by ``difference``
+    everywhere."""
     truth = torch.zeros(2, 2, 3)
     return StepReport(step, 0.5, IMAGE, truth + difference, truth, finding)
 

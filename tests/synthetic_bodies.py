@@ -1,4 +1,5 @@
-"""Random bodies with the keys, types and layout of SMPL files, writers of such files, and their pose in slow loops.
+"""Random bodies with the keys, types and layout of SMPL files, writers of such files, and their
+pose in slow loops.
 
 The real files may not be passed on. J joints, M vertices, T triangles, F frames.
 """
@@ -36,9 +37,11 @@ def parents_of(kind: str) -> list[int]:
 
 
 def model(kind: str, seed: int = 0, directions: int | None = None) -> Arrays:
-    """The arrays of a random body of M vertices, as large as a person, with all keys of the real files."""
+    """The arrays of a random body of M vertices, as large as a person, with all keys of the real
+    files."""
     generator = np.random.default_rng(seed)
-    j, b = NUM_JOINTS[kind], NUM_SHAPES[kind] if directions is None else directions
+    j = NUM_JOINTS[kind]
+    b = NUM_SHAPES[kind] if directions is None else directions
     parents = np.array(parents_of(kind), dtype=np.int64)
     parents[0] = 2**32 - 1
     triangles = generator.permutation(list(combinations(range(M), 3)))
@@ -52,16 +55,27 @@ def model(kind: str, seed: int = 0, directions: int | None = None) -> Arrays:
         "kintree_table": np.stack([parents, np.arange(j)]).astype(np.uint32),
     }
     if kind == "smpl":
-        return arrays | {"J": generator.uniform(-1, 1, (j, 3)), "bs_style": "lbs", "bs_type": "lrotmin"}
-    hands = {f"hands_{x}{side}": generator.standard_normal(45) for x in ("mean", "coeffs") for side in "lr"}
+        return arrays | {
+            "J": generator.uniform(-1, 1, (j, 3)),
+            "bs_style": "lbs",
+            "bs_type": "lrotmin",
+        }
+    hands = {
+        f"hands_{x}{side}": generator.standard_normal(45)
+        for x in ("mean", "coeffs")
+        for side in "lr"
+    }
     if kind == "smplh":
         return arrays | hands
     corners = generator.integers(0, M + 9, (T, 3)).astype(np.uint32)
     return arrays | hands | {"vt": generator.uniform(0, 1, (M + 9, 2)), "ft": corners}
 
 
-def slow_vertices(arrays: Arrays, poses: np.ndarray, trans: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """(F, M, 3) as the SMPL paper has it, from the raw arrays, in loops. ``beta`` are all directions of the file."""
+def slow_vertices(
+    arrays: Arrays, poses: np.ndarray, trans: np.ndarray, beta: np.ndarray
+) -> np.ndarray:
+    """(F, M, 3) as the SMPL paper has it, from the raw arrays, in loops. ``beta`` are all
+    directions of the file."""
     raw = {key: np.asarray(value) for key, value in arrays.items()}
     parents = raw["kintree_table"][0].astype(np.int64)
     frames = []
@@ -98,7 +112,8 @@ PythonPickler: Any = pickle._Pickler
 
 
 class Python2Pickler(PythonPickler):
-    """Writes as Python 2 did: bytes as strings, NumPy's and SciPy's modules under their old names."""
+    """Writes as Python 2 did: bytes as strings, NumPy's and SciPy's modules under their old
+    names."""
 
     def save_old_bytes(self, value: bytes) -> None:
         if self.proto == 0:
@@ -131,7 +146,9 @@ def write_python2_pickle(path: Path, content: object, protocol: int) -> Path:
     return path
 
 
-def write_obj(path: Path, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, vertices: int = M) -> Path:
+def write_obj(
+    path: Path, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, vertices: int = M
+) -> Path:
     lines = [
         "# a comment",
         "mtllib none.mtl",

@@ -1,4 +1,5 @@
-"""The most bytes that tensors made in a block take at once: what a step needs, without the luck of an allocator."""
+"""The most bytes that tensors made in a block take at once: what a step needs, without the luck of
+an allocator."""
 
 from __future__ import annotations
 
@@ -24,7 +25,11 @@ class TensorBytes(TorchDispatchMode):
         self._known: set[int] = set()
 
     def __torch_dispatch__(
-        self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: Any = (),
+        kwargs: dict[str, Any] | None = None,
     ) -> Any:
         found = func(*args, **(kwargs or {}))
         for x in tree_leaves(found):
@@ -33,7 +38,8 @@ class TensorBytes(TorchDispatchMode):
         return found
 
     def _count(self, storage: torch.UntypedStorage) -> None:
-        key, size = storage._cdata, storage.nbytes()
+        key = storage._cdata
+        size = storage.nbytes()
         if key in self._known:
             return
         self._known.add(key)

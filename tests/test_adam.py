@@ -19,7 +19,10 @@ def random(shape: tuple[int, ...], seed: int) -> Tensor:
 
 
 def start_values() -> dict[str, Tensor]:
-    return {name: random(shape, seed).requires_grad_() for seed, (name, shape) in enumerate(SHAPES.items())}
+    return {
+        name: random(shape, seed).requires_grad_()
+        for seed, (name, shape) in enumerate(SHAPES.items())
+    }
 
 
 def stepped(steps: int) -> tuple[AdamState, dict[str, Tensor]]:
@@ -40,8 +43,10 @@ def stepped_along(last_axis: bool, adam: AdamState, name: str, x: Tensor, step: 
 
 @pytest.mark.parametrize("along_last_axis", [False, True])
 def test_it_is_adam(along_last_axis: bool) -> None:
-    mine, theirs = start_values(), start_values()
-    adam, reference = AdamState.zero(mine), torch.optim.Adam(list(theirs.values()), lr=0.1, eps=EPS)
+    mine = start_values()
+    theirs = start_values()
+    adam = AdamState.zero(mine)
+    reference = torch.optim.Adam(list(theirs.values()), lr=0.1, eps=EPS)
     for step in range(1, 6):
         for seed, name in enumerate(SHAPES):
             grad = random(SHAPES[name], 10 * step + seed)
@@ -58,14 +63,18 @@ def test_without_gradients_nothing_is_done() -> None:
     before = {name: x.clone() for name, x in (tensors | tensors_of(adam.state())).items()}
     for name, x in tensors.items():
         assert adam.step_(name, x, lr=0.1, step=3) == stepped_along(True, adam, name, x, 3) == 0
-    assert all(torch.equal(x, before[name]) for name, x in (tensors | tensors_of(adam.state())).items())
+    assert all(
+        torch.equal(x, before[name]) for name, x in (tensors | tensors_of(adam.state())).items()
+    )
 
 
 def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
-    """A row is all that belongs to one Gaussian, or, of arrays for all of them, the values along the last axis."""
+    """A row is all that belongs to one Gaussian, or, of arrays for all of them, the values along
+    the last axis."""
     for along_last_axis, left_out in ((False, 1), (True, 2)):
         x = start_values()["planes"]
-        adam, before = AdamState.zero({"planes": x}), x.detach().clone()
+        adam = AdamState.zero({"planes": x})
+        before = x.detach().clone()
         x.grad = random(SHAPES["planes"], 1)
         x.grad[1, 2, 3, 0], x.grad[1, 0, 0, 1] = float("nan"), float("inf")
         assert stepped_along(along_last_axis, adam, "planes", x, 1) == left_out
@@ -77,8 +86,10 @@ def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
 
 
 def test_of_chosen_rows_only_those_are_updated() -> None:
-    x, rows = start_values()["weight"], torch.tensor([True, False, False, True])
-    adam, before = AdamState.zero({"weight": x}), x.detach().clone()
+    x = start_values()["weight"]
+    rows = torch.tensor([True, False, False, True])
+    adam = AdamState.zero({"weight": x})
+    before = x.detach().clone()
     x.grad = torch.ones_like(x)
     adam.step_("weight", x, lr=0.1, step=1, rows=rows)
     assert torch.equal((x.detach() != before).all(1), rows)
@@ -87,7 +98,8 @@ def test_of_chosen_rows_only_those_are_updated() -> None:
 
 def test_each_value_of_a_row_may_have_its_rate() -> None:
     x = start_values()["weight"]
-    adam, before = AdamState.zero({"weight": x}), x.detach().clone()
+    adam = AdamState.zero({"weight": x})
+    before = x.detach().clone()
     x.grad = torch.ones_like(x)
     rates = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
     adam.step_("weight", x, lr=rates, step=1)
@@ -96,9 +108,13 @@ def test_each_value_of_a_row_may_have_its_rate() -> None:
 
 def test_mapped_changes_both_moments_of_what_is_named() -> None:
     adam, _ = stepped(2)
-    some, everything, nothing = (adam.mapped(torch.zeros_like, names) for names in (["bias"], None, []))
+    some, everything, nothing = (
+        adam.mapped(torch.zeros_like, names) for names in (["bias"], None, [])
+    )
     for part in ("exp_avg", "exp_avg_sq"):
-        before, found, all_zero, same = (getattr(one, part) for one in (adam, some, everything, nothing))
+        before, found, all_zero, same = (
+            getattr(one, part) for one in (adam, some, everything, nothing)
+        )
         for name, x in before.items():
             assert x.any(), "what is mapped stays as it is"
             assert torch.equal(found[name], torch.zeros_like(x) if name == "bias" else x)
@@ -130,10 +146,15 @@ def test_its_state_is_for_training_alone() -> None:
 @pytest.mark.parametrize("part", ["exp_avg", "exp_avg_sq"])
 def test_moments_that_do_not_fit_are_refused(part: str) -> None:
     adam, tensors = stepped(1)
-    state, name = tensors_of(adam.state()), f"{part}.weight"
+    state = tensors_of(adam.state())
+    name = f"{part}.weight"
     with pytest.raises(KeyError, match=name):
         AdamState.restored({k: x for k, x in state.items() if k != name}, tensors)
-    bad = torch.full((4, 5), float("nan")), torch.zeros(5, 5), torch.zeros(4, 5, dtype=torch.float64)
+    bad = (
+        torch.full((4, 5), float("nan")),
+        torch.zeros(5, 5),
+        torch.zeros(4, 5, dtype=torch.float64),
+    )
     for x in bad:
         with pytest.raises(ValueError, match=name):
             AdamState.restored(state | {name: x}, tensors)

@@ -11,7 +11,14 @@ import torch
 from pretend_gpu import GPU, pretend_gpu
 from reference import project, rasterize
 
-from dyngs.bench import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
+from dyngs.bench import (
+    STAGES,
+    bench_rasterize,
+    format_report,
+    garden_workload,
+    random_workload,
+    write_report,
+)
 from dyngs.cli import main
 from dyngs.errors import DyngsError
 from dyngs.ops.projection import ProjectionOptions
@@ -24,12 +31,18 @@ def small_product(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_counts_agree_with_the_reference() -> None:
-    """Pairs are pixels with alpha >= 1/255 that are not full: the reference finds them, one Gaussian at a time."""
+    """Pairs are pixels with alpha >= 1/255 that are not full: the reference finds them, one
+    Gaussian at a time."""
     load = random_workload(12)
     report = bench_rasterize(load, [1], repeats=1)
     assert report.num_gaussians == 12
     projection = project(
-        load.means, load.quats, load.scales, load.opacities, load.cameras, ProjectionOptions(near=0.01)
+        load.means,
+        load.quats,
+        load.scales,
+        load.opacities,
+        load.cameras,
+        ProjectionOptions(near=0.01),
     )
     pairs = 0
     for i in range(12):
@@ -54,7 +67,12 @@ def test_points_beyond_two_units_are_left_out(tmp_path: Path) -> None:
     points = np.array([[0.0, 0, 3], [0, 0, 1], [0, 1.5, 1]], np.float32)
     path = tmp_path / "points.npz"
     view = np.eye(4, dtype=np.float32)[None]
-    arrays = {"means3d": points, "colors": np.zeros((3, 3), np.uint8), "viewmats": view, "Ks": np.eye(3)[None]}
+    arrays = {
+        "means3d": points,
+        "colors": np.zeros((3, 3), np.uint8),
+        "viewmats": view,
+        "Ks": np.eye(3)[None],
+    }
     np.savez(path, **arrays, width=8, height=6)
     load = garden_workload(path)
     assert len(load.means) == 2
@@ -72,7 +90,12 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "Ks": np.eye(3)[None],
     }
     right |= {"width": 8, "height": 6}
-    wrong = {"means3d": np.zeros(3), "colors": np.zeros((2, 3)), "viewmats": np.full((1, 4, 4), np.nan), "width": "x"}
+    wrong = {
+        "means3d": np.zeros(3),
+        "colors": np.zeros((2, 3)),
+        "viewmats": np.full((1, 4, 4), np.nan),
+        "width": "x",
+    }
     for key, value in wrong.items():
         np.savez(path, **(right | {key: np.asarray(value)}))
         with pytest.raises(DyngsError, match=r"garden\.npz.*give a workload"):

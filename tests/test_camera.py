@@ -40,9 +40,16 @@ def test_to_changes_the_precision_of_both_matrices() -> None:
         ((2, 4, 4), (1, 3, 3), (8, 8), r"intrinsics must be \(V, 3, 3\), got \(1, 3, 3\)"),
         ((2, 4, 4), (2, 3, 3), (0, 8), "image size must be positive, in whole pixels, got 0x8"),
         ((2, 4, 4), (2, 3, 3), (8, 7.5), "image size must be positive, in whole pixels, got 8x7.5"),
-        ((2, 4, 4), (2, 3, 3), (float("nan"), 8), "image size must be positive, in whole pixels, got nanx8"),
+        (
+            (2, 4, 4),
+            (2, 3, 3),
+            (float("nan"), 8),
+            "image size must be positive, in whole pixels, got nanx8",
+        ),
     ],
 )
-def test_wrong_shapes_are_named(poses: tuple, intrinsics: tuple, size: tuple[int, int], message: str) -> None:
+def test_wrong_shapes_are_named(
+    poses: tuple, intrinsics: tuple, size: tuple[int, int], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         Cameras(torch.zeros(poses), torch.zeros(intrinsics), *size)

@@ -1,4 +1,5 @@
-"""The command line: exit codes, one-line errors, instant help, and every verb once on a tiny capture."""
+"""The command line: exit codes, one-line errors, instant help, and every verb once on a tiny
+capture."""
 
 from __future__ import annotations
 
@@ -80,7 +81,9 @@ def test_version(capsys: Capture) -> None:
     assert capsys.readouterr().out.strip() == f"dyngs {dyngs.__version__}"
 
 
-@pytest.mark.parametrize("verb", [["data", "sfm"], ["data", "inspect"], ["data", "synth"], *([v] for v in VERBS[:5])])
+@pytest.mark.parametrize(
+    "verb", [["data", "sfm"], ["data", "inspect"], ["data", "synth"], *([v] for v in VERBS[:5])]
+)
 def test_every_command_explains_itself(verb: list[str], capsys: Capture) -> None:
     assert main([*verb, "--help"]) == 0
     assert f"usage: dyngs {' '.join(verb)}" in capsys.readouterr().out
@@ -94,17 +97,31 @@ def test_help_is_instant_because_torch_is_not_imported() -> None:
     seconds = []
     for _ in range(3):  # the best counts: a busy machine only ever makes it slower
         start = os.times()
-        done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         end = os.times()
-        seconds.append(end.children_user + end.children_system - start.children_user - start.children_system)
+        seconds.append(
+            end.children_user + end.children_system - start.children_user - start.children_system
+        )
         assert done.stdout.splitlines()[-1] == "[]"
         if seconds[-1] < 0.5:
             return
-    pytest.fail(f"takes {min(seconds)} s of the processor")  # 0.1 s on an idle machine; the promise is 0.3 s
+    # 0.1 s on an idle machine; the promise is 0.3 s
+    pytest.fail(f"takes {min(seconds)} s of the processor")
 
 
 def test_module_and_command_are_the_same() -> None:
-    done = subprocess.run([sys.executable, "-m", "dyngs", "--version"], env=ENVIRONMENT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "dyngs", "--version"],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+    )
     assert (done.returncode, done.stdout.strip()) == (0, f"dyngs {dyngs.__version__}")
 
 
@@ -138,12 +155,16 @@ def test_without_a_command_it_says_what_to_do_next(capsys: Capture) -> None:
     assert {"demo", "train", "view"} <= named <= {*VERBS, "view"}
 
 
-def test_without_debug_there_is_only_the_line(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_without_debug_there_is_only_the_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
     make_doctor(monkeypatch, fail_in_a_reader)
     assert "KeyError: 'fl_x'" in error_line(capsys, "doctor")
 
 
-def test_a_line_holds_nothing_that_a_terminal_obeys(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_a_line_holds_nothing_that_a_terminal_obeys(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
     make_doctor(monkeypatch, raising(DyngsError("a\x1b[2J.png: no such\nimage")))
     assert "a\\x1b[2J.png: no such image" in error_line(capsys, "doctor")
 
@@ -151,7 +172,9 @@ def test_a_line_holds_nothing_that_a_terminal_obeys(monkeypatch: pytest.MonkeyPa
 def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
     code = "import sys; from dyngs.cli import main; main(['--version']); print('p\\udce9re.png')"
     environment = ENVIRONMENT | {"PYTHONIOENCODING": "utf-8:strict"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
     assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "p\\udce9re.png")
 
 
@@ -178,7 +201,10 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("render nowhere --out x --size 0x5", "1280x720"),
         ("render nowhere --out x --frames 0", "whole number from 1"),
         ("render nowhere --out x --split test --path orbit", "not allowed with"),
-        ("render nowhere", "--out DIR (or --video FILE.mp4 with --path, --time, --times or --view)"),
+        (
+            "render nowhere",
+            "--out DIR (or --video FILE.mp4 with --path, --time, --times or --view)",
+        ),
         ("render nowhere --out x --time nan", "'nan' is not a time"),
         ("render nowhere --out x --time noon", "'noon' is not a time; write a number from 0 to 1"),
         ("render nowhere --out x --time 0 --times 0:1:2", "not allowed with"),
@@ -212,11 +238,20 @@ def test_wrong_usage_and_missing_input_end_in_one_line(
     ("error", "part"),
     [
         (DyngsError("two\nlines"), "two lines"),
-        (OSError(errno.ENOSPC, "No space left on device", "a.png"), "a.png: No space left on device; free some space"),
-        (PermissionError(errno.EACCES, "Permission denied", "b"), "b: Permission denied; choose another folder"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "a.png"),
+            "a.png: No space left on device; free some space",
+        ),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "b"),
+            "b: Permission denied; choose another folder",
+        ),
         (BrokenPipeError(errno.EPIPE, "Broken pipe"), "Broken pipe"),
         (MemoryError(), "out of memory"),
-        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "the GPU is out of memory; lower strategy.max"),
+        (
+            RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"),
+            "the GPU is out of memory; lower strategy.max",
+        ),
     ],
 )
 def test_errors_of_the_world_end_in_one_line(
@@ -235,7 +270,10 @@ def test_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_interruption_says_how_to_go_on(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     make_doctor(monkeypatch, raising(KeyboardInterrupt("go on with: dyngs train --resume runs/a")))
     assert main(["doctor"]) == 130
-    assert capsys.readouterr().err.strip() == "dyngs: interrupted: go on with: dyngs train --resume runs/a"
+    assert (
+        capsys.readouterr().err.strip()
+        == "dyngs: interrupted: go on with: dyngs train --resume runs/a"
+    )
 
 
 TALKATIVE = """
@@ -248,7 +286,11 @@ sys.exit(main(["doctor"]))
 
 def test_a_reader_that_leaves_gets_no_traceback() -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", TALKATIVE], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", TALKATIVE],
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout is not None
     assert process.stderr is not None
@@ -263,17 +305,23 @@ def test_a_reader_that_leaves_gets_no_traceback() -> None:
 def test_a_full_disk_gets_no_traceback() -> None:
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-c", TALKATIVE]
-        done = subprocess.run(command, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run(
+            command, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
     assert done.returncode == 2
     assert done.stderr.startswith("dyngs: error: No space left on device")
     assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="closes a file descriptor in a shell")
-@pytest.mark.parametrize("command", ["docs cli >&-", "config static >&-", "config static | head -n 1", "--help >&-"])
+@pytest.mark.parametrize(
+    "command", ["docs cli >&-", "config static >&-", "config static | head -n 1", "--help >&-"]
+)
 def test_output_that_nobody_takes_gets_no_traceback(command: str) -> None:
     line = f"'{sys.executable}' -m dyngs {command}"
-    done = subprocess.run(line, shell=True, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        line, shell=True, env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
     assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
 
 
@@ -282,13 +330,20 @@ def test_ctrl_c_at_any_time_of_the_start_gets_no_traceback(capture: Path, tmp_pa
     """While dyngs and torch are imported, and in the first steps; a shell sees 130 each time."""
     words = ["train", "static", f"data.root={capture}", "train.steps=100000"]
     for wait in (0.7, 2.5):
-        command = [sys.executable, "-m", "dyngs", *words, f"run.dir={tmp_path / f'run after {wait} s'}"]
+        command = [
+            sys.executable,
+            "-m",
+            "dyngs",
+            *words,
+            f"run.dir={tmp_path / f'run after {wait} s'}",
+        ]
         process = subprocess.Popen(
             command,
             env=ENVIRONMENT,
             stderr=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
+            # tests in the background ignore it
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         time.sleep(wait)
         process.send_signal(signal.SIGINT)
@@ -325,7 +380,9 @@ def test_ctrl_c_while_a_module_is_imported_gets_no_traceback(module: str) -> Non
         check=False,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    assert (done.returncode, done.stderr.strip()) in ((130, ""), (130, "dyngs: interrupted")), done.stderr
+    assert (done.returncode, done.stderr.strip()) in ((130, ""), (130, "dyngs: interrupted")), (
+        done.stderr
+    )
 
 
 # ---------------------------------------------------------------------------------------------------- train's words
@@ -336,7 +393,16 @@ def test_ctrl_c_while_a_module_is_imported_gets_no_traceback(module: str) -> Non
     [
         ["prune", "RUN", "model.alpha_min=0.02", "prune.mask_times=6", "--out", "RUN2"],
         ["prune", "RUN", "--out", "RUN2", "model.alpha_min=0.02", "prune.mask_times=6"],
-        ["prune", "--out", "RUN2", "RUN", "model.alpha_min=0.02", "--prune", "0.5", "prune.mask_times=6"],
+        [
+            "prune",
+            "--out",
+            "RUN2",
+            "RUN",
+            "model.alpha_min=0.02",
+            "--prune",
+            "0.5",
+            "prune.mask_times=6",
+        ],
     ],
 )
 def test_overrides_may_stand_anywhere(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -348,7 +414,8 @@ def test_overrides_may_stand_anywhere(words: list[str], monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    "words", [["prune", "RUN", "--out", "X", "a.b=1", "foo"], ["eval", "RUN", "--split", "val", "foo"]]
+    "words",
+    [["prune", "RUN", "--out", "X", "a.b=1", "foo"], ["eval", "RUN", "--split", "val", "foo"]],
 )
 def test_other_words_may_not(words: list[str], capsys: Capture) -> None:
     assert main(words) == 2
@@ -357,7 +424,11 @@ def test_other_words_may_not(words: list[str], capsys: Capture) -> None:
 
 def test_words_after_train() -> None:
     config = parse_config(["static", "data.root=x", "train.steps=5", "run.threads=2"], None)
-    assert (config.train.steps, config.run.threads, config.data.root) == (5, 2, Path("x").absolute())
+    assert (config.train.steps, config.run.threads, config.data.root) == (
+        5,
+        2,
+        Path("x").absolute(),
+    )
     assert parse_config(["data.root=x"], None) == load_config(None, ["data.root=x"])
 
 
@@ -369,7 +440,10 @@ def test_a_resumed_run_keeps_its_config_but_for_its_length_and_threads(tmp_path:
     assert resumed.run.dir == tmp_path
     assert resumed.model_copy(update={"run": stored.run}) == stored
     assert parse_config(["train.steps=9", "data.cache_mb=5"], tmp_path).train.steps == 9
-    with pytest.raises(DyngsError, match=r"'optim.lr_means=1': .* keeps its own config; train.steps=N .*run.threads"):
+    with pytest.raises(
+        DyngsError,
+        match=r"'optim.lr_means=1': .* keeps its own config; train.steps=N .*run.threads",
+    ):
         parse_config(["train.steps=9", "optim.lr_means=1"], tmp_path)
 
 
@@ -386,15 +460,25 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run_dir(capture: Path) -> Path:
     folder = capture.parent / "run"
-    words = [f"data.root={capture}", f"run.dir={folder}", "train.steps=20", "init.num_random=200", "run.threads=1"]
+    words = [
+        f"data.root={capture}",
+        f"run.dir={folder}",
+        "train.steps=20",
+        "init.num_random=200",
+        "run.threads=1",
+    ]
     assert main(["train", "static", *words]) == 0
     return folder
 
 
-def test_train_writes_a_run_folder_and_never_overwrites_it(run_dir: Path, capture: Path, capsys: Capture) -> None:
+def test_train_writes_a_run_folder_and_never_overwrites_it(
+    run_dir: Path, capture: Path, capsys: Capture
+) -> None:
     assert {"config.yaml", "checkpoints", "log.jsonl"} <= {f.name for f in run_dir.iterdir()}
     before = {f: f.read_bytes() for f in run_dir.rglob("*") if f.is_file()}
-    assert str(run_dir) in error_line(capsys, "train", "static", f"data.root={capture}", f"run.dir={run_dir}")
+    assert str(run_dir) in error_line(
+        capsys, "train", "static", f"data.root={capture}", f"run.dir={run_dir}"
+    )
     assert {f: f.read_bytes() for f in run_dir.rglob("*") if f.is_file()} == before
     assert main(["train", "--resume", str(run_dir)]) == 0
 
@@ -426,9 +510,15 @@ def test_export_and_render_of_the_file(run_dir: Path, tmp_path: Path, capsys: Ca
     few = ("--max-gaussians-drawn", "1000")
     assert main(["render", str(ply), "--out", str(out), *words, *few]) == 0
     capsys.readouterr()
-    assert "a number of Gaussians" in error_line(capsys, "render", ply, "--out", tmp_path, few[0], 0)
-    assert "has no splits" in error_line(capsys, "render", ply, "--out", tmp_path, "--split", "test")
-    assert "no camera path 'circle'" in error_line(capsys, "render", ply, "--out", tmp_path, "--path", "circle")
+    assert "a number of Gaussians" in error_line(
+        capsys, "render", ply, "--out", tmp_path, few[0], 0
+    )
+    assert "has no splits" in error_line(
+        capsys, "render", ply, "--out", tmp_path, "--split", "test"
+    )
+    assert "no camera path 'circle'" in error_line(
+        capsys, "render", ply, "--out", tmp_path, "--path", "circle"
+    )
 
 
 def test_eval_of_a_still_run_says_nothing_about_time(run_dir: Path, capsys: Capture) -> None:
@@ -449,13 +539,19 @@ def test_synth_leaves_a_used_folder_alone(capture: Path, capsys: Capture) -> Non
 
 
 @pytest.mark.parametrize("text", ["-1", "1.5", "x", "9" * 30, "²", "2000"])
-@pytest.mark.parametrize("command", [("render", "."), ("eval", "."), ("prune", ".", "--out", "x"), ("demo",)])
-def test_threads_are_counted(capsys: pytest.CaptureFixture[str], command: tuple[str, ...], text: str) -> None:
+@pytest.mark.parametrize(
+    "command", [("render", "."), ("eval", "."), ("prune", ".", "--out", "x"), ("demo",)]
+)
+def test_threads_are_counted(
+    capsys: pytest.CaptureFixture[str], command: tuple[str, ...], text: str
+) -> None:
     assert "is not a number of threads" in error_line(capsys, *command, "--threads", text)
 
 
 @pytest.mark.parametrize("text", ["a\0b", "\ud800"])
-def test_words_that_can_name_nothing_are_refused(capsys: pytest.CaptureFixture[str], text: str) -> None:
+def test_words_that_can_name_nothing_are_refused(
+    capsys: pytest.CaptureFixture[str], text: str
+) -> None:
     for words in (("render", ".", "--out", text), ("export", text), ("train", f"run.dir={text}")):
         assert "holds a character that no name or path may hold" in error_line(capsys, *words)
 
@@ -470,7 +566,9 @@ def test_memory_that_torch_cannot_have_is_one_line(
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_an_error_that_cannot_be_said_has_its_exit_code() -> None:
     with open("/dev/full", "w") as full:
-        done = subprocess.run([sys.executable, "-m", "dyngs", "nothing"], env=ENVIRONMENT, stderr=full, check=False)
+        done = subprocess.run(
+            [sys.executable, "-m", "dyngs", "nothing"], env=ENVIRONMENT, stderr=full, check=False
+        )
     assert done.returncode == 2
 
 
@@ -488,7 +586,9 @@ def test_long_words_are_cut_in_messages(capsys: pytest.CaptureFixture[str]) -> N
         ["eval", "nothing", "--device", "cuda"],
     ],
 )
-def test_a_gpu_that_is_not_there_is_told_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gpu_that_is_not_there_is_told_in_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     Path("nothing.ply").touch()
     assert main(words) == 2
     printed = capsys.readouterr()

@@ -1,4 +1,5 @@
-"""``dyngs.rasterization``: the interface of gsplat 1.5, and agreement with gsplat's formulas where it is installed."""
+"""``dyngs.rasterization``: the interface of gsplat 1.5, and agreement with gsplat's formulas where
+it is installed."""
 
 from __future__ import annotations
 
@@ -57,12 +58,14 @@ def call(scene: Scene, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
 
 
 def near_scene() -> Scene:
-    """Some Gaussians close to the camera and some beside the image, so that the clamp of the Jacobian matters."""
+    """Some Gaussians close to the camera and some beside the image, so that the clamp of the
+    Jacobian matters."""
     scene = random_scene(n=60, views=3, seed=8, degree=3)
     return replace(scene, means=2 * scene.means)
 
 
-# --- against gsplat's reference ---------------------------------------------------------------------------------------
+# --- against gsplat's reference
+# ---------------------------------------------------------------------------------------
 
 
 def gsplat_projection(formulas: ModuleType, scene: Scene) -> tuple[Tensor, ...]:
@@ -79,11 +82,18 @@ def gsplat_projection(formulas: ModuleType, scene: Scene) -> tuple[Tensor, ...]:
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-5)])
-def test_projection_equals_gsplat(formulas: ModuleType, dtype: torch.dtype, tolerance: float) -> None:
-    """Float32 to 1e-5 of the largest value: both round, gsplat's determinant cancels for thin splats."""
+def test_projection_equals_gsplat(
+    formulas: ModuleType, dtype: torch.dtype, tolerance: float
+) -> None:
+    """Float32 to 1e-5 of the largest value: both round, gsplat's determinant cancels for thin
+    splats."""
     scene = near_scene().to(dtype)
-    radii, means2d, depths, conics, compensations = gsplat_projection(formulas, scene.to(torch.float64))
-    ours = project(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS)
+    radii, means2d, depths, conics, compensations = gsplat_projection(
+        formulas, scene.to(torch.float64)
+    )
+    ours = project(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS
+    )
     seen = ours.radii[..., 0] > 0
     assert seen.any()
     assert (radii > 0).all(-1)[seen].all()  # ours cull tighter: by the opacity
@@ -104,12 +114,16 @@ def test_projection_gradients_equal_gsplat(formulas: ModuleType) -> None:
     def outputs_of_gsplat(s: Scene) -> list[Tensor]:
         return list(gsplat_projection(formulas, s)[1:])
 
-    seen = project(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS).radii[..., 0]
+    seen = project(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS
+    ).radii[..., 0]
 
     def slopes(outputs: Callable[[Scene], list[Tensor]]) -> tuple[Tensor, ...]:
         leaves = scene.leaves()
         parts = [(x[seen > 0] * weights(x)[seen > 0]).sum() for x in outputs(leaves)]
-        return torch.autograd.grad(torch.stack(parts).sum(), [getattr(leaves, name) for name in names])
+        return torch.autograd.grad(
+            torch.stack(parts).sum(), [getattr(leaves, name) for name in names]
+        )
 
     for name, x, y in zip(names, slopes(outputs_of_ours), slopes(outputs_of_gsplat), strict=True):
         assert relative_error(x, y) < 1e-9, name
@@ -122,11 +136,14 @@ def test_radii_follow_gsplats_rule(formulas: ModuleType) -> None:
     a, b, c = conics.unbind(-1)
     sigma = torch.stack([c, a], -1) / (a * c - b * b)[..., None]
     extend = (2 * (255 * scene.opacities).log()).sqrt().clamp_max(3.33)
-    ours = project(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS).radii
+    ours = project(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS
+    ).radii
     seen = (ours > 0).all(-1)
     expected = (extend[None, :, None] * sigma.sqrt()).ceil().int()
     assert torch.equal(ours[seen], expected[seen])
-    assert (ours[seen] <= reference_radii[seen]).all()  # its plain-torch version ignores the opacity
+    # its plain-torch version ignores the opacity
+    assert (ours[seen] <= reference_radii[seen]).all()
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -145,12 +162,17 @@ def test_parameters_are_those_of_gsplat() -> None:
     theirs = inspect.signature(gsplat.rasterization).parameters
     ours = inspect.signature(rasterization).parameters
     assert list(ours) == list(theirs)
-    defaults = {name: (p.default, theirs[name].default) for name, p in ours.items() if name != "rolling_shutter"}
+    defaults = {
+        name: (p.default, theirs[name].default)
+        for name, p in ours.items()
+        if name != "rolling_shutter"
+    }
     assert {name: pair for name, pair in defaults.items() if pair[0] != pair[1]} == {}
     call(random_scene(), rolling_shutter=theirs["rolling_shutter"].default)
 
 
-# --- the interface ----------------------------------------------------------------------------------------------------
+# --- the interface
+# ----------------------------------------------------------------------------------------------------
 
 
 def test_is_public() -> None:
@@ -213,7 +235,14 @@ def test_meta_unpacked() -> None:
     for name in ("means2d", "depths", "conics", "radii"):
         assert torch.equal(meta[name], getattr(p, name)), name
     assert torch.equal(meta["opacities"], scene.opacities * p.compensations)
-    sizes = {"width": 37, "height": 29, "tile_size": 16, "tile_width": 3, "tile_height": 2, "n_cameras": 3}
+    sizes = {
+        "width": 37,
+        "height": 29,
+        "tile_size": 16,
+        "tile_width": 3,
+        "tile_height": 2,
+        "n_cameras": 3,
+    }
     assert {name: meta[name] for name in sizes} == sizes
     assert meta["camera_ids"] is None
     assert meta["gaussian_ids"] is None
@@ -232,7 +261,8 @@ def test_meta_packed_lists_the_visible_pairs() -> None:
 @pytest.mark.parametrize("packed", [True, False])
 def test_tile_lists_are_sorted_by_depth_and_complete(packed: bool) -> None:
     _, _, meta = call(near_scene(), packed=packed)
-    depths, ids = meta["depths"].reshape(-1), meta["flatten_ids"].long()
+    depths = meta["depths"].reshape(-1)
+    ids = meta["flatten_ids"].long()
     assert meta["isect_offsets"].shape == (3, 2, 3)
     bounds = [*meta["isect_offsets"].flatten().tolist(), len(ids)]
     for begin, end in pairwise(bounds):
@@ -250,7 +280,9 @@ def test_means2d_keeps_its_gradient(packed: bool) -> None:
     meta["means2d"].retain_grad()
     (image * weights(image)).sum().backward()
     probe = torch.zeros(3, 60, 4, dtype=torch.float64, requires_grad=True)
-    p = project(means.detach(), scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS)
+    p = project(
+        means.detach(), scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS
+    )
     again = rasterize_with_probe(scene, p, probe)
     (again * weights(again)).sum().backward()
     assert probe.grad is not None
@@ -279,7 +311,12 @@ def test_gradcheck(packed: bool) -> None:
     def run(*tensors: Tensor) -> tuple[Tensor, Tensor]:
         moved = replace(scene, **dict(zip(names, tensors, strict=True)))
         image, alpha, _ = call(
-            moved, colors=moved.sh, sh_degree=1, backgrounds=moved.background, render_mode="RGB+ED", packed=packed
+            moved,
+            colors=moved.sh,
+            sh_degree=1,
+            backgrounds=moved.background,
+            render_mode="RGB+ED",
+            packed=packed,
         )
         return image, alpha
 
@@ -315,10 +352,19 @@ def test_unsupported_arguments_are_refused_by_name(name: str, scene: Scene) -> N
     ("options", "message"),
     [
         ({"render_mode": "rgb"}, "render_mode must be one of RGB, D, ED, .*got 'rgb'"),
-        ({"rasterize_mode": "mip"}, "rasterize_mode must be one of classic, antialiased, got 'mip'"),
+        (
+            {"rasterize_mode": "mip"},
+            "rasterize_mode must be one of classic, antialiased, got 'mip'",
+        ),
         ({"sh_degree": 3}, "with sh_degree colors must be"),
-        ({"colors": torch.zeros(7, 3).double()}, r"colors must be \(20, D\) or \(2, 20, D\), got \(7, 3\)"),
-        ({"colors": torch.zeros(20, 4, 3).double(), "sh_degree": 2}, "sh_degree 2 does not fit 4 coefficients"),
+        (
+            {"colors": torch.zeros(7, 3).double()},
+            r"colors must be \(20, D\) or \(2, 20, D\), got \(7, 3\)",
+        ),
+        (
+            {"colors": torch.zeros(20, 4, 3).double(), "sh_degree": 2},
+            "sh_degree 2 does not fit 4 coefficients",
+        ),
     ],
 )
 def test_what_does_not_fit_is_named(options: dict[str, Any], message: str, scene: Scene) -> None:
@@ -338,22 +384,31 @@ NUMBERS: dict[str, list[Any]] = {
 }
 
 
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in NUMBERS.items() for value in values])
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, value) for name, values in NUMBERS.items() for value in values]
+)
 def test_numbers_out_of_range_are_refused_by_name(name: str, value: Any) -> None:
     """Some gave an empty image, some a mirrored one, some an error of another library."""
     scene = random_scene(degree=3)
     said = {"near_plane": "near", "far_plane": "far"}.get(name, name)
-    sizes = {"width": scene.width, "height": scene.height} | ({name: value} if name in ("width", "height") else {})
+    sizes = {"width": scene.width, "height": scene.height} | (
+        {name: value} if name in ("width", "height") else {}
+    )
     options = {} if name in sizes else {name: value}
     with pytest.raises(DyngsError, match=f"^rasterization: (?s:.*){said}"):
-        call(replace(scene, **sizes), **({"colors": scene.sh} | options if name == "sh_degree" else options))
+        call(
+            replace(scene, **sizes),
+            **({"colors": scene.sh} | options if name == "sh_degree" else options),
+        )
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1.0, -1.0), (2.0, 2.0, 2.0), (0.0, 0.0, 0.0)])
 def test_poses_are_rigid(factors: tuple[float, float, float], scene: Scene) -> None:
     poses = scene.cam_from_world.clone()
     poses[1, :3, :3] @= torch.diag(torch.tensor(factors)).to(poses)
-    with pytest.raises(DyngsError, match=r"viewmats: the matrix of camera 1 (is mirrored|differs from a rotation)"):
+    with pytest.raises(
+        DyngsError, match=r"viewmats: the matrix of camera 1 (is mirrored|differs from a rotation)"
+    ):
         call(replace(scene, cam_from_world=poses))
 
 
@@ -367,7 +422,9 @@ def test_focal_lengths_are_positive(position: tuple[int, int], focal: float, sce
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds"])
+@pytest.mark.parametrize(
+    "name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds"]
+)
 def test_what_is_not_finite_is_named(name: str, bad: float, scene: Scene) -> None:
     fields = {"viewmats": "cam_from_world", "Ks": "intrinsics"}
     options = {"colors": scene.sh[:, 0].abs(), "backgrounds": scene.background}
@@ -379,7 +436,9 @@ def test_what_is_not_finite_is_named(name: str, bad: float, scene: Scene) -> Non
         call(replace(scene, **changed), **options)
 
 
-@pytest.mark.parametrize("backgrounds", [torch.zeros(3), torch.zeros(2, 2), torch.zeros(1, 3), torch.zeros(2, 4)])
+@pytest.mark.parametrize(
+    "backgrounds", [torch.zeros(3), torch.zeros(2, 2), torch.zeros(1, 3), torch.zeros(2, 4)]
+)
 def test_backgrounds_fit_cameras_and_channels(backgrounds: Tensor, scene: Scene) -> None:
     for mode in ("RGB", "RGB+D"):
         with pytest.raises(DyngsError, match=r"backgrounds must be \(2, 3\)"):
@@ -407,7 +466,11 @@ EXTREMES: dict[str, list[float]] = {
 
 @settings(max_examples=40, deadline=None)
 @example(  # gradients of NaN, from a focal length that is refused now
-    {"near_plane": 0.0, "far_plane": 5.0, "radius_clip": 0.0, "eps2d": 1e-45}, 1e-45, torch.float32, "classic", "RGB"
+    {"near_plane": 0.0, "far_plane": 5.0, "radius_clip": 0.0, "eps2d": 1e-45},
+    1e-45,
+    torch.float32,
+    "classic",
+    "RGB",
 )
 @given(
     st.fixed_dictionaries({name: st.sampled_from(values) for name, values in EXTREMES.items()}),
@@ -417,7 +480,11 @@ EXTREMES: dict[str, list[float]] = {
     st.sampled_from(["RGB", "RGB+ED", "D"]),
 )
 def test_extreme_numbers_give_finite_images_or_one_line(
-    limits: dict[str, float], focal: float, dtype: torch.dtype, rasterize_mode: str, render_mode: str
+    limits: dict[str, float],
+    focal: float,
+    dtype: torch.dtype,
+    rasterize_mode: str,
+    render_mode: str,
 ) -> None:
     scene = random_scene(n=8, views=1).to(dtype)
     intrinsics = scene.intrinsics.clone()
@@ -425,9 +492,14 @@ def test_extreme_numbers_give_finite_images_or_one_line(
     scene = replace(scene, intrinsics=intrinsics)
     leaves = scene.leaves()
     try:
-        image, alpha, _ = call(leaves, rasterize_mode=rasterize_mode, render_mode=render_mode, **limits)
+        image, alpha, _ = call(
+            leaves, rasterize_mode=rasterize_mode, render_mode=render_mode, **limits
+        )
     except DyngsError:
-        assert limits["far_plane"] <= limits["near_plane"] or not 1e-6 <= float(intrinsics[0, 0, 0]) <= 1e12
+        assert (
+            limits["far_plane"] <= limits["near_plane"]
+            or not 1e-6 <= float(intrinsics[0, 0, 0]) <= 1e12
+        )
         return
     assert bool(image.isfinite().all())
     assert 0 <= float(alpha.detach().min()) <= float(alpha.detach().max()) <= 1
@@ -437,14 +509,20 @@ def test_extreme_numbers_give_finite_images_or_one_line(
         assert grad is None or bool(grad.isfinite().all()), name
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "cam_from_world", "intrinsics"])
+@pytest.mark.parametrize(
+    "name", ["means", "quats", "scales", "opacities", "cam_from_world", "intrinsics"]
+)
 def test_wrong_shapes_and_dtypes_are_named(name: str, scene: Scene) -> None:
     shown = {"cam_from_world": "viewmats", "intrinsics": "Ks"}.get(name, name)
     x = getattr(scene, name)
-    with pytest.raises(DyngsError, match=rf"(?s)^rasterization: .*{'' if name == 'means' else shown}"):
+    with pytest.raises(
+        DyngsError, match=rf"(?s)^rasterization: .*{'' if name == 'means' else shown}"
+    ):
         call(replace(scene, **{name: x[..., None]}), colors=scene.sh[:, 0])
     if name != "means":
-        with pytest.raises(DyngsError, match=f"{shown} is torch.float32, but means is torch.float64"):
+        with pytest.raises(
+            DyngsError, match=f"{shown} is torch.float32, but means is torch.float64"
+        ):
             call(replace(scene, **{name: x.float()}))
 
 

@@ -28,7 +28,13 @@ def test_everything_that_is_promised_lies_there_and_the_command_prints_it(
     monkeypatch.setattr("dyngs.demo.run_demo", run_tiny)
     assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "30", "--threads", "1"]) == 0
     (result,) = done
-    for path in (result.run_dir, result.images, result.images / "sheet.png", result.video, result.ply):
+    for path in (
+        result.run_dir,
+        result.images,
+        result.images / "sheet.png",
+        result.video,
+        result.ply,
+    ):
         assert path.exists()
         assert (tmp_path / "demo") in path.parents
     assert json.loads((result.run_dir / "metrics.json").read_text())["psnr"] == result.report.psnr
@@ -67,10 +73,16 @@ def test_two_demos_at_once_take_two_folders(tmp_path: Path) -> None:
         assert folder == tmp_path / "demo"
 
 
-def test_the_demo_trains_the_packaged_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_trains_the_packaged_preset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs" / "static.yaml").write_text("train: {ssim_weight: 0.9}")
     config = demo_config(tmp_path / "a: b", tmp_path / "run", TINY)
     assert config.data.root == tmp_path / "a: b"
-    assert (config.run.dir, config.train.steps, config.train.ssim_weight) == (tmp_path / "run", 30, 0.2)
+    assert (config.run.dir, config.train.steps, config.train.ssim_weight) == (
+        tmp_path / "run",
+        30,
+        0.2,
+    )

@@ -1,8 +1,10 @@
-"""The commands and the Python examples of README.md and docs/*.md: none may name an option or a key that is not there.
+"""The commands and the Python examples of README.md and docs/*.md: none may name an option or a key
+that is not there.
 
-Every ``dyngs`` command in a block of shell goes through the real parser and the real configuration; those of the pages
-in ``RUN_PAGES`` are run, shortened, in a folder with a tiny capture. Commands within sentences and outlines of commands
-(blocks of text) are checked for the names of their options, and ``key=value`` for keys and values.
+Every ``dyngs`` command in a block of shell goes through the real parser and the real configuration;
+those of the pages in ``RUN_PAGES`` are run, shortened, in a folder with a tiny capture. Commands
+within sentences and outlines of commands (blocks of text) are checked for the names of their
+options, and ``key=value`` for keys and values.
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]*)`")
-SHELL, PYTHON, OUTLINE = ("bash", "sh"), ("python",), ("", "text")
+SHELL = ("bash", "sh")
+PYTHON = ("python",)
+OUTLINE = ("", "text")
 
 RUN_PAGES = (
     "README.md", "storage.md", "photos.md", "video.md", "person.md", "mask.md", "look.md", "longer.md", "smaller.md",
@@ -76,7 +80,10 @@ KINDS = (
     ("strategy.kind=mcmc",),
     ("init.kind=random",),
     ("init.kind=scene", "init.scene=x"),
-    *(("model.kind=dynamic", f"model.deform.kind={kind}") for kind in ("mlp", "hexplane", "control_nodes")),
+    *(
+        ("model.kind=dynamic", f"model.deform.kind={kind}")
+        for kind in ("mlp", "hexplane", "control_nodes")
+    ),
 )
 PRESETS = ("static", "dynamic", "human", "human_predictor", "ngp")
 PLACEHOLDER = re.compile(r"[A-Z]|\.\.\.|start:stop:step|value|X,Y")
@@ -99,13 +106,20 @@ class Command:
 
 def blocks(page: Path, languages: tuple[str, ...]) -> Iterator[str]:
     """Fenced blocks of a page in some languages."""
-    yield from (text for language, text in BLOCK.findall(page.read_text(encoding="utf-8")) if language in languages)
+    yield from (
+        text
+        for language, text in BLOCK.findall(page.read_text(encoding="utf-8"))
+        if language in languages
+    )
 
 
 def segments(block: str) -> Iterator[list[str]]:
-    """The simple commands of a block of shell, as words; comments are left out, variables stand for 1."""
+    """The simple commands of a block of shell, as words; comments are left out, variables stand for
+    1."""
     for line in re.sub(r"\\\n\s*", " ", block).splitlines():
-        lexer = shlex.shlex(re.sub(r"\$\w+|\$\{\w+\}", "1", line), posix=True, punctuation_chars=";&|()")
+        lexer = shlex.shlex(
+            re.sub(r"\$\w+|\$\{\w+\}", "1", line), posix=True, punctuation_chars=";&|()"
+        )
         lexer.whitespace_split = True
         words: list[str] = []
         for word in [*lexer, ";"]:
@@ -132,7 +146,11 @@ def commands() -> list[Command]:
     found = []
     for page in PAGES:
         for block in blocks(page, SHELL):
-            found += [Command(page.name, w) for words in segments(block) if (w := dyngs_words(words)) is not None]
+            found += [
+                Command(page.name, w)
+                for words in segments(block)
+                if (w := dyngs_words(words)) is not None
+            ]
     return found
 
 
@@ -163,7 +181,8 @@ def require_overrides(*overrides: str) -> None:
 
 
 def require_sound(command: Command, arguments: argparse.Namespace) -> None:
-    """Nothing, if what a parsed command names besides its options can be: keys, variations, times, presets."""
+    """Nothing, if what a parsed command names besides its options can be: keys, variations, times,
+    presets."""
     from dyngs.camera_paths.path import parse_times, path_file
     from dyngs.tradeoff.table import parse_goal, parse_requirements
     from dyngs.tradeoff.variants import parse_variations
@@ -171,7 +190,9 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     for word in command.words:
         if word.startswith(("configs/", "benchmarks/", "examples/")):
             assert (ROOT / word).is_file(), f"{command}: there is no {word}"
-        assert not Path(word.partition("=")[2] or word).is_absolute(), f"{command}: a path of one machine"
+        assert not Path(word.partition("=")[2] or word).is_absolute(), (
+            f"{command}: a path of one machine"
+        )
     overrides = [word for word in getattr(arguments, "overrides", []) if "=" in word]
     if command.verb == "train" and arguments.resume is None:
         parse_config(arguments.overrides, None, arguments.begun)
@@ -179,7 +200,9 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
         is_config = arguments.target.startswith("configs/")
         parse_variations(arguments.vary, trains=arguments.train or is_config)
         parse_requirements(arguments.require or "psnr>=1")
-        parse_goal(arguments.minimize or arguments.maximize or "psnr", smallest=bool(arguments.minimize))
+        parse_goal(
+            arguments.minimize or arguments.maximize or "psnr", smallest=bool(arguments.minimize)
+        )
         if is_config:
             load_config(Path(arguments.target), overrides)
     elif overrides:
@@ -203,7 +226,11 @@ def test_every_command_is_parsed_with_its_configuration(
 
 @pytest.mark.parametrize(
     "words",
-    ["eval runs/a --splt test", "train static data.root=x trian.steps=2", "prune r --out o prune.shrae=0.1"],
+    [
+        "eval runs/a --splt test",
+        "train static data.root=x trian.steps=2",
+        "prune r --out o prune.shrae=0.1",
+    ],
 )
 def test_a_misspelt_option_or_key_is_noticed(words: str, parsed: list[argparse.Namespace]) -> None:
     command = Command("nowhere.md", tuple(words.split()))
@@ -217,13 +244,23 @@ def test_a_misspelt_option_or_key_is_noticed(words: str, parsed: list[argparse.N
 def test_other_programs_are_known_and_their_options_there() -> None:
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     for page in PAGES:
-        for words in (w for block in blocks(page, SHELL) for w in segments(block) if dyngs_words(w) is None):
+        for words in (
+            w for block in blocks(page, SHELL) for w in segments(block) if dyngs_words(w) is None
+        ):
             program = Path(words[0]).name
-            reason = [why for name, why in OTHER_PROGRAMS.items() if program == name or name == program[:5]]
-            assert reason, f"{page.name}: {' '.join(words)} is neither checked nor in OTHER_PROGRAMS"
+            reason = [
+                why
+                for name, why in OTHER_PROGRAMS.items()
+                if program == name or name == program[:5]
+            ]
+            assert reason, (
+                f"{page.name}: {' '.join(words)} is neither checked nor in OTHER_PROGRAMS"
+            )
             for extra in re.findall(r"\[([\w,]+)\]", " ".join(words)) if program == "pip" else ():
                 for name in extra.split(","):
-                    assert re.search(rf"^{name} = \[", project, re.MULTILINE), f"{page.name}: no extra {name}"
+                    assert re.search(rf"^{name} = \[", project, re.MULTILINE), (
+                        f"{page.name}: no extra {name}"
+                    )
             if program == "python" and words[1].endswith(".py"):
                 source = (ROOT / words[1]).read_text(encoding="utf-8")
                 own = words[: words.index("--")] if "--" in words else words
@@ -231,7 +268,8 @@ def test_other_programs_are_known_and_their_options_there() -> None:
                     assert f'"{option}"' in source, f"{page.name}: {words[1]} has no {option}"
 
 
-# ------------------------------------------------------------------------------------------ in sentences and outlines
+# ------------------------------------------------------------------------------------------ in
+# sentences and outlines
 
 
 @cache
@@ -253,11 +291,15 @@ def mentions(page: Path) -> Iterator[str]:
     text = page.read_text(encoding="utf-8")
     yield from re.findall(r"`(dyngs [^`\n]*)`", BLOCK.sub("", text))
     for block in blocks(page, OUTLINE):
-        yield from (line.lstrip("$ ") for line in block.splitlines() if re.match(r"(\$ )?dyngs ", line))
+        yield from (
+            line.lstrip("$ ") for line in block.splitlines() if re.match(r"(\$ )?dyngs ", line)
+        )
 
 
 def test_commands_in_sentences_have_the_options_that_they_name() -> None:
-    verbs = next(a.choices for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    verbs = next(
+        a.choices for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction)
+    )
     assert verbs is not None
     for page, mention in ((x, mention) for x in PAGES for mention in mentions(x)):
         words = mention.split()
@@ -265,12 +307,18 @@ def test_commands_in_sentences_have_the_options_that_they_name() -> None:
             continue
         assert words[1] in verbs, f"{page.name}: `{mention}`: no such command"
         for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", mention):
-            assert option in options_of(*words[1:3]), f"{page.name}: `{mention}`: no option {option}"
+            assert option in options_of(*words[1:3]), (
+                f"{page.name}: `{mention}`: no option {option}"
+            )
 
 
 def test_keys_in_sentences_are_keys_of_the_configuration() -> None:
     keys = {key.name for key in config_keys()}
-    found = [(x.name, code) for x in PAGES for code in CODE.findall(BLOCK.sub("", x.read_text(encoding="utf-8")))]
+    found = [
+        (x.name, code)
+        for x in PAGES
+        for code in CODE.findall(BLOCK.sub("", x.read_text(encoding="utf-8")))
+    ]
     for page, code in found:
         words = [word for word in code.split() if re.fullmatch(r"[a-z]\w*(\.[a-z]\w*)+=\S+", word)]
         for word in words:
@@ -291,7 +339,9 @@ def test_files_and_places_that_a_page_names_are_there() -> None:
         for file, place in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
             target = page.parent / file if file else page
             assert target.exists(), f"{page.name}: there is no {file}"
-            assert not place or place in places_of(target), f"{page.name}: {file} has no section {place}"
+            assert not place or place in places_of(target), (
+                f"{page.name}: {file} has no section {place}"
+            )
 
 
 @cache
@@ -306,8 +356,11 @@ def places_of(page: Path) -> set[str]:
 
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with what pages begin from: a still capture and a run of a moving scene."""
-    write_still_capture(tmp_path / "PATH", StillOptions(size=16, num_train=4, num_test=2, samples=1))
+    """The current folder, with what pages begin from: a still capture and a run of a moving
+    scene."""
+    write_still_capture(
+        tmp_path / "PATH", StillOptions(size=16, num_train=4, num_test=2, samples=1)
+    )
     (tmp_path / "runs").mkdir()
     write_moving_run(tmp_path / "moving").rename(tmp_path / "runs" / "dance")
     monkeypatch.chdir(tmp_path)
@@ -316,9 +369,11 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def shortened(command: Command) -> list[str]:
     """The command with less to do."""
-    words, extra = list(command.words), SHORTER.get(command.verb, ())
+    words = list(command.words)
+    extra = SHORTER.get(command.verb, ())
     if "--resume" in words:
-        words, extra = [re.sub(r"^train\.steps=\d+", "train.steps=6", word) for word in words], ("run.threads=1",)
+        words = [re.sub(r"^train\.steps=\d+", "train.steps=6", word) for word in words]
+        extra = ("run.threads=1",)
     elif "--from" in words:
         extra = tuple(word for word in extra if not word.startswith("init."))
     elif words[2:3] in (["room"], ["human"]):
@@ -341,10 +396,14 @@ def test_the_commands_of_these_pages_run(page: str, capsys: pytest.CaptureFixtur
 
 @pytest.mark.usefixtures("one_thread", "workplace")
 @pytest.mark.parametrize(
-    ("page", "code"), [(page.name, code) for page in PAGES for code in blocks(page, PYTHON)], ids=lambda x: x[:20]
+    ("page", "code"),
+    [(page.name, code) for page in PAGES for code in blocks(page, PYTHON)],
+    ids=lambda x: x[:20],
 )
 def test_python_examples_run(page: str, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in set(re.findall(r"\bdyngs\.(\w+)\(", code)):
         assert hasattr(dyngs, name), f"{page}: there is no dyngs.{name}"
-    monkeypatch.setattr(dyngs, "load_config", lambda preset, keys: load_config(preset, [*keys, *SHORTER["train"]]))
+    monkeypatch.setattr(
+        dyngs, "load_config", lambda preset, keys: load_config(preset, [*keys, *SHORTER["train"]])
+    )
     exec(compile(code, page, "exec"), {})

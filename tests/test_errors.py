@@ -1,4 +1,5 @@
-"""The boundary of the readers: every error becomes one line that names the file, and the cause is kept."""
+"""The boundary of the readers: every error becomes one line that names the file, and the cause is
+kept."""
 
 from __future__ import annotations
 
@@ -15,7 +16,17 @@ import pytest
 
 import dyngs
 from dyngs.cli.arguments import print_notes
-from dyngs.errors import DyngsError, as_word, counted, printable, reading, reason, require_regular, show, warn
+from dyngs.errors import (
+    DyngsError,
+    as_word,
+    counted,
+    printable,
+    reading,
+    reason,
+    require_regular,
+    show,
+    warn,
+)
 from dyngs.files.fields import read_json_object
 from dyngs.files.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
@@ -78,7 +89,10 @@ def test_printable_keeps_letters_and_escapes_what_a_terminal_obeys() -> None:
 
 
 def test_no_message_can_steer_a_terminal() -> None:
-    assert str(DyngsError("a\x1b[31m.png: no\nsuch\u2028file \ud800")) == "a\\x1b[31m.png: no such file \\ud800"
+    assert (
+        str(DyngsError("a\x1b[31m.png: no\nsuch\u2028file \ud800"))
+        == "a\\x1b[31m.png: no such file \\ud800"
+    )
 
 
 @pytest.mark.parametrize("text", ["x" * 5000, "9" * 5000, "\x07" * 300, "prune=" + "1" * 5000])
@@ -88,7 +102,12 @@ def test_what_the_command_line_quotes_is_short(text: str) -> None:
     from dyngs.tradeoff.table import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
 
-    for parse in (parse_frames, parse_times, parse_requirements, lambda word: parse_variations([word], trains=True)):
+    for parse in (
+        parse_frames,
+        parse_times,
+        parse_requirements,
+        lambda word: parse_variations([word], trains=True),
+    ):
         with pytest.raises(DyngsError) as caught:
             parse(text)
         assert len(str(caught.value)) < 500
@@ -110,14 +129,23 @@ def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
 def test_pipes_in_captures_and_runs_stop_nobody(tmp_path: Path) -> None:
     for name in ("transforms.json", "timing.json"):
         os.mkfifo(tmp_path / name)
-    for read in (read_json_object, lambda path: read_tensors(path, FileKind("a", "a", 1), ""), read_scene):
+    for read in (
+        read_json_object,
+        lambda path: read_tensors(path, FileKind("a", "a", 1), ""),
+        read_scene,
+    ):
         with pytest.raises(DyngsError, match="is no file but a pipe"):
             read(tmp_path / "transforms.json")
     assert seconds_at(tmp_path, 1) == 0
 
 
 def test_what_is_counted() -> None:
-    assert [counted(n, "image") for n in (0, 1, 2, 1200)] == ["0 images", "1 image", "2 images", "1,200 images"]
+    assert [counted(n, "image") for n in (0, 1, 2, 1200)] == [
+        "0 images",
+        "1 image",
+        "2 images",
+        "1,200 images",
+    ]
 
 
 ODD_NAMES = (
@@ -137,7 +165,9 @@ ODD_NAMES = (
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash here")
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 @pytest.mark.parametrize("name", ODD_NAMES)
-def test_names_in_commands_can_be_copied(name: str, encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_in_commands_can_be_copied(
+    name: str, encoding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What shows on the terminal, also within an error, is the name again for a shell."""
     stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace")
     monkeypatch.setattr(sys, "stdout", stream)
@@ -147,7 +177,9 @@ def test_names_in_commands_can_be_copied(name: str, encoding: str, monkeypatch: 
     monkeypatch.undo()
     assert shown.isprintable()
     word = shown.removeprefix("run `").removesuffix("`")
-    copied = subprocess.run(["bash", "-c", f"printf %s {word}"], capture_output=True, check=True).stdout
+    copied = subprocess.run(
+        ["bash", "-c", f"printf %s {word}"], capture_output=True, check=True
+    ).stdout
     assert copied == os.fsencode(f"./{name}" if name.startswith("-") else name)
 
 
@@ -157,7 +189,11 @@ def test_names_can_be_copied_in_the_locale_c(tmp_path: Path) -> None:
     code = "import sys; from dyngs.errors import as_word; print('next: cd ' + as_word(sys.argv[1]))"
     locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(
-        [sys.executable, "-c", code, "läufer"], env=os.environ | locale, capture_output=True, check=True, text=True
+        [sys.executable, "-c", code, "läufer"],
+        env=os.environ | locale,
+        capture_output=True,
+        check=True,
+        text=True,
     )
     command = done.stdout.removeprefix("next: ").strip()
     assert command.isascii()
@@ -182,4 +218,6 @@ def test_warnings_of_the_package_are_escaped() -> None:
         for line in file.read_text(encoding="utf-8").splitlines()
         if re.search(r"dyngs: warning|= print\b|, print\)|lambda line: print", line)
     ]
-    assert found == ['errors.py: print(f"dyngs: warning: {printable(text)}", file=sys.stderr, flush=True)']
+    assert found == [
+        'errors.py: print(f"dyngs: warning: {printable(text)}", file=sys.stderr, flush=True)'
+    ]

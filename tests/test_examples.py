@@ -17,17 +17,29 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the capture and the run that the examples name."""
     here = tmp_path_factory.mktemp("examples")
-    write_still_capture(here / "lego", StillOptions(size=16, num_train=3, num_val=1, num_test=1, samples=1))
-    overrides = [f"data.root={here / 'lego'}", f"run.dir={here / 'runs/lego'}", "train.steps=2", "init.num_random=50"]
+    write_still_capture(
+        here / "lego", StillOptions(size=16, num_train=3, num_val=1, num_test=1, samples=1)
+    )
+    overrides = [
+        f"data.root={here / 'lego'}",
+        f"run.dir={here / 'runs/lego'}",
+        "train.steps=2",
+        "init.num_random=50",
+    ]
     dyngs.train(dyngs.load_config("static", overrides))
     return here
 
 
 @pytest.mark.parametrize("name", dyngs.__all__)
-def test_every_public_name_has_an_example_that_runs(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_public_name_has_an_example_that_runs(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = inspect.getdoc(getattr(dyngs, name)) or ""
     examples = re.findall(r"::\n\n((?:(?:    .*)?\n)+)", text + "\n")
     assert examples, f"dyngs.{name} has no example"
     monkeypatch.chdir(folder)
     for example in examples:
-        exec(compile(textwrap.dedent(example), f"example of dyngs.{name}", "exec"), {"__name__": name})
+        exec(
+            compile(textwrap.dedent(example), f"example of dyngs.{name}", "exec"),
+            {"__name__": name},
+        )

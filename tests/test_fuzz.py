@@ -19,9 +19,12 @@ from dyngs.data.read import FORMATS
 
 ROOT = Path(__file__).resolve().parents[1]
 INPUTS = max(10, settings.default.max_examples // 10)
-"""Changed inputs of a reader; a hundred with HYPOTHESIS_PROFILE=long. ``python -m fuzz`` tries more."""
+"""Changed inputs of a reader; a hundred with HYPOTHESIS_PROFILE=long. ``python -m fuzz`` tries
+more."""
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="its limits are those of Linux")
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/status").is_file(), reason="its limits are those of Linux"
+)
 
 
 FUZZ = """
@@ -52,11 +55,14 @@ class Fuzzed:
 
 @pytest.fixture(scope="module")
 def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Fuzzed:
-    """By one process, which imports everything and is forked: threads of these tests would not survive that."""
+    """By one process, which imports everything and is forked: threads of these tests would not
+    survive that."""
     report = tmp_path_factory.mktemp("fuzz") / "report.json"
     environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
     command = [sys.executable, "-c", FUZZ, str(report), str(INPUTS), HARM]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
     assert "the harm" in done.stdout, done.stderr
     replayed, _, harms = done.stdout.partition("the corpus")[2].partition("the harm")
     return Fuzzed(json.loads(report.read_text()), replayed, harms, done.returncode)
@@ -66,7 +72,9 @@ def test_changed_inputs_are_read_or_refused(fuzzed: Fuzzed) -> None:
     tried = fuzzed.tried
     assert {name: own["failures"] for name, own in tried.items() if own["failures"]} == {}
     # Few inputs cannot be made; none of these counts.
-    assert {name: own["inputs"] for name, own in tried.items() if own["inputs"] < 0.9 * INPUTS} == {}
+    assert {
+        name: own["inputs"] for name, own in tried.items() if own["inputs"] < 0.9 * INPUTS
+    } == {}
     # Of a log, lines that are not whole are left out: hardly any is refused.
     assert [name for name, own in tried.items() if not own["refused"]] in ([], ["logs"])
 
@@ -79,7 +87,11 @@ def test_every_capture_format_is_fuzzed(fuzzed: Fuzzed) -> None:
 
 def test_what_was_found_stays_mended(fuzzed: Fuzzed) -> None:
     """The corpus: one small input for each kind of failure that was ever seen."""
-    tried = [int(words[1]) for words in map(str.split, fuzzed.replayed.splitlines()) if words[2:3] == ["inputs"]]
+    tried = [
+        int(words[1])
+        for words in map(str.split, fuzzed.replayed.splitlines())
+        if words[2:3] == ["inputs"]
+    ]
     assert fuzzed.code == 0, fuzzed.replayed
     assert sum(tried) >= 70
 

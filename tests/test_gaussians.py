@@ -79,7 +79,12 @@ def test_to_moves_and_converts_every_tensor() -> None:
     gaussians = five()
     moved = gaussians.to(device="meta", dtype=torch.float32)
     assert {(x.device.type, x.dtype) for x in moved.tensors().values()} == {("meta", torch.float32)}
-    assert all(a is b for a, b in zip(gaussians.to().tensors().values(), gaussians.tensors().values(), strict=True))
+    assert all(
+        a is b
+        for a, b in zip(
+            gaussians.to().tensors().values(), gaussians.tensors().values(), strict=True
+        )
+    )
 
 
 def test_replace_leaves_the_rest() -> None:
@@ -103,7 +108,8 @@ def test_keep_is_the_mask(mask: list[bool]) -> None:
 def test_moments_of_new_rows_start_at_zero(rows: list[tuple[int, bool]]) -> None:
     source = torch.tensor([r for r, _ in rows], dtype=torch.long)
     is_new = torch.tensor([new for _, new in rows], dtype=torch.bool)
-    edit, x = TopologyEdit(source, is_new), torch.rand(5, 3) + 1
+    edit = TopologyEdit(source, is_new)
+    x = torch.rand(5, 3) + 1
     before = x.clone()
     assert torch.equal(edit.apply(x), x[source])
     assert torch.equal(edit.apply_moments(x), x[source] * (~is_new)[:, None])
@@ -122,6 +128,7 @@ def test_stored_sizes_beyond_float32_are_refused() -> None:
 
 def test_joined_parts_follow_each_other() -> None:
     whole = five()
-    first, rest = torch.tensor([0, 1]), torch.tensor([2, 3, 4])
+    first = torch.tensor([0, 1])
+    rest = torch.tensor([2, 3, 4])
     both = Gaussians.joined([whole.select(first), whole.select(rest)])
     assert all(torch.equal(x, both.tensors()[name]) for name, x in whole.tensors().items())

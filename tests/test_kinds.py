@@ -29,7 +29,12 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
+from dyngs.data.synthetic.captures import (
+    DynamicOptions,
+    StillOptions,
+    write_dynamic_capture,
+    write_still_capture,
+)
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
@@ -47,7 +52,9 @@ from dyngs.training.losses import SilhouetteLoss
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=5, num_test=1, samples=1, distance=4.0))
+    write_still_capture(
+        folder, StillOptions(size=16, num_train=5, num_test=1, samples=1, distance=4.0)
+    )
     return folder
 
 
@@ -55,8 +62,12 @@ def test_training_cameras_are_those_of_the_images(capture: Path) -> None:
     options = DataConfig(root=capture, downscale=2)
     views = read_capture(options).splits["train"]
     images = ImageLoader(views, options)
-    for camera, image in zip(training_cameras(views, options), (images[i] for i in range(5)), strict=True):
-        assert (camera.width, camera.height) == (image.cameras.width, image.cameras.height) == (8, 8)
+    for camera, image in zip(
+        training_cameras(views, options), (images[i] for i in range(5)), strict=True
+    ):
+        assert (
+            (camera.width, camera.height) == (image.cameras.width, image.cameras.height) == (8, 8)
+        )
         assert torch.equal(camera.intrinsics, image.cameras.intrinsics)
         assert torch.equal(camera.cam_from_world, image.cameras.cam_from_world)
 
@@ -71,13 +82,23 @@ def test_surroundings_of_a_blender_capture(capture: Path) -> None:
 def test_parts_follow_the_config(capture: Path) -> None:
     config = Config(
         data=DataConfig(root=capture),
-        model=StaticModel(rasterize_mode=RasterizeMode.ANTIALIASED, eps2d=0.1, near=0.5, sh_degree=2, alpha_min=0.01),
+        model=StaticModel(
+            rasterize_mode=RasterizeMode.ANTIALIASED,
+            eps2d=0.1,
+            near=0.5,
+            sh_degree=2,
+            alpha_min=0.01,
+        ),
         init=PointsInit(num_random=40),
         strategy=DefaultStrategy(absgrad=True),
     )
     trainer = assemble(config)
     assert isinstance(trainer.model.densifier, DefaultDensifier)
-    assert (trainer.model.options.mode, trainer.model.options.eps2d, trainer.model.options.near) == (
+    assert (
+        trainer.model.options.mode,
+        trainer.model.options.eps2d,
+        trainer.model.options.near,
+    ) == (
         RasterizeMode.ANTIALIASED,
         0.1,
         0.5,
@@ -103,7 +124,9 @@ def test_a_fixed_set_of_gaussians_stays(capture: Path) -> None:
     trainer = assemble(config)
     assert isinstance(trainer.model.densifier, Densifier)
     trainer.step()
-    assert len(trainer.model.scene.gaussians) == 30, "a limit on their number removes some later on, none are added"
+    assert len(trainer.model.scene.gaussians) == 30, (
+        "a limit on their number removes some later on, none are added"
+    )
 
 
 def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
@@ -116,7 +139,8 @@ def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
 
 
 def _with_times(capture: Path, out: Path, times: list[float] | None) -> Path:
-    """A copy of the capture whose training images have these times, and whose test images are taken at 0.5."""
+    """A copy of the capture whose training images have these times, and whose test images are taken
+    at 0.5."""
     shutil.copytree(capture, out)
     for split in ("train", "test"):
         file = out / f"transforms_{split}.json"
@@ -150,7 +174,9 @@ def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     assert isinstance(assemble(_dynamic(root, model=StaticModel())).model.scene, StaticScene)
 
 
-def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(capture: Path) -> None:
+def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(
+    capture: Path,
+) -> None:
     """That one prints a line when training begins, not when a run is resumed."""
     presets = {name: load_config(name, [f"data.root={capture}"]) for name in packaged_presets()}
     weights = {name: config.train.alpha_weight for name, config in presets.items()}
@@ -159,7 +185,9 @@ def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(ca
 
     few = [f"data.root={capture}", "init.kind=random", "init.num_random=30"]
 
-    def weight_and_findings(name: str, *keys: str, restored: bool = False) -> tuple[float, list[str]]:
+    def weight_and_findings(
+        name: str, *keys: str, restored: bool = False
+    ) -> tuple[float, list[str]]:
         trainer = assemble(load_config(name, [*few, *keys]), restored=restored)
         losses = [x for x in trainer.losses if isinstance(x, SilhouetteLoss)]
         return losses[0].weight, trainer.findings
@@ -205,7 +233,10 @@ def test_without_times_a_dynamic_config_is_a_static_one(
     """The same bytes after some steps, among them changes of the set."""
     root = _with_times(capture, tmp_path / "capture", times)
     results = []
-    for model in (DynamicModel(sh_degree=1, filter_3d=filter_3d), StaticModel(sh_degree=1, filter_3d=filter_3d)):
+    for model in (
+        DynamicModel(sh_degree=1, filter_3d=filter_3d),
+        StaticModel(sh_degree=1, filter_3d=filter_3d),
+    ):
         trainer = assemble(_dynamic(root, model=model))
         assert isinstance(trainer.model.scene, StaticScene)
         for _ in range(8):
@@ -217,7 +248,9 @@ def test_without_times_a_dynamic_config_is_a_static_one(
     assert all(torch.equal(x, results[1].tensors[name]) for name, x in results[0].tensors.items())
 
 
-def test_motion_is_looked_for_in_images_from_all_over_the_clip(capture: Path, tmp_path: Path) -> None:
+def test_motion_is_looked_for_in_images_from_all_over_the_clip(
+    capture: Path, tmp_path: Path
+) -> None:
     """Drawn as in training, on the background of the evaluation."""
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
@@ -244,10 +277,14 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     assert len(assemble(without).model.scene) == 7
 
 
-def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_points_are_triangulated_for_what_is_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And it goes on as if they had been."""
     options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_val=0, num_test=0, samples=1)
-    config = _dynamic(write_dynamic_capture("room", tmp_path / "room", options), init=PointsInit(num_random=7))
+    config = _dynamic(
+        write_dynamic_capture("room", tmp_path / "room", options), init=PointsInit(num_random=7)
+    )
     trainer = assemble(config)
     trainer.step()
 
@@ -288,7 +325,9 @@ def test_a_still_blender_scene_begins_in_its_silhouettes_or_anywhere(capture: Pa
 def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> None:
     """Until something moves, a dynamic run is a static one, byte by byte, on all views."""
     root = _with_times(capture, tmp_path / "timed", [0.0, 0.25, 0.5, 0.75, 1.0])
-    static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0)))
+    static, dynamic = (
+        assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0))
+    )
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss
     mine, others = (tensors_of(trainer.model.state()) for trainer in (static, dynamic))

@@ -1,4 +1,4 @@
-"""The habits of this repository, checked: sizes of files and functions, names, layers, what an import costs."""
+"""Rules that hold for the whole repository: safety, portability and the cost of an import."""
 
 from __future__ import annotations
 
@@ -16,39 +16,20 @@ import dyngs
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON_FILES = sorted((ROOT / "dyngs").rglob("*.py"))
-CPP_FILES = sorted(f for suffix in ("hpp", "cpp", "h", "inl", "cu") for f in (ROOT / "csrc").rglob(f"*.{suffix}"))
-TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
 
-MAX_FILE_LINES = 500
-MAX_FUNCTION_LINES = 60
-MAX_PARAMETERS = 8
 
-LONG_FUNCTIONS = {"rasterization": "34 arguments of gsplat's, each with its line of documentation"}
-"""Functions that may be longer, each with its reason."""
-
-MANY_PARAMETERS = {
-    "rasterization": "has the signature of gsplat 1.5, so that users can switch",
-    "adam_step_": "the tensors and constants of Adam's formula",
-}
-"""Functions that may take more parameters, each with its reason."""
-
-HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips", "matplotlib")
-WITHOUT_MIRROR = {
-    "test_devices.py": "about all that poses an avatar",
-    "test_examples.py": "about the public names",
-    "test_emulated_gpu.py": "about all ops at once, on another core",
-    "test_pretend_gpu.py": "about all that a trainer holds, on another device",
-    "test_docs.py": "about README.md and docs/*.md",
-    "test_fuzz.py": "about all readers, by the folder fuzz beside the tests",
-    "test_layout.py": "about the repository, not one module",
-    "test_quality.py": "about training as a whole, on small captures",
-    "test_reference.py": "about the reference that the kernels are tested against",
-    "test_numerics.py": "the table of docs/numerics.md",
-    "test_units.py": "about every kind of model, and all that leaves a run",
-}
-
-Function = ast.FunctionDef | ast.AsyncFunctionDef
-Found = list[tuple[str, str, Function]]
+HEAVY = (
+    "pycolmap",
+    "trimesh",
+    "kornia",
+    "OpenImageIO",
+    "skimage",
+    "av",
+    "rich",
+    "tensorboard",
+    "lpips",
+    "matplotlib",
+)
 
 
 def relative(path: Path) -> str:
@@ -67,81 +48,28 @@ def nodes(trees: dict[str, ast.Module]) -> dict[str, list[ast.AST]]:
     return {file: list(ast.walk(tree)) for file, tree in trees.items()}
 
 
-@pytest.fixture(scope="module")
-def functions(nodes: dict[str, list[ast.AST]]) -> Found:
-    """File, name and definition of every function."""
-    return [(file, node.name, node) for file, own in nodes.items() for node in own if isinstance(node, Function)]
-
-
-def num_lines(function: Function) -> int:
-    """Lines of a function without its docstring, in which an example must not cost any code."""
-    first = function.body[0]
-    told = (first.end_lineno or 0) - first.lineno + 1 if ast.get_docstring(function) is not None else 0
-    return (function.end_lineno or 0) - function.lineno + 1 - told
-
-
-def is_plumbing(file: str, name: str) -> bool:
-    """Kernels, fakes and autograd functions of a torch op: their signatures are the op's schema."""
-    return file.startswith("dyngs/ops/") and name.startswith("_")
-
-
-def parameters(function: Function) -> list[ast.arg]:
-    given = function.args
-    named = (*given.posonlyargs, *given.args, *given.kwonlyargs)
-    return [a for a in named if a.arg not in ("self", "cls")]
-
-
-def test_files_are_short() -> None:
-    lengths = {relative(f): len(f.read_text(encoding="utf-8").splitlines()) for f in (*PYTHON_FILES, *CPP_FILES)}
-    assert {name: n for name, n in lengths.items() if n > MAX_FILE_LINES} == {}
-
-
-def test_functions_are_short(functions: Found) -> None:
-    lengths = {f"{file}:{name}": num_lines(node) for file, name, node in functions}
-    assert {k: n for k, n in lengths.items() if n > MAX_FUNCTION_LINES and k.split(":")[1] not in LONG_FUNCTIONS} == {}
-
-
-def test_functions_take_few_parameters(functions: Found) -> None:
-    counts = {
-        f"{file}:{name}": len(parameters(node))
-        for file, name, node in functions
-        if name not in MANY_PARAMETERS and not is_plumbing(file, name)
-    }
-    assert {k: n for k, n in counts.items() if n > MAX_PARAMETERS} == {}
-
-
-def test_exceptions_to_the_rules_still_exist(functions: Found) -> None:
-    assert (LONG_FUNCTIONS.keys() | MANY_PARAMETERS.keys()) - {name for _, name, _ in functions} == set()
-
-
-def test_every_parameter_and_result_is_annotated(functions: Found) -> None:
-    bare = []
-    for file, name, node in functions:
-        given = [*parameters(node), *(a for a in (node.args.vararg, node.args.kwarg) if a is not None)]
-        if (node.returns is None or any(a.annotation is None for a in given)) and not is_plumbing(file, name):
-            bare.append(f"{file}:{name}")
-    assert bare == []
-
-
-def test_every_module_says_what_it_is(trees: dict[str, ast.Module]) -> None:
-    silent = [file for file, tree in trees.items() if not ast.get_docstring(tree)]
-    assert silent == []
-
-
-def test_no_drawer_for_odds_and_ends() -> None:
-    names = {"utils.py", "util.py", "helpers.py", "misc.py", "common.py"}
-    assert [relative(f) for f in (*PYTHON_FILES, *TEST_FILES) if f.name in names] == []
-
-
 def test_no_paths_of_one_machine() -> None:
     homes = "|".join(("work", "home", "root", "opt", "mnt", "Users"))
     pattern = re.compile(rf"[\"'(\s=](/({homes})/|[A-Z]:\\Users)")
     folders = [
-        f for f in ("dyngs", "csrc", "tests", "fuzz", "configs", "docs", "benchmarks", ".ci") if (ROOT / f).is_dir()
+        f
+        for f in ("dyngs", "csrc", "tests", "fuzz", "configs", "docs", "benchmarks", ".ci")
+        if (ROOT / f).is_dir()
     ]
-    files = [f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file() and f.stat().st_size < 2**20]
-    files += [ROOT / f for f in ("README.md", "pyproject.toml", "CMakeLists.txt") if (ROOT / f).is_file()]
-    found = [relative(f) for f in files if f != Path(__file__) and pattern.search(f.read_text("utf-8", "ignore"))]
+    files = [
+        f
+        for folder in folders
+        for f in (ROOT / folder).rglob("*")
+        if f.is_file() and f.stat().st_size < 2**20
+    ]
+    files += [
+        ROOT / f for f in ("README.md", "pyproject.toml", "CMakeLists.txt") if (ROOT / f).is_file()
+    ]
+    found = [
+        relative(f)
+        for f in files
+        if f != Path(__file__) and pattern.search(f.read_text("utf-8", "ignore"))
+    ]
     assert [name for name in found if "__pycache__" not in name] == []
 
 
@@ -157,7 +85,11 @@ def test_no_code_from_data(nodes: dict[str, list[ast.AST]]) -> None:
                 names = {(node.module or "").split(".")[0]}
             elif isinstance(node, ast.Call):
                 called = ast.unparse(node.func)
-                names = {"pickle"} if called in ("eval", "exec", "yaml.load", "torch.load", "os.system") else set()
+                names = (
+                    {"pickle"}
+                    if called in ("eval", "exec", "yaml.load", "torch.load", "os.system")
+                    else set()
+                )
                 if called == "torch.load" and "weights_only=True" in ast.unparse(node):
                     names = set()  # its unpickler calls nothing but what makes tensors
             else:
@@ -173,7 +105,19 @@ def test_only_ops_imports_the_native_core() -> None:
     assert [name for name in importers if not name.startswith("dyngs/ops/")] == []
 
 
-FACTORIES = {"zeros", "ones", "full", "empty", "tensor", "arange", "linspace", "logspace", "eye", "rand", "randn"} | {
+FACTORIES = {
+    "zeros",
+    "ones",
+    "full",
+    "empty",
+    "tensor",
+    "arange",
+    "linspace",
+    "logspace",
+    "eye",
+    "rand",
+    "randn",
+} | {
     "randint",
     "randperm",
     "tril_indices",
@@ -183,8 +127,8 @@ FACTORIES = {"zeros", "ones", "full", "empty", "tensor", "arange", "linspace", "
 
 
 def test_every_tensor_is_made_on_a_named_device(nodes: dict[str, list[ast.AST]]) -> None:
-    """A tensor made without ``device`` lies on the CPU, whatever it is to be used with. Say ``device="cpu"`` where it
-    belongs there."""
+    """A tensor made without ``device`` lies on the CPU, whatever it is to be used with. Say
+    ``device="cpu"`` where it belongs there."""
     found = []
     for file, own in nodes.items():
         for node in own:
@@ -199,15 +143,21 @@ def test_every_tensor_is_made_on_a_named_device(nodes: dict[str, list[ast.AST]])
 def test_what_other_systems_lack_is_not_relied_on(
     nodes: dict[str, list[ast.AST]], trees: dict[str, ast.Module]
 ) -> None:
-    """Windows: modules of POSIX are imported where they may be missing, names below a folder are written with slashes,
-    and only where /proc is a process forks; nothing makes symbolic links, for which a user needs rights there."""
+    """Windows: modules of POSIX are imported where they may be missing, names below a folder are
+    written with slashes, and only where /proc is a process forks; nothing makes symbolic links, for
+    which a user needs rights there."""
     found = []
     for file, tree in trees.items():
         imported = [y.name for x in tree.body if isinstance(x, ast.Import) for y in x.names]
-        found += [f"{file}: {name}" for name in ({"fcntl", "resource", "pwd", "grp", "termios"} & {*imported})]
+        found += [
+            f"{file}: {name}"
+            for name in ({"fcntl", "resource", "pwd", "grp", "termios"} & {*imported})
+        ]
         for node in (x for x in nodes[file] if isinstance(x, ast.Call)):
             call = ast.unparse(node)
-            if re.match(r"(os\.(fork|symlink)|multiprocessing\.)\b|.*\.(symlink_to|hardlink_to)\(", call):
+            if re.match(
+                r"(os\.(fork|symlink)|multiprocessing\.)\b|.*\.(symlink_to|hardlink_to)\(", call
+            ):
                 found += [f"{file}:{node.lineno}: {call}"] if (file, call) not in FORKS else []
             if re.match(r"str\(.*\brelative_to\(", call):
                 found.append(f"{file}:{node.lineno}: {call}: use as_posix()")
@@ -220,27 +170,36 @@ FORKS = {("dyngs/tradeoff/memory.py", "os.fork()")}
 
 def test_every_file_can_lie_on_every_system() -> None:
     """Names that differ by more than case, that Windows has no devices of, and no links."""
-    folders = ("dyngs", "configs", "docs", "csrc", "tests", "benchmarks", "examples", "fuzz", "packaging", ".github")
-    files = [x for folder in folders for x in (ROOT / folder).rglob("*") if "__pycache__" not in x.parts]
+    folders = (
+        "dyngs",
+        "configs",
+        "docs",
+        "csrc",
+        "tests",
+        "benchmarks",
+        "examples",
+        "fuzz",
+        "packaging",
+        ".github",
+    )
+    files = [
+        x for folder in folders for x in (ROOT / folder).rglob("*") if "__pycache__" not in x.parts
+    ]
     assert len(files) > 800
     assert len({relative(file).casefold() for file in files}) == len(files)
-    device = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)|.*[<>:\"|?*\\]|.*[. ]$", re.IGNORECASE)
+    device = re.compile(
+        r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)|.*[<>:\"|?*\\]|.*[. ]$", re.IGNORECASE
+    )
     assert [relative(file) for file in files if device.match(file.name) or file.is_symlink()] == []
-
-
-def test_every_test_file_mirrors_a_source_file() -> None:
-    for path in TEST_FILES:
-        below = path.relative_to(ROOT / "tests")
-        source = ROOT / "dyngs" / below.parent / path.stem.removeprefix("test_")
-        found = [file for file in (source.with_suffix(".py"), source / "__init__.py") if file.is_file()]
-        assert found or path.name in WITHOUT_MIRROR, f"no {relative(source)}.py beside {below}"
 
 
 def run_python(code: str) -> str:
     """What ``code`` prints in a process of its own, with the dyngs that these tests import."""
     environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=environment, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -277,24 +236,40 @@ def test_import_is_cheap_and_leaves_heavy_packages_alone() -> None:
     pytest.fail(f"dyngs takes {seconds} s to import")
 
 
-FOR_FEW_SCENES = ("scipy", "skimage", "trimesh", "av", "pycolmap", "kornia", "sympy", "torch._dynamo")
+FOR_FEW_SCENES = (
+    "scipy",
+    "skimage",
+    "trimesh",
+    "av",
+    "pycolmap",
+    "kornia",
+    "sympy",
+    "torch._dynamo",
+)
 
 
 def test_the_conda_recipe_needs_what_pip_does() -> None:
     """Versions, too; two packages have other names on conda-forge."""
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     recipe = yaml.safe_load((ROOT / "packaging" / "recipe.yaml").read_text(encoding="utf-8"))
-    wanted = re.findall(r'^  "([\w-]+)([^"]*)",', project.split("dependencies = [")[1].split("\n]")[0], re.MULTILINE)
+    wanted = re.findall(
+        r'^  "([\w-]+)([^"]*)",', project.split("dependencies = [")[1].split("\n]")[0], re.MULTILINE
+    )
     names = {"torch": "pytorch", "OpenImageIO": "py-openimageio"}
-    assert recipe["requirements"]["run"][1:] == [f"{names.get(name, name)} {versions}" for name, versions in wanted]
+    assert recipe["requirements"]["run"][1:] == [
+        f"{names.get(name, name)} {versions}" for name, versions in wanted
+    ]
     assert f'version = "{recipe["context"]["version"]}"' in project
 
 
 def test_newer_versions_of_torch_are_allowed() -> None:
-    """Pip must not downgrade the torch of an environment; constraints.txt names the version of the tests."""
+    """Pip must not downgrade the torch of an environment; constraints.txt names the version of the
+    tests."""
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     allowed = re.search(r'"torch([^"]*)"', project)
-    pinned = re.search(r"^torch==([\d.]+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    pinned = re.search(
+        r"^torch==([\d.]+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert allowed is not None
     assert "<" not in allowed[1]
     assert pinned is not None

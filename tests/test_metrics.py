@@ -34,8 +34,11 @@ def test_psnr_known_answers() -> None:
 
 def test_psnr_is_that_of_skimage() -> None:
     skimage = pytest.importorskip("skimage.metrics")
-    a, b = image(), noisy(image(), 0.1)
-    assert psnr(b, a) == pytest.approx(skimage.peak_signal_noise_ratio(a.numpy(), b.numpy(), data_range=1), abs=1e-5)
+    a = image()
+    b = noisy(image(), 0.1)
+    assert psnr(b, a) == pytest.approx(
+        skimage.peak_signal_noise_ratio(a.numpy(), b.numpy(), data_range=1), abs=1e-5
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -48,57 +51,83 @@ def test_masks_ignore_and_weight(height, width, seed) -> None:
     spoiled = torch.where(mask[..., None] == 1, rendered, torch.rand(()))
     for metric in (psnr, ssim):
         assert metric(spoiled, truth, mask) == metric(rendered, truth, mask)
-        whole = metric(rendered, truth)  # means in float64 of 256 numbers; that of SSIM may be near 0
-        assert metric(rendered, truth, torch.ones(height, width)) == pytest.approx(whole, rel=1e-12, abs=1e-12)
+        # means in float64 of 256 numbers; that of SSIM may be near 0
+        whole = metric(rendered, truth)
+        assert metric(rendered, truth, torch.ones(height, width)) == pytest.approx(
+            whole, rel=1e-12, abs=1e-12
+        )
         assert math.isnan(metric(rendered, truth, torch.zeros(height, width)))
     kept = (rendered - truth).double().square().mean(-1)[mask == 1].mean().item()
-    assert psnr(rendered, truth, mask) == pytest.approx(min(-10 * math.log10(max(kept, 1e-10)), MAX_PSNR), rel=1e-6)
+    assert psnr(rendered, truth, mask) == pytest.approx(
+        min(-10 * math.log10(max(kept, 1e-10)), MAX_PSNR), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 1e-3, 0.05, 1.0])
 def test_ssim_of_white_images_keeps_its_digits(amplitude: float) -> None:
-    """White is where the variance of float32 squares cancels: a map off by up to 6e-4, by way of E[x^2] - E[x]^2."""
+    """White is where the variance of float32 squares cancels: a map off by up to 6e-4, by way of
+    E[x^2] - E[x]^2."""
     white = torch.ones(40, 40, 3)
     rendered = white - amplitude * image(40, 40)
-    found, wanted = ssim_map(rendered, white), ssim_map(rendered.double(), white.double())
-    # The sum less 1, at most 1 in square, is rounded some 16 times before half its variance is left, beside C2 = 9e-4.
+    found = ssim_map(rendered, white)
+    wanted = ssim_map(rendered.double(), white.double())
+    # The sum less 1, at most 1 in square, is rounded some 16 times before half its variance is
+    # left, beside C2 = 9e-4.
     allowed = 16 * torch.finfo(torch.float32).eps / 2 / (2 * 9e-4) * (1 - wanted) + 1e-6
     assert bool(((found - wanted).abs() <= allowed).all())
     assert amplitude > 0 or ssim(rendered, white) == 1
 
 
 def test_extreme_images_have_a_metric() -> None:
-    """Metrics are those of the image as displayed: clamped, so that one pixel of 1e30 is one of 1."""
+    """Metrics are those of the image as displayed: clamped, so that one pixel of 1e30 is one of
+    1."""
     truth = image()
     rendered = truth.clone()
     rendered[3, 4] = 1e30
     clipped = truth.clone()
     clipped[3, 4] = 1.0
-    rendered[5, 6], clipped[5, 6] = -math.inf, 0.0
+    rendered[5, 6] = -math.inf
+    clipped[5, 6] = 0.0
     for metric in (psnr, ssim):
         assert metric(rendered, truth) == metric(clipped, truth)
 
 
 def test_ssim_is_that_of_skimage_inside() -> None:
     skimage = pytest.importorskip("skimage.metrics")
-    a, b = image(40, 50), noisy(image(40, 50), 0.15)
-    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
-    a64, b64 = a.numpy().astype(np.float64), b.numpy().astype(np.float64)
+    a = image(40, 50)
+    b = noisy(image(40, 50), 0.15)
+    options = {
+        "gaussian_weights": True,
+        "sigma": 1.5,
+        "use_sample_covariance": False,
+        "data_range": 1.0,
+    }
+    a64 = a.numpy().astype(np.float64)
+    b64 = b.numpy().astype(np.float64)
     _, wanted = skimage.structural_similarity(a64, b64, channel_axis=2, full=True, **options)
-    # Borders differ: skimage mirrors them, 3DGS pads with zeros. Inside, float32 sums of 121 products.
+    # Borders differ: skimage mirrors them, 3DGS pads with zeros. Inside, float32 sums of 121
+    # products.
     inside = (slice(5, -5), slice(5, -5))
     np.testing.assert_allclose(ssim_map(b, a).numpy()[inside], wanted[inside], atol=2e-5)
 
 
 def test_ssim_pads_with_zeros() -> None:
     """At a corner, a constant image's blurred value is the part of the window that lies inside."""
-    a, b = torch.full((9, 9, 3), 0.8), torch.full((9, 9, 3), 0.4)
+    a = torch.full((9, 9, 3), 0.8)
+    b = torch.full((9, 9, 3), 0.4)
     window = np.exp(-((np.arange(11) - 5) ** 2) / 4.5)
     inside = (window[5:].sum() / window.sum()) ** 2
-    mean_a, mean_b = 0.8 * inside, 0.4 * inside
-    var_a, var_b, both = 0.64 * inside - mean_a**2, 0.16 * inside - mean_b**2, 0.32 * inside - mean_a * mean_b
+    mean_a = 0.8 * inside
+    mean_b = 0.4 * inside
+    var_a = 0.64 * inside - mean_a**2
+    var_b = 0.16 * inside - mean_b**2
+    both = 0.32 * inside - mean_a * mean_b
     c1, c2 = 1e-4, 9e-4
-    wanted = (2 * mean_a * mean_b + c1) * (2 * both + c2) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+    wanted = (
+        (2 * mean_a * mean_b + c1)
+        * (2 * both + c2)
+        / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+    )
     np.testing.assert_allclose(ssim_map(a, b)[0, 0].numpy(), wanted, rtol=1e-5)
 
 
@@ -113,7 +142,8 @@ def test_flip() -> None:
     pytest.importorskip("flip_evaluator")
     a = image()
     assert flip(a, a).value == 0.0
-    small, large = flip(noisy(a, 0.05), a).value, flip(noisy(a, 0.3), a).value
+    small = flip(noisy(a, 0.05), a).value
+    large = flip(noisy(a, 0.3), a).value
     assert small is not None
     assert large is not None
     assert 0 < small < large < 1
@@ -127,7 +157,8 @@ def test_flip() -> None:
 
 def test_flip_is_the_packages_own_default() -> None:
     package = pytest.importorskip("flip_evaluator")
-    a, b = image(), noisy(image(), 0.1)
+    a = image()
+    b = noisy(image(), 0.1)
     _, mean, _ = package.evaluate(a.numpy(), b.numpy(), "LDR", applyMagma=False, parameters={})
     assert flip(b, a).value == pytest.approx(mean, rel=1e-5)
 
@@ -160,7 +191,8 @@ def test_lpips_never_downloads(monkeypatch, tmp_path) -> None:
 
 def test_lpips_scales_and_masks_its_input() -> None:
     lpips = Lpips("alex", None, lambda a, b: (a - b).abs().max())
-    black, white = torch.zeros(4, 6, 3), torch.ones(4, 6, 3)
+    black = torch.zeros(4, 6, 3)
+    white = torch.ones(4, 6, 3)
     assert lpips(black, white).value == 2.0  # [0, 1] becomes [-1, 1]
     assert lpips(black, white, torch.zeros(4, 6)).value == 0.0
 
@@ -169,4 +201,6 @@ def test_lpips_of_tiny_images_has_a_reason() -> None:
     def too_small(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("output size is too small")
 
-    assert "4x6 are too small" in str(Lpips("vgg", None, too_small)(torch.zeros(6, 4, 3), torch.zeros(6, 4, 3)).reason)
+    assert "4x6 are too small" in str(
+        Lpips("vgg", None, too_small)(torch.zeros(6, 4, 3), torch.zeros(6, 4, 3)).reason
+    )

@@ -1,7 +1,7 @@
 """Numbers at the extremes: one test per row of the table in docs/numerics.md.
 
-Each compares float32 with float64 on the same numbers, or with the analytic answer, or asserts the exact error; and in
-each every gradient is finite.
+Each compares float32 with float64 on the same numbers, or with the analytic answer, or asserts the
+exact error; and in each every gradient is finite.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ def some_gaussians(n: int = 6, z: float = 3.0, **changes: Tensor | float) -> Gau
     means = 0.5 * scene.means + torch.tensor([0.0, 0.0, z])
     gaussians = replace(scene, means=means, opacities=0.5 + 0.4 * scene.opacities).gaussians
     fields = gaussians.tensors()
-    given = {k: v if isinstance(v, Tensor) else torch.full_like(fields[k], v) for k, v in changes.items()}
+    given = {
+        k: v if isinstance(v, Tensor) else torch.full_like(fields[k], v) for k, v in changes.items()
+    }
     return gaussians.replace(**given)
 
 
@@ -66,7 +68,9 @@ def drawn_with_gradients(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions, dtype: torch.dtype
 ) -> tuple[Rendering, dict[str, Tensor]]:
     """An image, and the gradients of a weighted sum of its colours and alphas."""
-    leaves = Gaussians(**{k: x.detach().to(dtype).requires_grad_() for k, x in gaussians.tensors().items()})
+    leaves = Gaussians(
+        **{k: x.detach().to(dtype).requires_grad_() for k, x in gaussians.tensors().items()}
+    )
     image = render(leaves, cameras.to(dtype=dtype), options, background=BACKGROUND)
     total = (image.rgb * weights(image.rgb)).sum() + (image.alpha * weights(image.alpha)).sum()
     found = torch.autograd.grad(total, list(leaves.tensors().values()))
@@ -83,9 +87,10 @@ def check_against_float64(
 ) -> Rendering:
     """The float32 image, after comparing it and its gradients with float64 of the same numbers.
 
-    Tolerances are those without thresholds: colours absolutely (rounding of 6e-8 times up to a hundred operations),
-    gradients relative to the largest of their kind (terms of both signs cancel) or to 0.01 (the pixels' own gradients
-    are of size 1: less is noise). With thresholds a pixel within rounding of one may differ by 1/255.
+    Tolerances are those without thresholds: colours absolutely (rounding of 6e-8 times up to a
+    hundred operations), gradients relative to the largest of their kind (terms of both signs
+    cancel) or to 0.01 (the pixels' own gradients are of size 1: less is noise). With thresholds a
+    pixel within rounding of one may differ by 1/255.
     """
     unlimited = replace(options, alpha_min=0.0, transmittance_min=0.0)
     image, slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float32)
@@ -103,20 +108,29 @@ def check_against_float64(
     return image
 
 
-def gradients_vanish(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = USUAL) -> bool:
+def gradients_vanish(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = USUAL
+) -> bool:
     """Nothing is drawn, and every gradient is exactly zero."""
     image, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
-    return torch.equal(image.rgb, BACKGROUND.expand_as(image.rgb)) and not any(x.any() for x in slopes.values())
+    return torch.equal(image.rgb, BACKGROUND.expand_as(image.rgb)) and not any(
+        x.any() for x in slopes.values()
+    )
 
 
-# --- scales -----------------------------------------------------------------------------------------------------------
+# --- scales
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_scale_1e_minus_12_is_a_dot_of_the_low_pass() -> None:
     """Alpha is o exp(-d^2 / (2 eps2d)), whatever the rotation."""
-    gaussians = some_gaussians(n=1, means=torch.tensor([[0.0, 0.0, 3.0]]), log_scales=math.log(1e-12))
+    gaussians = some_gaussians(
+        n=1, means=torch.tensor([[0.0, 0.0, 3.0]]), log_scales=math.log(1e-12)
+    )
     image = check_against_float64(gaussians, camera(), options=NO_THRESHOLDS)
-    x, y = torch.meshgrid(torch.arange(37) + 0.5 - 18.5, torch.arange(29) + 0.5 - 14.5, indexing="xy")
+    x, y = torch.meshgrid(
+        torch.arange(37) + 0.5 - 18.5, torch.arange(29) + 0.5 - 14.5, indexing="xy"
+    )
     expected = gaussians.opacities * (-(x * x + y * y) / 0.6).exp()
     torch.testing.assert_close(image.alpha[0], expected, rtol=0, atol=1e-6)
     check_against_float64(some_gaussians(log_scales=math.log(1e-12)), camera())
@@ -134,9 +148,12 @@ def test_scale_1e12_is_a_uniform_veil() -> None:
     check_against_float64(some_gaussians(log_scales=math.log(1e3)), camera(), options=ANTIALIASED)
 
 
-@pytest.mark.parametrize(("log_scale", "drawn"), [(-1e4, True), (40.0, True), (43.0, False), (88.7, False)])
+@pytest.mark.parametrize(
+    ("log_scale", "drawn"), [(-1e4, True), (40.0, True), (43.0, False), (88.7, False)]
+)
 def test_scales_that_underflow_or_overflow_their_squares(log_scale: float, drawn: bool) -> None:
-    """exp(-1e4) is 0: a dot. exp(43) units are 5e19 px here; the square of 1.8e19 is the last that float32 holds."""
+    """exp(-1e4) is 0: a dot. exp(43) units are 5e19 px here; the square of 1.8e19 is the last that
+    float32 holds."""
     gaussians = some_gaussians(log_scales=log_scale)
     image, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
     assert image.rgb.isfinite().all()
@@ -146,7 +163,9 @@ def test_scales_that_underflow_or_overflow_their_squares(log_scale: float, drawn
 
 def test_scales_beyond_float32_are_an_error_or_skipped() -> None:
     gaussians = some_gaussians(log_scales=89.0)
-    with pytest.raises(DyngsError, match=r"exp\(log_scales\) holds 18 NaN or infinite value\(s\) in 6 of 6 rows"):
+    with pytest.raises(
+        DyngsError, match=r"exp\(log_scales\) holds 18 NaN or infinite value\(s\) in 6 of 6 rows"
+    ):
         render(gaussians, camera())
     assert gradients_vanish(gaussians, camera(), RenderOptions(nonfinite="skip"))
 
@@ -157,12 +176,14 @@ def test_needles_of_1e8_to_1(axis: int, mode: RasterizeMode) -> None:
     """1000 units long, 1e-5 thick, in six random directions."""
     log_scales = torch.full((6, 3), math.log(1e-5))
     log_scales[:, axis] = math.log(1e3)
-    needles, options = some_gaussians(log_scales=log_scales), RenderOptions(mode=mode)
+    needles = some_gaussians(log_scales=log_scales)
+    options = RenderOptions(mode=mode)
     check_against_float64(needles, camera(), options=options, gradient_tolerance=1e-3)
 
 
 def test_needle_keeps_its_width() -> None:
-    """A diagonal needle: alpha o exp(-d^2 / (2 eps2d)) with d the distance from the line, to 1e-5 (d has 7 digits)."""
+    """A diagonal needle: alpha o exp(-d^2 / (2 eps2d)) with d the distance from the line, to 1e-5
+    (d has 7 digits)."""
     angle = 0.7
     gaussians = one_gaussian((0.0, 0.0, 3.0), 1.0)
     gaussians = gaussians.replace(
@@ -170,16 +191,22 @@ def test_needle_keeps_its_width() -> None:
         log_scales=torch.tensor([[1e4, 1e-4, 1e-4]]).log(),
     )
     alpha = render(gaussians, camera(), NO_THRESHOLDS).alpha[0]
-    x, y = torch.meshgrid(torch.arange(37) + 0.5 - 18.5, torch.arange(29) + 0.5 - 14.5, indexing="xy")
+    x, y = torch.meshgrid(
+        torch.arange(37) + 0.5 - 18.5, torch.arange(29) + 0.5 - 14.5, indexing="xy"
+    )
     distance = x.double() * math.sin(angle) - y.double() * math.cos(angle)
-    torch.testing.assert_close(alpha.double(), 0.5 * (-(distance**2) / (0.6 + 2e-6)).exp(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        alpha.double(), 0.5 * (-(distance**2) / (0.6 + 2e-6)).exp(), rtol=0, atol=1e-5
+    )
 
 
-# --- quaternions ------------------------------------------------------------------------------------------------------
+# --- quaternions
+# ------------------------------------------------------------------------------------------------------
 
 
 def test_zero_quaternion_is_the_identity() -> None:
-    zero, identity = some_gaussians(quats=0.0), some_gaussians(quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1))
+    zero = some_gaussians(quats=0.0)
+    identity = some_gaussians(quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1))
     assert torch.equal(render(zero, camera()).rgb, render(identity, camera()).rgb)
     check_against_float64(zero, camera())
     _, slopes = drawn_with_gradients(zero, camera(), USUAL, torch.float32)
@@ -189,41 +216,60 @@ def test_zero_quaternion_is_the_identity() -> None:
 
 @pytest.mark.parametrize("size", [1e-3, 1e3, 1e30, 1e-30])
 def test_unnormalised_quaternions(size: float) -> None:
-    """Same image; the gradient is divided by the size, but by no less than 1e-12 for the largest entry."""
-    unit, long = some_gaussians(), some_gaussians(quats=some_gaussians().quats * size)
+    """Same image; the gradient is divided by the size, but by no less than 1e-12 for the largest
+    entry."""
+    unit = some_gaussians()
+    long = some_gaussians(quats=some_gaussians().quats * size)
     image = check_against_float64(long, camera())
-    torch.testing.assert_close(image.rgb, render(unit, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
-    slopes, unit_slopes = (drawn_with_gradients(g, camera(), NO_THRESHOLDS, torch.float32)[1] for g in (long, unit))
-    divisor = (unit.quats.abs().amax(1, keepdim=True) * size).clamp_min(1e-12) / unit.quats.abs().amax(1, keepdim=True)
+    torch.testing.assert_close(
+        image.rgb, render(unit, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5
+    )
+    slopes, unit_slopes = (
+        drawn_with_gradients(g, camera(), NO_THRESHOLDS, torch.float32)[1] for g in (long, unit)
+    )
+    divisor = (unit.quats.abs().amax(1, keepdim=True) * size).clamp_min(
+        1e-12
+    ) / unit.quats.abs().amax(1, keepdim=True)
     assert relative_error(slopes["quats"] * divisor, unit_slopes["quats"]) < 1e-4
 
 
 def test_denormal_quaternions() -> None:
-    """The direction of a denormal has few digits, but it is a direction: same image as that direction normalised.
-    Below 1e-12 the gradient no longer grows as 1 / |q|."""
+    """The direction of a denormal has few digits, but it is a direction: same image as that
+    direction normalised. Below 1e-12 the gradient no longer grows as 1 / |q|."""
     units = torch.tensor(
-        [[1.0, 0, 0, 0], [1.0, 1, 0, 0], [0.5, 0.5, -0.5, 0.5], [0, 0, 1, 1], [1, 0, -1, 0], [1, 1, 1, 1]]
+        [
+            [1.0, 0, 0, 0],
+            [1.0, 1, 0, 0],
+            [0.5, 0.5, -0.5, 0.5],
+            [0, 0, 1, 1],
+            [1, 0, -1, 0],
+            [1, 1, 1, 1],
+        ]
     )
     tiny = some_gaussians(quats=units * 2.0**-140)
     assert 0 < tiny.quats.abs().max() < torch.finfo(torch.float32).tiny
     (image, slopes), (truth, true_slopes) = (
-        drawn_with_gradients(g, camera(), NO_THRESHOLDS, torch.float32) for g in (tiny, some_gaussians(quats=units))
+        drawn_with_gradients(g, camera(), NO_THRESHOLDS, torch.float32)
+        for g in (tiny, some_gaussians(quats=units))
     )
     torch.testing.assert_close(image.rgb, truth.rgb, rtol=0, atol=1e-6)
     capped = true_slopes["quats"] * units.abs().amax(1, keepdim=True) * 1e12
     assert relative_error(slopes["quats"], capped) < 1e-4
 
 
-# --- opacities --------------------------------------------------------------------------------------------------------
+# --- opacities
+# --------------------------------------------------------------------------------------------------------
 
 
 def blended_with(opacities: list[float], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """Alpha of a ball, and the gradients of opacity and position, through the ops that take opacities."""
+    """Alpha of a ball, and the gradients of opacity and position, through the ops that take
+    opacities."""
     n = len(opacities)
     cameras = camera().to(dtype=dtype)
     opacity = torch.tensor(opacities, dtype=dtype, requires_grad=True)
     means = torch.tensor([[0.0, 0, 3]], dtype=dtype).repeat(n, 1).requires_grad_()
-    quats, scales = torch.ones(n, 4, dtype=dtype), torch.full((n, 3), 0.2, dtype=dtype)
+    quats = torch.ones(n, 4, dtype=dtype)
+    scales = torch.full((n, 3), 0.2, dtype=dtype)
     projection = project(means, quats, scales, opacity, cameras)
     blended = rasterize(projection, opacity[None], torch.ones(1, n, 1, dtype=dtype), (37, 29))
     slopes = torch.autograd.grad((blended.color * weights(blended.color)).sum(), [opacity, means])
@@ -247,7 +293,8 @@ def test_opacity_1_is_clamped_and_the_clamp_stops_the_gradient() -> None:
     truth, true_slope, true_mean = blended_with([1.0], torch.float64)
     assert float(alpha.detach().max()) == pytest.approx(0.99)
     assert (alpha - truth).abs().max() < 1e-6 + 1.1 / 255
-    assert opacity_slope.item() == pytest.approx(true_slope.item(), rel=0.01)  # a pixel at the edge may be missing
+    # a pixel at the edge may be missing
+    assert opacity_slope.item() == pytest.approx(true_slope.item(), rel=0.01)
     assert relative_error(mean_slope, true_mean) < 0.01
 
 
@@ -264,12 +311,20 @@ def test_logits_of_plus_and_minus_100(logit: float) -> None:
     assert slopes["means"].any()
 
 
-# --- positions --------------------------------------------------------------------------------------------------------
+# --- positions
+# --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "mean",
-    [(0.0, 0.0, 0.0), (0.0, 0.0, 0.2), (0.3, 0.1, 0.2), (0.0, 0.0, -3.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1e10)],
+    [
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.2),
+        (0.3, 0.1, 0.2),
+        (0.0, 0.0, -3.0),
+        (1.0, 1.0, 0.0),
+        (0.0, 0.0, 1e10),
+    ],
     ids=[
         "camera centre",
         "on the near plane",
@@ -280,7 +335,9 @@ def test_logits_of_plus_and_minus_100(logit: float) -> None:
     ],
 )
 @pytest.mark.parametrize("scale", [0.01, 10.0, 1e6])
-def test_centres_outside_the_planes_are_culled(mean: tuple[float, float, float], scale: float) -> None:
+def test_centres_outside_the_planes_are_culled(
+    mean: tuple[float, float, float], scale: float
+) -> None:
     assert gradients_vanish(one_gaussian(mean, scale), camera())
 
 
@@ -295,12 +352,15 @@ def test_distance_of_1e7_units() -> None:
     near = one_gaussian((0.2, -0.1, 3.0), 0.2)
     far = one_gaussian((0.2e7, -0.1e7, 3e7), 0.2e7)
     image = check_against_float64(far, camera(), options=replace(USUAL, depth="expected"))
-    torch.testing.assert_close(image.rgb, render(near, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        image.rgb, render(near, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5
+    )
     check_against_float64(one_gaussian((1.0, 2.0, 1e7), 0.1), camera())
     assert gradients_vanish(one_gaussian((1e7, 0.0, 3.0), 0.1), camera())
 
 
-# --- a world origin far from the scene --------------------------------------------------------------------------------
+# --- a world origin far from the scene
+# --------------------------------------------------------------------------------
 
 GEOREFERENCED = np.array([4_500_123.25, -1_234_567.5, 812.0])
 
@@ -330,8 +390,10 @@ def image_of(capture: Capture) -> Tensor:
 
 
 def test_world_origin_far_away_is_rebased_on_load() -> None:
-    """Subtracted in float64 the offset costs 1e-9 units; kept, float32 cannot even resolve 0.25 units there."""
-    near, far = capture_at(np.zeros(3)), capture_at(GEOREFERENCED)
+    """Subtracted in float64 the offset costs 1e-9 units; kept, float32 cannot even resolve 0.25
+    units there."""
+    near = capture_at(np.zeros(3))
+    far = capture_at(GEOREFERENCED)
     rebased = normalise_capture(far)
     rebased = change_coordinates(rebased, 1.0, rebased.world_offset)
     truth = image_of(near)
@@ -342,19 +404,22 @@ def test_world_origin_far_away_is_rebased_on_load() -> None:
     assert not normalise_capture(near).world_offset.any()
 
 
-# --- many of them -----------------------------------------------------------------------------------------------------
+# --- many of them
+# -----------------------------------------------------------------------------------------------------
 
 
 def test_thousands_of_coincident_opaque_gaussians() -> None:
-    """The first by index covers the rest: 0.99 of its colour; the next would leave less than 1e-4 (0.01 squared,
-    rounded down in float32) and is not added."""
+    """The first by index covers the rest: 0.99 of its colour; the next would leave less than 1e-4
+    (0.01 squared, rounded down in float32) and is not added."""
     n = 5000
     gaussians = one_gaussian((0.0, 0.0, 3.0), 1e4)
     gaussians = gaussians.select(torch.zeros(n, dtype=torch.long))
     gaussians = gaussians.replace(logit_opacities=torch.full((n,), 100.0), sh=torch.rand(n, 1, 3))
     image, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
     first = gaussians.base_rgb[0]
-    torch.testing.assert_close(image.rgb, (0.99 * first + 0.01 * BACKGROUND).expand_as(image.rgb), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        image.rgb, (0.99 * first + 0.01 * BACKGROUND).expand_as(image.rgb), rtol=0, atol=1e-6
+    )
     assert all(x.isfinite().all() for x in slopes.values())
     assert slopes["sh"][0].any()
     assert not slopes["sh"][2:].any()
@@ -362,15 +427,20 @@ def test_thousands_of_coincident_opaque_gaussians() -> None:
 
 def test_thousands_of_coincident_faint_gaussians() -> None:
     n = 3000
-    gaussians = one_gaussian((0.0, 0.0, 3.0), 0.3, opacity=0.01).select(torch.zeros(n, dtype=torch.long))
-    gaussians = gaussians.replace(sh=torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(2)))
+    gaussians = one_gaussian((0.0, 0.0, 3.0), 0.3, opacity=0.01).select(
+        torch.zeros(n, dtype=torch.long)
+    )
+    gaussians = gaussians.replace(
+        sh=torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(2))
+    )
     # float32 multiplies 3000 factors: 3000 * 6e-8 = 2e-4 at worst
     image = check_against_float64(gaussians, camera(), tolerance=2e-4, gradient_tolerance=1e-3)
     assert image.alpha.max() > 0.999
 
 
 def test_equal_depths_are_ordered_by_index() -> None:
-    """Two veils at one depth: the first in the list is in front, also after the list is reversed."""
+    """Two veils at one depth: the first in the list is in front, also after the list is
+    reversed."""
     pair = one_gaussian((0.0, 0.0, 3.0), 1e4).select(torch.tensor([0, 0]))
     pair = pair.replace(sh=torch.tensor([[[1.0, 0, 0]], [[0, 1.0, 0]]]))
     for order in ([0, 1], [1, 0]):
@@ -390,11 +460,13 @@ def test_one_gaussian_covering_a_4k_image() -> None:
     expected = (0.5 * gaussians.base_rgb + 0.5 * BACKGROUND).expand_as(image.rgb)
     torch.testing.assert_close(image.rgb.detach(), expected.detach(), rtol=0, atol=1e-5)
     assert leaves.sh.grad is not None
-    assert float(leaves.sh.grad[0, 0, 0]) == pytest.approx(0.5 * SH_C0 * 3840 * 2160, rel=1e-4)  # 8e6 numbers summed
+    # 8e6 numbers summed
+    assert float(leaves.sh.grad[0, 0, 0]) == pytest.approx(0.5 * SH_C0 * 3840 * 2160, rel=1e-4)
     assert all(x.grad is not None and x.grad.isfinite().all() for x in leaves.tensors().values())
 
 
-# --- sizes ------------------------------------------------------------------------------------------------------------
+# --- sizes
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_no_gaussians() -> None:
@@ -415,7 +487,8 @@ def test_images_of_one_pixel_or_one_line(size: tuple[int, int]) -> None:
 
 
 def test_more_than_2_to_the_31_intersections_are_refused_before_anything_is_allocated() -> None:
-    """2100 veils on 16384 x 16384 px (a million tiles): 2.2e9 pairs, which alone would take 17 GB."""
+    """2100 veils on 16384 x 16384 px (a million tiles): 2.2e9 pairs, which alone would take 17
+    GB."""
     gaussians = one_gaussian((0.0, 0.0, 3.0), 1e6).select(torch.zeros(2100, dtype=torch.long))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     message = (
@@ -435,14 +508,20 @@ def test_limit_of_intersections_is_exact() -> None:
         compensations=torch.ones(1, 3),
         radii=torch.full((1, 3, 2), 10**9, dtype=torch.int32),
     )
-    opacities, colors = torch.full((1, 3), 0.5), torch.ones(1, 3, 1)
-    blended = rasterize(projection, opacities, colors, (64, 64), options=BlendOptions(max_entries=48))
-    torch.testing.assert_close(blended.transmittance, torch.full((1, 64, 64), 0.125), rtol=0, atol=1e-5)
+    opacities = torch.full((1, 3), 0.5)
+    colors = torch.ones(1, 3, 1)
+    blended = rasterize(
+        projection, opacities, colors, (64, 64), options=BlendOptions(max_entries=48)
+    )
+    torch.testing.assert_close(
+        blended.transmittance, torch.full((1, 64, 64), 0.125), rtol=0, atol=1e-5
+    )
     with pytest.raises(DyngsError, match="meet 48 tiles, more than the limit of 47"):
         rasterize(projection, opacities, colors, (64, 64), options=BlendOptions(max_entries=47))
 
 
-# --- NaN and infinity -------------------------------------------------------------------------------------------------
+# --- NaN and infinity
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
@@ -452,14 +531,17 @@ def test_nonfinite_gaussians_are_named(name: str, bad: float, dtype: torch.dtype
     gaussians = some_gaussians()
     gaussians = Gaussians(**{k: x.to(dtype) for k, x in gaussians.tensors().items()})
     getattr(gaussians, name).view(6, -1)[[1, 4], -1] = bad
-    with pytest.raises(DyngsError, match=rf"^{name} holds 2 NaN or infinite value\(s\) in 2 of 6 rows; .*skip"):
+    with pytest.raises(
+        DyngsError, match=rf"^{name} holds 2 NaN or infinite value\(s\) in 2 of 6 rows; .*skip"
+    ):
         render(gaussians, camera())
 
 
 @pytest.mark.parametrize("nonfinite", ["error", "skip"])
 @pytest.mark.parametrize("name", ["cam_from_world", "intrinsics", "background"])
 def test_nonfinite_views_are_named_whatever_the_policy(name: str, nonfinite: str) -> None:
-    cameras, background = camera(), BACKGROUND.clone()
+    cameras = camera()
+    background = BACKGROUND.clone()
     (background if name == "background" else getattr(cameras, name)).view(-1)[2] = float("nan")
     with pytest.raises(DyngsError, match=rf"^{name} holds 1 NaN or infinite value\(s\)"):
         render(some_gaussians(), cameras, RenderOptions(nonfinite=nonfinite), background=background)
@@ -474,7 +556,9 @@ def test_skipping_nonfinite_gaussians_equals_leaving_them_out(bad: float) -> Non
     keep = torch.tensor([i not in (0, 2, 4, 6, 8) for i in range(12)])
     options = RenderOptions(nonfinite="skip")
     image, slopes = drawn_with_gradients(gaussians, camera(), options, torch.float32)
-    truth, true_slopes = drawn_with_gradients(gaussians.select(keep), camera(), USUAL, torch.float32)
+    truth, true_slopes = drawn_with_gradients(
+        gaussians.select(keep), camera(), USUAL, torch.float32
+    )
     assert torch.equal(image.rgb, truth.rgb)
     assert torch.equal(image.radii[:, keep], truth.radii)
     assert not image.radii[:, ~keep].any()
@@ -486,11 +570,15 @@ def test_skipping_nonfinite_gaussians_equals_leaving_them_out(bad: float) -> Non
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_ops_draw_no_nan_even_if_nobody_looks(name: str, bad: float) -> None:
-    """The ops below ``render`` do not look for NaN, but every comparison is phrased so that it fails."""
+    """The ops below ``render`` do not look for NaN, but every comparison is phrased so that it
+    fails."""
     scene = random_scene(n=4, views=1).to(torch.float32)
     getattr(scene, name).view(4, -1)[1, 0] = bad
-    p = project(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, ProjectionOptions())
+    p = project(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, ProjectionOptions()
+    )
     assert all(x.isfinite().all() for x in (p.means2d, p.depths, p.factors, p.compensations))
-    assert bool(p.radii[0, 1].any()) == (name == "opacities" and bad == float("inf"))  # as if opacity were 1
+    # as if opacity were 1
+    assert bool(p.radii[0, 1].any()) == (name == "opacities" and bad == float("inf"))
     blended = rasterize(p, scene.opacities[None], torch.ones(1, 4, 3), scene.size)
     assert blended.color.isfinite().all()

@@ -18,7 +18,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def one_camera(width: int = 8, height: int = 8, focal: float = 50.0) -> Cameras:
-    intrinsics = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=torch.float64)
+    intrinsics = torch.tensor(
+        [[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=torch.float64
+    )
     return Cameras(torch.eye(4, dtype=torch.float64)[None], intrinsics, width, height)
 
 
@@ -29,7 +31,9 @@ def flat_splats(alphas: list[float], depths: list[float]) -> tuple[Projection, T
     factors = torch.tensor([1e-12, 0.0, 1e-12], dtype=torch.float64).expand(1, n, 3)
     ones = torch.ones(1, n, dtype=torch.float64)
     depth = torch.tensor([depths], dtype=torch.float64)
-    projection = Projection(zeros, depth, factors, ones, torch.full((1, n, 2), 100, dtype=torch.int32))
+    projection = Projection(
+        zeros, depth, factors, ones, torch.full((1, n, 2), 100, dtype=torch.int32)
+    )
     return projection, torch.tensor([alphas], dtype=torch.float64)
 
 
@@ -56,9 +60,13 @@ def test_ball_on_the_optical_axis() -> None:
     variance = bare + 0.3
     assert p.means2d.tolist() == [[[4.0, 4.0]]]
     assert p.depths.item() == z
-    torch.testing.assert_close(p.conics[0, 0], torch.tensor([1 / variance, 0, 1 / variance]).double())
+    torch.testing.assert_close(
+        p.conics[0, 0], torch.tensor([1 / variance, 0, 1 / variance]).double()
+    )
     assert p.compensations.item() == pytest.approx(bare / variance)
-    assert p.radii[0, 0].tolist() == [math.ceil(math.sqrt(2 * math.log(opacity * 255) * variance))] * 2
+    assert (
+        p.radii[0, 0].tolist() == [math.ceil(math.sqrt(2 * math.log(opacity * 255) * variance))] * 2
+    )
 
 
 def test_blending_two_flat_layers() -> None:
@@ -67,12 +75,17 @@ def test_blending_two_flat_layers() -> None:
     background = torch.tensor([[100.0]], dtype=torch.float64)
     blended = reference.rasterize(projection, opacities, colors, (3, 2), background=background)
     expected = 0.25 * 10 + 0.75 * 0.5 * 1 + 0.75 * 0.5 * 100
-    torch.testing.assert_close(blended.color, torch.full((1, 2, 3, 1), expected, dtype=torch.float64))
-    torch.testing.assert_close(blended.transmittance, torch.full((1, 2, 3), 0.375, dtype=torch.float64))
+    torch.testing.assert_close(
+        blended.color, torch.full((1, 2, 3, 1), expected, dtype=torch.float64)
+    )
+    torch.testing.assert_close(
+        blended.transmittance, torch.full((1, 2, 3), 0.375, dtype=torch.float64)
+    )
 
 
 def test_thresholds_of_the_blending() -> None:
-    """Too faint: skipped. Too strong: clamped. Would be too dark: left out, with everything behind."""
+    """Too faint: skipped. Too strong: clamped. Would be too dark: left out, with everything
+    behind."""
     options = BlendOptions(alpha_min=0.1, alpha_max=0.9, transmittance_min=0.02)
     projection, opacities = flat_splats([0.05, 1.0, 0.9, 0.5], depths=[1.0, 2.0, 3.0, 4.0])
     colors = torch.tensor([[[1.0], [10.0], [100.0], [1000.0]]], dtype=torch.float64)
@@ -92,7 +105,9 @@ def test_harmonics_are_orthonormal() -> None:
     ring = (1 - z * z).sqrt()
     directions = torch.stack([ring * phi.cos(), ring * phi.sin(), z], -1)
     basis = reference.harmonics_basis(directions, 4)
-    gram = torch.einsum("i,ijk,ijl->kl", torch.from_numpy(node_weights) * (2 * math.pi / 12), basis, basis)
+    gram = torch.einsum(
+        "i,ijk,ijl->kl", torch.from_numpy(node_weights) * (2 * math.pi / 12), basis, basis
+    )
     torch.testing.assert_close(gram, torch.eye(25, dtype=torch.float64))
 
 
@@ -101,15 +116,24 @@ def test_harmonics_of_degree_one_have_the_signs_of_3dgs() -> None:
     direction = direction / direction.norm()
     x, y, z = direction.tolist()
     expected = torch.tensor([0.28209479177387814, *(0.4886025119029199 * v for v in (-y, z, -x))])
-    torch.testing.assert_close(reference.harmonics_basis(direction, 1), expected.double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        reference.harmonics_basis(direction, 1), expected.double(), rtol=1e-6, atol=0
+    )
 
 
 def test_culling() -> None:
     near_far = ProjectionOptions(near=1.0, far=5.0)
-    means = torch.tensor([[0, 0, 1.0], [0, 0, 5.0], [0, 0, 3.0], [0, 0, -3.0], [99.0, 0, 3.0]], dtype=torch.float64)
+    means = torch.tensor(
+        [[0, 0, 1.0], [0, 0, 5.0], [0, 0, 3.0], [0, 0, -3.0], [99.0, 0, 3.0]], dtype=torch.float64
+    )
     quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(5, 4)
     p = reference.project(
-        means, quats, torch.full_like(means, 0.1), torch.full_like(means[:, 0], 0.5), one_camera(), near_far
+        means,
+        quats,
+        torch.full_like(means, 0.1),
+        torch.full_like(means[:, 0], 0.5),
+        one_camera(),
+        near_far,
     )
     assert (p.radii[0, :, 0] > 0).tolist() == [False, False, True, False, False]
     assert p.depths[0].tolist() == [0, 0, 3, 0, 0]

@@ -1,4 +1,5 @@
-"""Named tensors with roles: put together, taken apart, and moved to a device with all that holds them."""
+"""Named tensors with roles: put together, taken apart, and moved to a device with all that holds
+them."""
 
 from __future__ import annotations
 
@@ -10,23 +11,41 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.state import Role, StateTensor, fields_moved_to, moved_to, part_of, prefixed, tensors_of, with_role
+from dyngs.state import (
+    Role,
+    StateTensor,
+    fields_moved_to,
+    moved_to,
+    part_of,
+    prefixed,
+    tensors_of,
+    with_role,
+)
 
 NAMES = st.text("abc.", min_size=1, max_size=5)
 
 
-@given(st.dictionaries(NAMES, st.integers(0, 9)), st.sampled_from(Role), st.text("abc", min_size=1, max_size=3))
-def test_a_prefix_is_put_before_and_taken_away(values: dict[str, int], role: Role, prefix: str) -> None:
+@given(
+    st.dictionaries(NAMES, st.integers(0, 9)),
+    st.sampled_from(Role),
+    st.text("abc", min_size=1, max_size=3),
+)
+def test_a_prefix_is_put_before_and_taken_away(
+    values: dict[str, int], role: Role, prefix: str
+) -> None:
     tensors = {name: torch.tensor([x]) for name, x in values.items()}
     state = with_role(tensors, role)
     assert all(x.role is role for x in state.values())
     assert tensors_of(state) == tensors
     assert part_of(tensors_of(prefixed(prefix, state)), prefix) == tensors
-    assert tensors_of(prefixed(prefix, state)) == {f"{prefix}.{name}": x for name, x in tensors.items()}
+    assert tensors_of(prefixed(prefix, state)) == {
+        f"{prefix}.{name}": x for name, x in tensors.items()
+    }
 
 
 def test_a_part_has_the_whole_prefix() -> None:
-    x, y = torch.zeros(1), torch.ones(1)
+    x = torch.zeros(1)
+    y = torch.ones(1)
     assert part_of({"a.x": x, "ab.x": y, "x": y, "a": y, "b.a.x": y}, "a") == {"x": x}
 
 
@@ -56,14 +75,27 @@ def devices(value: Any) -> list[str]:
 
 def test_what_is_moved_keeps_its_shape() -> None:
     x = torch.arange(3.0)
-    value = {"a": (Plain(x, 2.0), Own(x, x)), "b": StateTensor(x, Role.SHARED), "c": (), "d": None, "e": "cpu"}
+    value = {
+        "a": (Plain(x, 2.0), Own(x, x)),
+        "b": StateTensor(x, Role.SHARED),
+        "c": (),
+        "d": None,
+        "e": "cpu",
+    }
     value["a"][0].cache["old"] = x
     moved: Any = moved_to(value, "meta")
     plain, own = moved["a"]
-    assert devices([plain.x, own.times, own.x, moved["b"].tensor]) == ["meta", "cpu", "meta", "meta"]
+    assert devices([plain.x, own.times, own.x, moved["b"].tensor]) == [
+        "meta",
+        "cpu",
+        "meta",
+        "meta",
+    ]
     assert (plain.number, plain.cache, moved["b"].role) == (2.0, {}, Role.SHARED)
     assert [moved[name] for name in "cde"] == [(), None, "cpu"]
-    assert devices([value["a"][0].x, value["b"].tensor]) == ["cpu", "cpu"], "what was given stays as it is"
+    assert devices([value["a"][0].x, value["b"].tensor]) == ["cpu", "cpu"], (
+        "what was given stays as it is"
+    )
     assert moved_to(Role.SHARED, "meta") is Role.SHARED
     assert moved_to(Plain, "meta") is Plain
 
@@ -95,4 +127,8 @@ def test_all_tensors_are_moved_and_only_real_ones_converted() -> None:
     assert (moved.real.device.type, moved.whole.device.type) == ("meta", "meta")
     assert (moved.none, moved.name) == (None, "x")
     exact = fields_moved_to(given, None, torch.float64)
-    assert (exact.real.dtype, exact.whole.dtype, exact.real.device.type) == (torch.float64, torch.int64, "cpu")
+    assert (exact.real.dtype, exact.whole.dtype, exact.real.device.type) == (
+        torch.float64,
+        torch.int64,
+        "cpu",
+    )

@@ -1,4 +1,5 @@
-"""A capture in millimetres, metres or kilometres trains to the same scene, which leaves in the unit of the capture."""
+"""A capture in millimetres, metres or kilometres trains to the same scene, which leaves in the unit
+of the capture."""
 
 from __future__ import annotations
 
@@ -36,7 +37,12 @@ SCENES = {
     "human": ["train.steps=8", "run.threads=1", "model.resolution=32", "data.train_cameras=[0]"],
     "ngp": ["train.steps=4", "run.threads=1", "model.levels=4"],
     "nerf": ["train.steps=3", "run.threads=1", "model.width=16", "model.coarse=4", "model.fine=4"],
-    "bg_triangle": ["train.steps=6", "run.threads=1", "model.max_triangles=200", "model.gaussian_steps=20"],
+    "bg_triangle": [
+        "train.steps=6",
+        "run.threads=1",
+        "model.max_triangles=200",
+        "model.gaussian_steps=20",
+    ],
 }
 NETWORK_KEYS = {
     "human_predictor": {"kind": "human_predictor"} | NET.model_dump(),
@@ -66,7 +72,8 @@ def trained(preset: str, capture: Path, out: Path, *more: str) -> Path:
 
 
 def assert_same_up_to_scale(one: Path, other: Path, scale: float) -> None:
-    first, second = latest_checkpoint(one), latest_checkpoint(other)
+    first = latest_checkpoint(one)
+    second = latest_checkpoint(other)
     assert second.info.world_scale == scale * first.info.world_scale
     assert second.tensors.keys() == first.tensors.keys()
     for name, x in first.tensors.items():
@@ -74,7 +81,9 @@ def assert_same_up_to_scale(one: Path, other: Path, scale: float) -> None:
 
 
 @pytest.mark.parametrize("preset", SCENES)
-def test_unit_of_a_power_of_two_trains_to_the_same_bytes(preset: str, captures: Path, tmp_path: Path) -> None:
+def test_unit_of_a_power_of_two_trains_to_the_same_bytes(
+    preset: str, captures: Path, tmp_path: Path
+) -> None:
     capture = capture_for(preset, captures)
     one = trained(preset, capture, tmp_path / "one")
     for exponent in (-13, 10) if preset == "static" else (-13,):
@@ -88,12 +97,16 @@ def test_unit_of_a_power_of_two_trains_to_the_same_bytes(preset: str, captures: 
 def test_deformation_field_in_another_unit(field: str, captures: Path, tmp_path: Path) -> None:
     scaled = scaled_capture(captures / "moving", tmp_path / "scaled", 2.0**-13)
     one = dyngs.train(busy_config(captures / "moving", tmp_path / "one", field))
-    assert_same_up_to_scale(one, dyngs.train(busy_config(scaled, tmp_path / "other", field)), 2.0**-13)
+    assert_same_up_to_scale(
+        one, dyngs.train(busy_config(scaled, tmp_path / "other", field)), 2.0**-13
+    )
 
 
 @pytest.mark.parametrize("kind", NETWORK_KEYS)
 def test_network_of_people_in_another_unit(kind: str, tmp_path: Path) -> None:
-    write = {"human_predictor": lambda x: people(x, (1,)), "gps": stereo_people}.get(kind, field_people)
+    write = {"human_predictor": lambda x: people(x, (1,)), "gps": stereo_people}.get(
+        kind, field_people
+    )
     folder = write(tmp_path / "people")
     scaled = scaled_capture(folder, tmp_path / "scaled", 2.0**-13)
     results = []
@@ -108,11 +121,14 @@ def test_network_of_people_in_another_unit(kind: str, tmp_path: Path) -> None:
         assert torch.equal(x, results[1][name]), name
 
 
-@pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (0.05, 0.0), (1e3, 0.0), (1.0, 5e6), (1e-3, 5e6)])
+@pytest.mark.parametrize(
+    ("scale", "offset"), [(1e-4, 0.0), (0.05, 0.0), (1e3, 0.0), (1.0, 5e6), (1e-3, 5e6)]
+)
 def test_other_units_and_places_train_to_the_same_images(
     scale: float, offset: float, captures: Path, tmp_path: Path
 ) -> None:
-    """Rounding differs, and a float64 pose 1e6 extents away has ten digits left: images differ a little."""
+    """Rounding differs, and a float64 pose 1e6 extents away has ten digits left: images differ a
+    little."""
     moved = scaled_capture(captures / "still", tmp_path / "moved", scale, (offset, -offset, 0.0))
     images = []
     for name, root in (("one", captures / "still"), ("other", moved)):
@@ -133,7 +149,8 @@ def test_python_users_see_the_unit_of_the_files(captures: Path, tmp_path: Path) 
     torch.testing.assert_close(other.bounds, scale * scene.bounds, rtol=0, atol=0)
     options = [dyngs.RenderOptions(near=x.options.near, depth="expected") for x in (scene, other)]
     one_camera, other_camera = (
-        ImageLoader(dyngs.read_capture(root).splits["test"])[0].cameras for root in (captures / "still", scaled)
+        ImageLoader(dyngs.read_capture(root).splits["test"])[0].cameras
+        for root in (captures / "still", scaled)
     )
     wanted = scene.render(one_camera, options=options[0])
     found = other.render(other_camera, other.time_step(0.0), options=options[1])
@@ -146,10 +163,16 @@ def test_python_users_see_the_unit_of_the_files(captures: Path, tmp_path: Path) 
 def test_what_leaves_a_run_is_in_the_unit_of_the_capture(captures: Path, tmp_path: Path) -> None:
     scale = 2.0**-10
     scaled = scaled_capture(captures / "still", tmp_path / "scaled", scale)
-    files, frames, poses, meshes, edited = [], [], [], [], []
+    files = []
+    frames = []
+    poses = []
+    meshes = []
+    edited = []
     for name, root, unit in (("one", captures / "still", 1.0), ("other", scaled, scale)):
         run = trained("static", root, tmp_path / name)
-        assert main(["export", str(run), "--out", str(tmp_path / f"{name}.ply"), "--up", "keep"]) == 0
+        assert (
+            main(["export", str(run), "--out", str(tmp_path / f"{name}.ply"), "--up", "keep"]) == 0
+        )
         files.append(dyngs.load(tmp_path / f"{name}.ply").at(0.0))
         path = tmp_path / f"{name}.json"
         document = json.loads((root / "transforms_test.json").read_text())
@@ -157,14 +180,31 @@ def test_what_leaves_a_run_is_in_the_unit_of_the_capture(captures: Path, tmp_pat
         out = tmp_path / f"{name}_frames"
         assert main(["render", str(run), "--path", str(path), "--depth", "--out", str(out)]) == 0
         frames.append({file.name: file.read_bytes() for file in out.glob("*.png")})
-        assert main(["export", str(run), "--format", "cameras", "--out", str(tmp_path / f"{name}_cameras.json")]) == 0
+        assert (
+            main(
+                [
+                    "export",
+                    str(run),
+                    "--format",
+                    "cameras",
+                    "--out",
+                    str(tmp_path / f"{name}_cameras.json"),
+                ]
+            )
+            == 0
+        )
         document = json.loads((tmp_path / f"{name}_cameras.json").read_text())
         mesh = tmp_path / f"{name}_mesh.ply"
-        assert main(["export", str(run), "--format", "mesh", "--cells", "32", "--out", str(mesh)]) == 0
+        assert (
+            main(["export", str(run), "--format", "mesh", "--cells", "32", "--out", str(mesh)]) == 0
+        )
         meshes.append(trimesh.load(mesh, process=False).vertices / unit)
         out = tmp_path / f"{name}_twice"
         assert main(["edit", str(run), "--scale", "2", "--out", str(out)]) == 0
-        assert main(["export", str(out), "--out", str(tmp_path / f"{name}_twice.ply"), "--up", "keep"]) == 0
+        assert (
+            main(["export", str(out), "--out", str(tmp_path / f"{name}_twice.ply"), "--up", "keep"])
+            == 0
+        )
         edited.append(dyngs.load(tmp_path / f"{name}_twice.ply").at(0.0).means / unit)
         poses.append(np.array([x["transform_matrix"] for x in document["frames"]])[:, :3, 3] / unit)
     torch.testing.assert_close(files[1].means, scale * files[0].means, rtol=0, atol=0)
@@ -173,10 +213,14 @@ def test_what_leaves_a_run_is_in_the_unit_of_the_capture(captures: Path, tmp_pat
     np.testing.assert_array_equal(poses[0], poses[1])
     np.testing.assert_allclose(meshes[0], meshes[1], rtol=1e-6)
     torch.testing.assert_close(edited[0], edited[1])
-    torch.testing.assert_close(edited[0].square().sum(1), 4 * files[0].means.square().sum(1), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        edited[0].square().sum(1), 4 * files[0].means.square().sum(1), rtol=1e-4, atol=0
+    )
 
 
-def test_run_of_an_earlier_version_is_evaluated_in_its_own_unit(captures: Path, tmp_path: Path) -> None:
+def test_run_of_an_earlier_version_is_evaluated_in_its_own_unit(
+    captures: Path, tmp_path: Path
+) -> None:
     """Such a run was trained in the unit of the files; its checkpoint does not name one."""
     scaled = scaled_capture(captures / "still", tmp_path / "scaled", 0.25)
     run = trained("static", scaled, tmp_path / "run")
@@ -195,7 +239,9 @@ def test_run_of_an_earlier_version_is_evaluated_in_its_own_unit(captures: Path, 
     assert evaluate_run(run).psnr == pytest.approx(psnr, abs=1e-3)
 
 
-def test_number_for_the_near_plane_is_in_the_unit_of_the_capture(captures: Path, tmp_path: Path) -> None:
+def test_number_for_the_near_plane_is_in_the_unit_of_the_capture(
+    captures: Path, tmp_path: Path
+) -> None:
     scaled = scaled_capture(captures / "still", tmp_path / "scaled", 0.01)
     scene = dyngs.load(trained("static", scaled, tmp_path / "run", "model.near=0.005"))
     assert scene.options.near == pytest.approx(0.005)

@@ -10,7 +10,10 @@ from dyngs.human.synthetic.people import PeopleOptions, write_people
 from dyngs.human.template.body_reader import default_template
 from dyngs.human_fields.people import Person, person_of
 
-NETWORKS: dict[str, dict[str, object]] = {"keypoint_nerf": {"step": 0.04}, "eg_human_nerf": {"samples": 8}}
+NETWORKS: dict[str, dict[str, object]] = {
+    "keypoint_nerf": {"step": 0.04},
+    "eg_human_nerf": {"samples": 8},
+}
 """Keys of small networks, by kind."""
 SIZES = {"features": 8, "width": 8, "patch": 16, "source_views": 3}
 

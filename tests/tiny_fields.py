@@ -58,8 +58,11 @@ def tiny_field(kind: str, num_moving: int = 9, *, everything: bool = True) -> De
     return new_field(tiny_options(kind, everything=everything), tiny_setup(num_moving), generator)
 
 
-def stirred_field(kind: str, num_moving: int = 9, *, size: float = 0.2, everything: bool = True) -> DeformationField:
-    """A field as after training: all that is learned has some noise on it, and no unit of the networks is silent.
+def stirred_field(
+    kind: str, num_moving: int = 9, *, size: float = 0.2, everything: bool = True
+) -> DeformationField:
+    """A field as after training: all that is learned has some noise on it, and no unit of the
+    networks is silent.
 
     Control nodes lie among the first means of ``cloud``.
     """
@@ -99,10 +102,11 @@ def write_tiny_capture(root: Path) -> Path:
 
 
 def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Config:
-    """A run of 24 steps in which all happens: motion begins after step 8, all times come from 14 on, splits from 15 on.
+    """A run of 24 steps in which all happens: motion begins after step 8, all times come from 14
+    on, splits from 15 on.
 
-    Of the 60 Gaussians some may move, and so may 12 random ones; the set changes each third step. The field learns so
-    fast that after some steps a part of what may move is seen to.
+    Of the 60 Gaussians some may move, and so may 12 random ones; the set changes each third step.
+    The field learns so fast that after some steps a part of what may move is seen to.
     """
     rates = {
         "hexplane": {"lr_planes": 1e-1, "lr_decoder": 5e-2},
@@ -130,7 +134,9 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         data=DataConfig(root=capture),
         model=DynamicModel.model_validate(options),
         init=RandomInit(num_random=60),
-        strategy=DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=300),
+        strategy=DefaultStrategy(
+            start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=300
+        ),
         train=TrainConfig(steps=24, log_every=1),
         run=RunConfig(dir=run_dir, threads=1),
     )

@@ -1,4 +1,5 @@
-"""A tiny capture with every kind of prior; its images are noise, so that nothing agrees with them."""
+"""A tiny capture with every kind of prior; its images are noise, so that nothing agrees with
+them."""
 
 from __future__ import annotations
 
@@ -21,12 +22,22 @@ def with_priors(root: Path, names: tuple[str, ...] = ("a", "b", "c")) -> Path:
         visible=np.ones((len(names), 1)),
         names=np.array(names),
     )
-    write_frames(root / "transforms_train.json", names, {"camera_angle_x": 0.7, "tracks_file_path": "tracks.npz"})
-    keys = {"motion_mask_path": "moves.png", "depth_file_path": "depth.npy", "flow_file_path": "flow.npy"}
+    write_frames(
+        root / "transforms_train.json",
+        names,
+        {"camera_angle_x": 0.7, "tracks_file_path": "tracks.npz"},
+    )
+    keys = {
+        "motion_mask_path": "moves.png",
+        "depth_file_path": "depth.npy",
+        "flow_file_path": "flow.npy",
+    }
 
     def change(content: dict) -> None:
         for i, frame in enumerate(content["frames"]):
-            frame |= {"time": (2 - i) / 2} | {key: f"{names[i]}_{name}" for key, name in keys.items()}
+            frame |= {"time": (2 - i) / 2} | {
+                key: f"{names[i]}_{name}" for key, name in keys.items()
+            }
 
     edit_json(root / "transforms_train.json", change)
     return root

@@ -1,4 +1,5 @@
-"""Small synthetic people with depth maps, and a small stereo network, for tests of predictions from pairs of views."""
+"""Small synthetic people with depth maps, and a small stereo network, for tests of predictions from
+pairs of views."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ PEOPLE = PeopleOptions(people=2, size=40, cameras=24)
 
 
 def stereo_config(folder: Path, run: Path, **train: object) -> Config:
-    """Of four steps, two of depth alone, with a checkpoint after every second one; ``train`` changes that."""
+    """Of four steps, two of depth alone, with a checkpoint after every second one; ``train``
+    changes that."""
     return Config.model_validate(
         {
             "data": {"root": folder},
@@ -24,4 +26,6 @@ def stereo_config(folder: Path, run: Path, **train: object) -> Config:
 
 
 def stereo_people(folder: Path, seed: int = 0) -> Path:
-    return write_people(folder, PeopleOptions(PEOPLE.people, PEOPLE.size, PEOPLE.cameras, seed=seed))
+    return write_people(
+        folder, PeopleOptions(PEOPLE.people, PEOPLE.size, PEOPLE.cameras, seed=seed)
+    )

@@ -1,4 +1,5 @@
-"""A kind of model that is not made of Gaussians: a grid of colours and densities, ray-marched in plain torch."""
+"""A kind of model that is not made of Gaussians: a grid of colours and densities, ray-marched in
+plain torch."""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ CELLS, SAMPLES, HALF = 12, 24, 1.5
 class ToyModel(ModelSection):
     """A grid around the origin."""
 
-    kind: Literal["toy"] = Field(default="toy", description="a grid of colours and densities, for tests")
+    kind: Literal["toy"] = Field(
+        default="toy", description="a grid of colours and densities, for tests"
+    )
     lr: float = Field(default=0.3, gt=0, description="learning rate")
 
 
@@ -68,23 +71,36 @@ class ToyScene(Renderable):
         behind = self.background if background is None else background
         behind = torch.zeros(3) if behind is None else behind
         views = [
-            self._view(pose, k, cameras) for pose, k in zip(cameras.cam_from_world, cameras.intrinsics, strict=True)
+            self._view(pose, k, cameras)
+            for pose, k in zip(cameras.cam_from_world, cameras.intrinsics, strict=True)
         ]
         rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
         wants_depth = (self.options if options is None else options).depth != "none"
         return Rendering(rgb + through[..., None] * behind, through, depth if wants_depth else None)
 
-    def _view(self, pose: Tensor, intrinsics: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-        y, x = torch.meshgrid(torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5, indexing="ij")
+    def _view(
+        self, pose: Tensor, intrinsics: Tensor, cameras: Cameras
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        y, x = torch.meshgrid(
+            torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5, indexing="ij"
+        )
         local = torch.stack(
-            [(x - intrinsics[0, 2]) / intrinsics[0, 0], (y - intrinsics[1, 2]) / intrinsics[1, 1], torch.ones_like(x)],
+            [
+                (x - intrinsics[0, 2]) / intrinsics[0, 0],
+                (y - intrinsics[1, 2]) / intrinsics[1, 1],
+                torch.ones_like(x),
+            ],
             -1,
         )
         z = torch.linspace(1.5, 7.0, SAMPLES)
         points = (local[..., None, :] * z[:, None] - pose[:3, 3]) @ pose[:3, :3]
-        found = torch.nn.functional.grid_sample(self.grid, points[None] / HALF, align_corners=False)[0]
+        found = torch.nn.functional.grid_sample(
+            self.grid, points[None] / HALF, align_corners=False
+        )[0]
         inside = (points.abs() < HALF).all(-1)
-        alpha = torch.where(inside, 1 - torch.exp(-torch.nn.functional.softplus(found[3]) * (z[1] - z[0])), 0.0)
+        alpha = torch.where(
+            inside, 1 - torch.exp(-torch.nn.functional.softplus(found[3]) * (z[1] - z[0])), 0.0
+        )
         left = torch.cumprod(1 - alpha, -1)
         weight = alpha * torch.cat([torch.ones_like(left[..., :1]), left[..., :-1]], -1)
         rgb = (weight * found[:3].sigmoid()).sum(-1).permute(1, 2, 0)
@@ -96,7 +112,8 @@ class Toy(Model[ToyScene]):
 
     def __init__(self, run: RunStart, model: ToyModel) -> None:
         noise = 0.1 * torch.randn(1, 4, CELLS, CELLS, CELLS, generator=run.generator)
-        self._grid, self._lr = (noise - torch.tensor([0.0, 0, 0, 2]).view(1, 4, 1, 1, 1)).requires_grad_(), model.lr
+        self._grid = (noise - torch.tensor([0.0, 0, 0, 2]).view(1, 4, 1, 1, 1)).requires_grad_()
+        self._lr = model.lr
         self._adam = AdamState.zero({"grid": self._grid})
         self._background = background_colour(run.background)
 
@@ -110,7 +127,9 @@ class Toy(Model[ToyScene]):
 
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
         options = DrawOptions(depth="expected" if depth else "none")
-        return Drawn(self.scene.render(image.cameras, image.time, options=options, background=background))
+        return Drawn(
+            self.scene.render(image.cameras, image.time, options=options, background=background)
+        )
 
     def regularizers(self) -> dict[str, Tensor]:
         return {"empty": 1e-4 * torch.nn.functional.softplus(self._grid[:, 3]).mean()}
@@ -140,13 +159,18 @@ def start(run: RunStart) -> Toy:
 
 
 def restore(model: ToyModel, checkpoint: Checkpoint) -> ToyScene:
-    return ToyScene(stored_grid(checkpoint), background=background_colour(checkpoint.info.background))
+    return ToyScene(
+        stored_grid(checkpoint), background=background_colour(checkpoint.info.background)
+    )
 
 
 @contextmanager
 def registered() -> Iterator[None]:
-    """Let ``model.kind=toy`` be a kind: one line more in the tuple of kinds, of which ``Config`` is made again."""
-    info, before, known = Config.model_fields["model"], Config.model_fields["model"].annotation, kinds.KINDS
+    """Let ``model.kind=toy`` be a kind: one line more in the tuple of kinds, of which ``Config`` is
+    made again."""
+    info = Config.model_fields["model"]
+    before = Config.model_fields["model"].annotation
+    known = kinds.KINDS
     kinds.KINDS = (*known, Kind(ToyModel, __name__))
     info.annotation = Union[tuple(kind.section for kind in kinds.KINDS)]  # type: ignore[assignment]  # noqa: UP007
     Config.model_rebuild(force=True)

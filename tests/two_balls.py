@@ -11,12 +11,19 @@ from dyngs.gaussians import Gaussians
 
 
 def two_balls(distance: float = 4.0) -> Gaussians:
-    """A big red ball left, a small green one right, both ``distance`` from the camera of ``cameras_around``."""
+    """A big red ball left, a small green one right, both ``distance`` from the camera of
+    ``cameras_around``."""
     means = torch.tensor([[-0.5, 0.0, 0.0], [0.7, 0.0, 0.0]])
     colours = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     sizes = torch.tensor([0.3, 0.15]).log()[:, None].expand(2, 3)
     identity = torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
-    return Gaussians(means, identity, sizes, torch.full((2,), 5.0), ((colours - 0.5) / 0.28209479177387814)[:, None])
+    return Gaussians(
+        means,
+        identity,
+        sizes,
+        torch.full((2,), 5.0),
+        ((colours - 0.5) / 0.28209479177387814)[:, None],
+    )
 
 
 def cameras_around(count: int, width: int = 24, height: int = 18, distance: float = 4.0) -> Cameras:
@@ -27,5 +34,7 @@ def cameras_around(count: int, width: int = 24, height: int = 18, distance: floa
         poses[i, 0, 0] = poses[i, 2, 2] = math.cos(angle)
         poses[i, 0, 2], poses[i, 2, 0] = math.sin(angle), -math.sin(angle)
         poses[i, 2, 3] = distance
-    intrinsics = torch.tensor([[24.0, 0, width / 2], [0, 24, height / 2], [0, 0, 1]]).repeat(count, 1, 1)
+    intrinsics = torch.tensor([[24.0, 0, width / 2], [0, 24, height / 2], [0, 0, 1]]).repeat(
+        count, 1, 1
+    )
     return Cameras(poses, intrinsics, width, height)

@@ -18,7 +18,9 @@ from dyngs.view.session import Eye, Sent, Session
 
 def opened_at(scene: GaussianScene, name: str = "balls") -> Opened:
     """A scene on white, looked at from 4 away."""
-    opened = replace(opened_scene(replace(scene, background=torch.ones(3)), Path(name)), stated_up="-y")
+    opened = replace(
+        opened_scene(replace(scene, background=torch.ones(3)), Path(name)), stated_up="-y"
+    )
     opened.once("viewpoint", lambda: Viewpoint(camera(), np.zeros(3), 4.0, np.array([0.0, -1, 0])))
     return opened
 

@@ -1,8 +1,9 @@
 """Decide before a run which settings pay, by short trainings scored on held-out training views.
 
 A setting is taken if the mean gain over these views, pair by pair, is above twice its standard
-error, motion above three times. The simpler side wins a tie, and wherever nothing could be compared.
-The winner is trained in full, on all training views. Settings that the user has requested are never compared.
+error, motion above three times. The simpler side wins a tie, and wherever nothing could be
+compared. The winner is trained in full, on all training views. Settings that the user has requested
+are never compared.
 
 - Motion: one static model is trained for a while, and then twice as long, with motion and without.
 - Other settings: small runs of the same images, steps and cap on Gaussians differ in one setting.
@@ -50,37 +51,44 @@ from dyngs.runs.folder import CHOICES_NAME
 from dyngs.section import Section
 from dyngs.training.loop import Interrupts
 
-SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000  # Of small runs: longest side of the images, px, and most Gaussians
-STEPS, FEWEST_STEPS = 2000, 1000  # Most steps of a small run; with fewer than the latter it says nothing
+# Of small runs: longest side of the images, px, and most Gaussians
+SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
+# Most steps of a small run; with fewer than the latter it says nothing
+STEPS, FEWEST_STEPS = 2000, 1000
 SPENT = 0.1  # Most of a run's work that small runs may take
-STEP_COST, GAUSSIAN_COST = 20_000, 2  # Work of a step next to its images, and of a Gaussian in it, in pixels
+# Work of a step next to its images, and of a Gaussian in it, in pixels
+STEP_COST, GAUSSIAN_COST = 20_000, 2
 FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
-"""With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
-the views; otherwise about so many are held out."""
+"""With fewer views nothing is compared; with fewer than the second, small runs are made twice, each
+without a fourth of the views; otherwise about so many are held out."""
 TRIAL_STEPS, TRIAL_SIDE, TRIAL_GAUSSIANS, TRIAL_RANDOM = 600, 96, 5000, 1000
 """Of the trial of motion: steps of each model, of which the first third is shared; longest side of
 the images, px; most Gaussians; most random ones that motion begins with. In 300 steps the motion of
 a turning head is not found yet."""
 TRIAL_COST = 1.4
-"""Work of the trial, in steps of a moving scene, for each of its steps: a step with motion costs two without."""
+"""Work of the trial, in steps of a moving scene, for each of its steps: a step with motion costs
+two without."""
 TRIAL_SPENT = 0.25  # Most of a run's work, or of its ``train.minutes``, that the trial may take
 FEWEST_MOVING = 1500
 """Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static
 model of it, in 3,000 it gains."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
 ERRORS, ERRORS_OF_MOTION = 2.0, 3.0
-"""Standard errors that a gain must exceed. The preset ``static`` learns faster than a model at rest of the trial, so
-motion needs more: on photos of a cup that stands still it gained 1.13 dB (0.56), and ended 1.3 dB below ``static``. On
-captures that move the gain was 3.5 errors or more."""
+"""Standard errors that a gain must exceed. The preset ``static`` learns faster than a model at rest
+of the trial, so motion needs more: on photos of a cup that stands still it gained 1.13 dB (0.56),
+and ended 1.3 dB below ``static``. On captures that move the gain was 3.5 errors or more."""
 FREE_VIEWS, MANY_VIEWS = 3.0, 6.0
-"""Views of each time by fixed cameras, in the mean, from which free primitives may be used for what moves, and from
-which they are the first choice: before four cameras a cloth loses 0.9 dB by them, before eight a room gains 4.7."""
+"""Views of each time by fixed cameras, in the mean, from which free primitives may be used for what
+moves, and from which they are the first choice: before four cameras a cloth loses 0.9 dB by them,
+before eight a room gains 4.7."""
 EARLY = {"resolution_grows_from": 0.3, "resolution_full_at": 0.5}
 """Fractions of a run with free primitives at which its images grow."""
 MIN_DIFFERING = 0.001
-"""Fraction of the pixels of fixed cameras that differ from their median from which something moves."""
+"""Fraction of the pixels of fixed cameras that differ from their median from which something
+moves."""
 LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
-"""Of the look at fixed cameras: longest side of the images, px; most cameras, and images of each."""
+"""Of the look at fixed cameras: longest side of the images, px; most cameras, and images of
+each."""
 
 
 @dataclass(frozen=True)
@@ -116,10 +124,12 @@ class Choice:
 def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
     """Resolve every setting that is left open, by short trainings, and print what they found.
 
-    Returns the resolved config, the figures, and the capture with the points that the scene begins with.
+    Returns the resolved config, the figures, and the capture with the points that the scene begins
+    with.
 
     Raises:
-        DyngsError: images that cannot be read, or a capture that this kind of model cannot be trained on.
+        DyngsError: images that cannot be read, or a capture that this kind of model cannot be
+            trained on.
         KeyboardInterrupt: during short trainings; nothing has been written.
     """
     problem = kind_of(config.model).refusal(capture)
@@ -160,10 +170,12 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
 
 
 def _trial_of_motion(config: Config, capture: Capture) -> Choice | None:
-    """Compare ``config`` with the same model at rest; None where the run is too short, or has too few views.
+    """Compare ``config`` with the same model at rest; None where the run is too short, or has too
+    few views.
 
-    Both begin as one static model, and train on the same views in the same order. That compares motion alone: at the
-    rates of the preset ``static``, a still model would win by its faster learning.
+    Both begin as one static model, and train on the same views in the same order. That compares
+    motion alone: at the rates of the preset ``static``, a still model would win by its faster
+    learning.
     """
     views = capture.splits["train"]
     folds = _held_out(views)
@@ -195,7 +207,8 @@ def _trial_of_motion(config: Config, capture: Capture) -> Choice | None:
 def _with_and_without_motion(
     config: Config, capture: Capture, held_out: frozenset[int], deadline: float
 ) -> tuple[GaussianTrainer, GaussianTrainer] | None:
-    """Return trainers without and with motion after the trial ``config``; None where it takes too long."""
+    """Return trainers without and with motion after the trial ``config``; None where it takes too
+    long."""
     moving = assemble(config, capture, held_out=held_out)
     begins = motion_begins_after(config, config.train.steps) or 1
     if not _trained(moving, begins - 1, deadline):
@@ -203,20 +216,28 @@ def _with_and_without_motion(
     still = refitted(moving, _with(config, "model", motion_from=1.0))
     # In the last step of its schedule the model at rest would begin to move.
     both = still, moving
-    return both if all(_trained(trainer, config.train.steps - 1, deadline) for trainer in both) else None
+    return (
+        both
+        if all(_trained(trainer, config.train.steps - 1, deadline) for trainer in both)
+        else None
+    )
 
 
 def _compared(
     config: Config, settings: Sequence[OpenSetting], capture: Capture
 ) -> tuple[Config, list[Choice], Capture]:
-    """Return ``config`` with the settings that win small runs, all figures, and the prepared capture."""
+    """Return ``config`` with the settings that win small runs, all figures, and the prepared
+    capture."""
     settings = [x for x in settings if x.applied(config) is not None]
     capture = with_points(capture, config)
     plan = _Plan.of(config, capture, len(settings)) if settings else None
     if plan is None or len(plan.folds) * plan.runs < 2:
         if settings:
             keys = ", ".join(x.text for x in settings)
-            print(f"{keys} not taken: too short a run, or too few views, to compare held-out PSNR", flush=True)
+            print(
+                f"{keys} not taken: too short a run, or too few views, to compare held-out PSNR",
+                flush=True,
+            )
         return config, [], capture
     found, choices = _decided(config, settings[: plan.runs - 1], plan, capture)
     return found, choices, capture
@@ -225,11 +246,17 @@ def _compared(
 def _decided(
     config: Config, settings: Sequence[OpenSetting], plan: _Plan, capture: Capture
 ) -> tuple[Config, list[Choice]]:
-    """Return ``config`` with the settings that win, each tried on top of those before it, and all figures."""
-    print(f"small runs of {counted(plan.steps, 'step')}, compared on training views that are held out:", flush=True)
-    runs, found = plan.trained(config, capture), list[Choice]()
+    """Return ``config`` with the settings that win, each tried on top of those before it, and all
+    figures."""
+    print(
+        f"small runs of {counted(plan.steps, 'step')}, compared on training views that are held out:",
+        flush=True,
+    )
+    runs = plan.trained(config, capture)
+    found = list[Choice]()
     for setting in settings:
-        changed, begun = setting.applied(config), time.monotonic()
+        changed = setting.applied(config)
+        begun = time.monotonic()
         if changed is None:
             continue
         others = plan.trained(changed, capture)
@@ -246,58 +273,90 @@ def _decided(
 
 
 def _choice(
-    text: str, pairs: Sequence[tuple[float, float]], steps: int, seconds: float, errors: float = ERRORS
+    text: str,
+    pairs: Sequence[tuple[float, float]],
+    steps: int,
+    seconds: float,
+    errors: float = ERRORS,
 ) -> Choice:
     gains = [after - before for before, after in pairs]
-    gain, error = fmean(gains), (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
+    gain = fmean(gains)
+    error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
     without = fmean(before for before, _ in pairs)
-    return Choice(text, len(pairs), without, gain, error, steps, seconds, gain > max(errors * error, LEAST_GAIN))
+    return Choice(
+        text,
+        len(pairs),
+        without,
+        gain,
+        error,
+        steps,
+        seconds,
+        gain > max(errors * error, LEAST_GAIN),
+    )
 
 
 def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
     """Write what small runs said into a run folder; nothing where there were none."""
     if not choices:
         return
-    write_text(folder / CHOICES_NAME, json.dumps([asdict(choice) for choice in choices], indent=2) + "\n")
+    write_text(
+        folder / CHOICES_NAME, json.dumps([asdict(choice) for choice in choices], indent=2) + "\n"
+    )
 
 
 def as_static(config: Config) -> Config:
-    """Return ``config`` as a static scene, as the preset ``static`` trains it: only what was requested is kept.
+    """Return ``config`` as a static scene, as the preset ``static`` trains it: only what was
+    requested is kept.
 
     That includes ``train.steps``, where a static scene has such a key.
     """
     usual = load_config(packaged_preset("static"), [f"data.root={config.data.root}"])
     names = ("model", "init", "strategy", "optim", "train")
-    return config.model_copy(update={name: _requested(getattr(config, name), getattr(usual, name)) for name in names})
+    return config.model_copy(
+        update={name: _requested(getattr(config, name), getattr(usual, name)) for name in names}
+    )
 
 
 def _requested(given: Section, usual: Section) -> Section:
-    """Return ``usual`` with what was requested in ``given``; of another kind of init or strategy, that."""
+    """Return ``usual`` with what was requested in ``given``; of another kind of init or strategy,
+    that."""
     keys = given.model_fields_set
-    if not isinstance(given, DynamicModel) and type(given) is not type(usual) and (not keys or "kind" in keys):
+    if (
+        not isinstance(given, DynamicModel)
+        and type(given) is not type(usual)
+        and (not keys or "kind" in keys)
+    ):
         usual = type(given)()
     known = type(usual).model_fields
-    return usual.model_copy(update={key: getattr(given, key) for key in keys if key in known and key != "kind"})
+    return usual.model_copy(
+        update={key: getattr(given, key) for key in keys if key in known and key != "kind"}
+    )
 
 
 @dataclass(frozen=True)
 class _Plan:
     """Small runs that keep within their part of a run's work."""
 
-    folds: Sequence[frozenset[int]]  # sets of the training views held out; small runs are made once for each
+    # sets of the training views held out; small runs are made once for each
+    folds: Sequence[frozenset[int]]
     steps: int
     runs: int  # number of configurations that can be tried
-    first_side: float  # longest side of the images that the run itself begins with, px; small runs begin with no less
+    # longest side of the images that the run itself begins with, px; small runs begin with no less
+    first_side: float
 
     @staticmethod
     def of(config: Config, capture: Capture, num_settings: int) -> _Plan:
-        """Return the plan for a run of ``config`` in which so many settings are open; later ones may be left out."""
-        folds, view = _held_out(capture.splits["train"]), capture.splits["train"][0]
+        """Return the plan for a run of ``config`` in which so many settings are open; later ones
+        may be left out."""
+        folds = _held_out(capture.splits["train"])
+        view = capture.splits["train"][0]
         first = _longest_side(config, view) / config.train.initial_downscale
         if config.train.minutes is not None:
             return _Plan(folds, 0, 0, first)
         small = _small(config, 1000, first)
-        spent = SPENT * config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
+        spent = (
+            SPENT * config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
+        )
         for runs in range(1 + num_settings, 1, -1):
             steps = min(STEPS, int(spent / max(runs * len(folds), 1)))
             if steps >= FEWEST_STEPS:
@@ -306,7 +365,10 @@ class _Plan:
 
     def trained(self, config: Config, capture: Capture) -> list[GaussianTrainer]:
         """Return the trainers of ``config`` after a small run for each fold."""
-        return [_small_run(_small(config, self.steps, self.first_side), capture, held_out) for held_out in self.folds]
+        return [
+            _small_run(_small(config, self.steps, self.first_side), capture, held_out)
+            for held_out in self.folds
+        ]
 
 
 def _small_run(config: Config, capture: Capture, held_out: frozenset[int]) -> GaussianTrainer:
@@ -320,7 +382,9 @@ def _trained(trainer: GaussianTrainer, steps: int, deadline: float = math.inf) -
     with Interrupts() as interrupts:
         while trainer.done < steps and time.monotonic() < deadline:
             if interrupts.requested:
-                raise KeyboardInterrupt("stopped before training began: nothing is written, give the command again")
+                raise KeyboardInterrupt(
+                    "stopped before training began: nothing is written, give the command again"
+                )
             trainer.step()
     trainer.images.rest()
     return trainer.done >= steps
@@ -330,7 +394,11 @@ def _work_of_step(config: Config, view: View) -> float:
     width, height = view_size(view, config.data)
     times = range(0, config.train.steps, max(1, config.train.steps // 50))
     drawn = fmean(image_divisor(config.train, step) ** -2 for step in times)
-    return STEP_COST + width * height * drawn + GAUSSIAN_COST * min(config.strategy.growth_limit, width * height)
+    return (
+        STEP_COST
+        + width * height * drawn
+        + GAUSSIAN_COST * min(config.strategy.growth_limit, width * height)
+    )
 
 
 def _longest_side(config: Config, view: View) -> int:
@@ -344,17 +412,29 @@ def _trial_config(config: Config) -> Config:
 
 
 def _small(
-    config: Config, steps: int, first_side: float, side: int = SMALL_SIDE, most_gaussians: int = SMALL_GAUSSIANS
+    config: Config,
+    steps: int,
+    first_side: float,
+    side: int = SMALL_SIDE,
+    most_gaussians: int = SMALL_GAUSSIANS,
 ) -> Config:
     """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits.
 
-    They begin with no smaller images than the run itself, ``first_side`` px: in smaller ones motion is lost that it
-    follows.
+    They begin with no smaller images than the run itself, ``first_side`` px: in smaller ones motion
+    is lost that it follows.
     """
     side = min(config.data.longest_side or side, side)
-    divisors = (n for n in (16, 8, 4, 2) if n <= config.train.initial_downscale and side / n >= first_side)
+    divisors = (
+        n for n in (16, 8, 4, 2) if n <= config.train.initial_downscale and side / n >= first_side
+    )
     first = next(divisors, 1)
-    length = {"steps": steps, "minutes": None, "save_every": 0, "eval_every": 0, "initial_downscale": first}
+    length = {
+        "steps": steps,
+        "minutes": None,
+        "save_every": 0,
+        "eval_every": 0,
+        "initial_downscale": first,
+    }
     return config.model_copy(
         update={
             "data": config.data.model_copy(update={"longest_side": side}),
@@ -367,26 +447,39 @@ def _small(
 
 
 def _held_out(views: Sequence[View]) -> list[frozenset[int]]:
-    """Return the sets of views that small runs hold out, in order of time; none where views are too few."""
+    """Return the sets of views that small runs hold out, in order of time; none where views are too
+    few."""
     order = sorted(range(len(views)), key=lambda i: (views[i].time or 0.0, views[i].name))
     if len(order) < FEWEST_VIEWS:
         return []
     if len(order) < FEW_VIEWS:
         return [frozenset(order[1::4]), frozenset(order[3::4])]
-    every = max(3, len(order) // HELD_OUT | 1)  # odd, so that it is not always the same of several cameras
+    # odd, so that it is not always the same of several cameras
+    every = max(3, len(order) // HELD_OUT | 1)
     return [frozenset(order[every // 2 :: every])]
 
 
 def _settings(config: Config) -> list[OpenSetting]:
     """Return what is open in ``config``, by what it was worth in the past, the most first."""
-    model, found = config.model, list[OpenSetting]()
+    model = config.model
+    found = list[OpenSetting]()
     if not isinstance(model, (StaticModel, DynamicModel)):
         return found
     if config.camera.refine == "auto":
-        found.append(OpenSetting("camera.refine=always", lambda c: _with(c, "camera", refine="always"), after_pose_fit))
+        found.append(
+            OpenSetting(
+                "camera.refine=always",
+                lambda c: _with(c, "camera", refine="always"),
+                after_pose_fit,
+            )
+        )
     if config.train.exposure == "auto":
         found.append(
-            OpenSetting("train.exposure=always", lambda c: _with(c, "train", exposure="always"), after_colour_fit)
+            OpenSetting(
+                "train.exposure=always",
+                lambda c: _with(c, "train", exposure="always"),
+                after_colour_fit,
+            )
         )
     if config.train.robust == "auto":
         found.append(OpenSetting("train.robust=always", _robust, explained))
@@ -408,7 +501,9 @@ def _without_auto(config: Config) -> Config:
 
 
 def _robust(config: Config) -> Config | None:
-    return _with(config, "train", robust="always") if isinstance(config.model, StaticModel) else None
+    return (
+        _with(config, "train", robust="always") if isinstance(config.model, StaticModel) else None
+    )
 
 
 def _views_at_once(capture: Capture) -> float:
@@ -418,10 +513,11 @@ def _views_at_once(capture: Capture) -> float:
 
 
 def _what_moves(given: Config, field: DeformField, free: bool) -> tuple[Config, OpenSetting]:
-    """Return ``given`` with free primitives or, if not ``free``, with ``field``, and the setting of the other one.
+    """Return ``given`` with free primitives or, if not ``free``, with ``field``, and the setting of
+    the other one.
 
-    Images of free primitives grow early where nothing else was requested: nothing is followed through a clip, so that
-    small ones save less than they lose.
+    Images of free primitives grow early where nothing else was requested: nothing is followed
+    through a clip, so that small ones save less than they lose.
     """
     early = {name: x for name, x in EARLY.items() if name not in given.train.model_fields_set}
     usual = {name: getattr(given.train, name) for name in EARLY}
@@ -437,17 +533,27 @@ def _what_moves(given: Config, field: DeformField, free: bool) -> tuple[Config, 
 
 
 def _bounded(config: Config) -> Config:
-    """Return the configuration for fixed cameras, with the filter in space unless that was requested.
+    """Return the configuration for fixed cameras, with the filter in space unless that was
+    requested.
 
-    What is thinner than few cameras show fits these alone. Before eight, against 3DGS's wider filter in the image, a
-    room has -1.4 dB on other cameras without the filter in space and +0.7 with it, a die +0.9 and +2.2. Small runs
-    cannot tell: a camera whose image is held out is trained on at other times.
+    What is thinner than few cameras show fits these alone. Before eight, against 3DGS's wider
+    filter in the image, a room has -1.4 dB on other cameras without the filter in space and +0.7
+    with it, a die +0.9 and +2.2. Small runs cannot tell: a camera whose image is held out is
+    trained on at other times.
     """
-    return config if "filter_3d" in config.model.model_fields_set else _with(config, "model", filter_3d=True)
+    return (
+        config
+        if "filter_3d" in config.model.model_fields_set
+        else _with(config, "model", filter_3d=True)
+    )
 
 
 def _network(config: Config) -> Config | None:
-    return config.model_copy(update={"colour": NetworkColour()}) if isinstance(config.model, DynamicModel) else None
+    return (
+        config.model_copy(update={"colour": NetworkColour()})
+        if isinstance(config.model, DynamicModel)
+        else None
+    )
 
 
 def _moving_opacities(config: Config) -> Config | None:
@@ -463,7 +569,8 @@ def _with(config: Config, section: str, **values: object) -> Config:
 
 
 def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
-    """Return whether anything moves, where all cameras are fixed, and say so; None: they do not tell."""
+    """Return whether anything moves, where all cameras are fixed, and say so; None: they do not
+    tell."""
     views = capture.splits["train"]
     cameras = cameras_in_place(views)
     if sum(map(len, cameras)) <= 0.9 * len(views):
@@ -472,9 +579,15 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
     loader = ImageLoader(views, config.data.model_copy(update={"longest_side": side}))
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     used = [cameras[i] for i in evenly_spaced(len(cameras), LOOK_CAMERAS)]
-    images = [[loader[seen[i]].composite(background) for i in evenly_spaced(len(seen), LOOK_TIMES)] for seen in used]
+    images = [
+        [loader[seen[i]].composite(background) for i in evenly_spaced(len(seen), LOOK_TIMES)]
+        for seen in used
+    ]
     fraction = differing_fraction(images)
     moves = fraction > MIN_DIFFERING
     said = "something moves" if moves else "nothing moves, trained as a static scene"
-    print(f"{said}: {fraction:.2%} of the pixels of fixed cameras differ from their median", flush=True)
+    print(
+        f"{said}: {fraction:.2%} of the pixels of fixed cameras differ from their median",
+        flush=True,
+    )
     return moves

@@ -1,8 +1,9 @@
 """A run in several processes: the first one leads, the others do what it says.
 
-The first process reads what was asked for, chooses, limits, prunes, evaluates and writes, as if it were alone. Before
-each step it tells the others to do the same step, and where it has changed the scene outside of one it sends them all
-that a checkpoint holds. So the others need no run folder, and write nothing.
+The first process reads what was asked for, chooses, limits, prunes, evaluates and writes, as if it
+were alone. Before each step it tells the others to do the same step, and where it has changed the
+scene outside of one it sends them all that a checkpoint holds. So the others need no run folder,
+and write nothing.
 """
 
 from __future__ import annotations
@@ -41,11 +42,14 @@ class Order(IntEnum):
 
 
 class Leader:
-    """The first process of a run: a listener, and what is to be called before each step of the loop."""
+    """The first process of a run: a listener, and what is to be called before each step of the
+    loop."""
 
     def __init__(self, processes: Processes, config: Config, threads: int) -> None:
         self.processes, self._trainer, self._is_stale = processes, None, True
-        self._config = config.model_copy(update={"run": config.run.model_copy(update={"threads": threads})})
+        self._config = config.model_copy(
+            update={"run": config.run.model_copy(update={"threads": threads})}
+        )
 
     def __call__(self, event: Event) -> None:
         match event:
@@ -57,7 +61,11 @@ class Leader:
         if self.processes.size == 1 or not isinstance(trainer, Trainer):
             return
         if trainer is not self._trainer:
-            _tell(self.processes, Order.BUILD, json.dumps(self._config.model_dump(mode="json")).encode())
+            _tell(
+                self.processes,
+                Order.BUILD,
+                json.dumps(self._config.model_dump(mode="json")).encode(),
+            )
             self._trainer, self._is_stale = trainer, True
             trainer.processes = self.processes
         if self._is_stale:
@@ -67,7 +75,8 @@ class Leader:
 
 
 def together(lead: Callable[[Processes], int]) -> int:
-    """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``, the others follow."""
+    """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``,
+    the others follow."""
     with Processes.of_torchrun() as processes:
         if not processes.is_first:
             return EXIT_INTERRUPTED if follow(processes) else 0
@@ -84,7 +93,8 @@ def together(lead: Callable[[Processes], int]) -> int:
 def follow(processes: Processes) -> bool:
     """Do what the first process says until it says that all is done; nothing is printed.
 
-    Returns whether a signal told this process to stop, which the first process then does after the next step.
+    Returns whether a signal told this process to stop, which the first process then does after the
+    next step.
     """
     keep_freed_memory()
     with (
@@ -95,11 +105,15 @@ def follow(processes: Processes) -> bool:
     ):
         order, payload = _heard(processes)
         while order is Order.BUILD:
-            order, payload = _follow_run(processes, Config.model_validate(json.loads(payload)), interrupts)
+            order, payload = _follow_run(
+                processes, Config.model_validate(json.loads(payload)), interrupts
+            )
     return interrupts.requested
 
 
-def _follow_run(processes: Processes, config: Config, interrupts: Interrupts) -> tuple[Order, bytes]:
+def _follow_run(
+    processes: Processes, config: Config, interrupts: Interrupts
+) -> tuple[Order, bytes]:
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
         trainer = build(config, restored=True)
@@ -139,7 +153,9 @@ def _heard(processes: Processes) -> tuple[Order, bytes]:
 
 
 def _packed(checkpoint: Checkpoint) -> bytes:
-    tensors = {name: x.detach().cpu().contiguous().clone() for name, x in checkpoint.tensors.items()}
+    tensors = {
+        name: x.detach().cpu().contiguous().clone() for name, x in checkpoint.tensors.items()
+    }
     return save(tensors, {"info": json.dumps(asdict(checkpoint.info))})
 
 

@@ -34,30 +34,35 @@ def load(path: Path | str) -> GaussianScene:
 
         scene = dyngs.load("runs/lego")
         pose = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]])
-        camera = dyngs.Cameras(pose, torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64, 48)
-        image = scene.render(camera, time=0.5).rgb[0]
+        camera = dyngs.Cameras(pose, torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64,
+        48) image = scene.render(camera, time=0.5).rgb[0]
 
     Args:
-        path: a run folder (its newest checkpoint, or its ``scene.dyngs``), a ``scene.dyngs`` with the ``config.yaml``
-            of its run next to it, an avatar file (``.safetensors``), or a file of Gaussians such as a 3DGS ``.ply``.
+        path: a run folder (its newest checkpoint, or its ``scene.dyngs``), a ``scene.dyngs`` with
+            the ``config.yaml`` of its run next to it, an avatar file (``.safetensors``), or a file
+            of Gaussians such as a 3DGS ``.ply``.
 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
     opened = open_scene(Path(path))
-    scene, scale = opened.scene, opened.info.world_scale
+    scene = opened.scene
+    scale = opened.info.world_scale
     if scale == 1:
         return scene
     options = replace(scene.options, near=scale * scene.options.near)
     gaussians = _scaled(scene.gaussians, scale)
-    return ScaledScene(gaussians=gaussians, options=options, background=scene.background, scene=scene, scale=scale)
+    return ScaledScene(
+        gaussians=gaussians, options=options, background=scene.background, scene=scene, scale=scale
+    )
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
     """Read the capture in a folder; images are not decoded, only their headers are read.
 
-    Poses and points are in the unit of the files; where these lie far from their origin, ``Capture.world_offset`` is
-    subtracted. For arguments, splits, times and errors see ``dyngs.data.read.read_capture``.
+    Poses and points are in the unit of the files; where these lie far from their origin,
+    ``Capture.world_offset`` is subtracted. For arguments, splits, times and errors see
+    ``dyngs.data.read.read_capture``.
 
     Example::
 
@@ -103,7 +108,9 @@ class ScaledScene(GaussianScene):
 
     def time_step(self, time: float | None) -> _ScaledTimeStep:
         inner = self.scene.time_step(time)
-        return _ScaledTimeStep(_scaled(inner.gaussians, self.scale), inner.time, inner.frame, inner=inner)
+        return _ScaledTimeStep(
+            _scaled(inner.gaussians, self.scale), inner.time, inner.frame, inner=inner
+        )
 
     def render(
         self,

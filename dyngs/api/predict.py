@@ -1,4 +1,5 @@
-"""Prediction of a person from a few images by a trained network of any kind, as a run folder like that of training."""
+"""Prediction of a person from a few images by a trained network of any kind, as a run folder like
+that of training."""
 
 from __future__ import annotations
 
@@ -46,20 +47,24 @@ def predict(
     say: Callable[[str], None] = show,
     report: ReportProgress = report_nothing,
 ) -> Prediction:
-    """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train --resume`` refines it.
+    """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train
+    --resume`` refines it.
 
     Args:
-        network: run folder of a network that predicts people, see ``dyngs.models.prediction``, a file of its weights,
-            see ``dyngs.runs.network_file``, or the name of published ones.
+        network: run folder of a network that predicts people, see ``dyngs.models.prediction``, a
+            file of its weights, see ``dyngs.runs.network_file``, or the name of published ones.
         capture: of a person, in any format that has silhouettes.
         out: a new run folder.
-        views: how many of the training views to predict from; or their names; None: as many as the network is for.
-        steps: of training the network on these images before; None: as many as usual for such a network.
+        views: how many of the training views to predict from; or their names; None: as many as the
+            network is for.
+        steps: of training the network on these images before; None: as many as usual for such a
+            network.
         say: is told in a line of what takes long before.
         report: is told how far that and these steps have come.
 
     Raises:
-        DyngsError: not such a run or capture, views that are not there or do not suit, or an ``out`` that is not empty.
+        DyngsError: not such a run or capture, views that are not there or do not suit, or an
+            ``out`` that is not empty.
     """
     if steps is not None and steps < 0:
         raise DyngsError(f"cannot train for {steps} steps; give 0 or more")
@@ -80,7 +85,8 @@ def predict(
 
 
 def trained_network(network: Path) -> tuple[Config, Checkpoint]:
-    """Return configuration and weights of a network: its run, a file, or a published name. Raises DyngsError."""
+    """Return configuration and weights of a network: its run, a file, or a published name. Raises
+    DyngsError."""
     if not network.exists() and network.name == str(network):
         network = published_network(network.name)
     if network.is_file():
@@ -90,19 +96,27 @@ def trained_network(network: Path) -> tuple[Config, Checkpoint]:
 
 
 def network_config(run_dir: Path) -> Config:
-    """Return the configuration of the run of a network. Raises DyngsError: it is of something else."""
+    """Return the configuration of the run of a network. Raises DyngsError: it is of something
+    else."""
     config = load_resolved(run_dir)
     if not config.model.is_network:
         known = " or ".join(kind.section().kind for kind in KINDS if kind.section.is_network)
-        raise DyngsError(f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs one of {known}")
+        raise DyngsError(
+            f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs one of {known}"
+        )
     return config
 
 
-def write_run(out: Path, predictor: Predictor, views: Sequence[int], scene: Renderable, seconds: float) -> None:
+def write_run(
+    out: Path, predictor: Predictor, views: Sequence[int], scene: Renderable, seconds: float
+) -> None:
     """Write ``scene``, which was predicted from ``views``, as a run after no step."""
     config = predictor.run_config(views)
-    config = config.model_copy(update={"run": config.run.model_copy(update={"name": out.name, "dir": out})})
-    unjudged = config.train.model_copy(update={"priors": ()})  # whether maps are used is for a training to find
+    config = config.model_copy(
+        update={"run": config.run.model_copy(update={"name": out.name, "dir": out})}
+    )
+    # whether maps are used is for a training to find
+    unjudged = config.train.model_copy(update={"priors": ()})
     trainer = assemble(config.model_copy(update={"train": unjudged}), restored=True)
     predictor.begin(trainer.model, scene, config)
     with new_folder(out, require_empty) as started:
@@ -114,5 +128,7 @@ def _chosen(predictor: Predictor, views: int | tuple[str, ...]) -> list[int]:
     if isinstance(views, tuple):
         return named_views(predictor.name, predictor.views, views)
     if not 1 <= views <= len(predictor.views):
-        raise DyngsError(f"{predictor.name}: cannot choose {views} of its {len(predictor.views)} training views")
+        raise DyngsError(
+            f"{predictor.name}: cannot choose {views} of its {len(predictor.views)} training views"
+        )
     return predictor.chosen(views)

@@ -1,4 +1,5 @@
-"""Pruning of a finished run into a smaller one: by a share that is given, or as far as a loss allows."""
+"""Pruning of a finished run into a smaller one: by a share that is given, or as far as a loss
+allows."""
 
 from __future__ import annotations
 
@@ -23,7 +24,13 @@ from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Promise, Search
 from dyngs.runs.capture_record import RECORD_NAME
-from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
+from dyngs.runs.checkpoint import (
+    SCENE_FILE,
+    TIMING_NAME,
+    latest_checkpoint,
+    save_checkpoint,
+    seconds_at,
+)
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, require_empty
 from dyngs.runs.frame import FRAME_NAME
@@ -34,16 +41,19 @@ SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.st
 
 
 def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
-    """Return the new run folder ``out``, which starts where the run in ``run_dir`` is and ends with fewer Gaussians.
+    """Return the new run folder ``out``, which starts where the run in ``run_dir`` is and ends with
+    fewer Gaussians.
 
     Args:
         run_dir: a run with at least one checkpoint; an interrupted one counts as finished there.
         out: must not exist, or be empty.
-        overrides: ``prune.key=value`` and ``run.threads=N``; what they do not say of the stage has its default.
+        overrides: ``prune.key=value`` and ``run.threads=N``; what they do not say of the stage has
+            its default.
 
     Raises:
         DyngsError: no such run, a folder that is taken, a wrong value, nothing to do.
-        KeyboardInterrupt: after Ctrl-C; ``dyngs train --resume`` goes on, and ``dyngs export`` writes the file then.
+        KeyboardInterrupt: after Ctrl-C; ``dyngs train --resume`` goes on, and ``dyngs export``
+            writes the file then.
     """
     require_empty(out)
     start = latest_checkpoint(run_dir)
@@ -66,11 +76,17 @@ def file_of(folder: Path) -> Path:
 
 
 def prune_within(
-    run_dir: Path, out: Path, max_loss: float, overrides: Sequence[str], tell: Callable[[str], None] = show
+    run_dir: Path,
+    out: Path,
+    max_loss: float,
+    overrides: Sequence[str],
+    tell: Callable[[str], None] = show,
 ) -> Promise:
-    """Take as much from the run in ``run_dir`` as ``max_loss`` allows, and write the rest to ``out``: a run and a file.
+    """Take as much from the run in ``run_dir`` as ``max_loss`` allows, and write the rest to
+    ``out``: a run and a file.
 
-    Nothing is written before the end: an interruption leaves nothing behind, and the next call begins anew.
+    Nothing is written before the end: an interruption leaves nothing behind, and the next call
+    begins anew.
 
     Args:
         run_dir: a run with at least one checkpoint; an interrupted one counts as finished there.
@@ -80,15 +96,21 @@ def prune_within(
         tell: is told what is tried and found.
 
     Raises:
-        DyngsError: no such run, a folder that is taken, a wrong value, a choice that leaves nothing to search.
+        DyngsError: no such run, a folder that is taken, a wrong value, a choice that leaves nothing
+            to search.
     """
     require_empty(out)
-    start, begun = latest_checkpoint(run_dir), time.perf_counter()
+    start = latest_checkpoint(run_dir)
+    begun = time.perf_counter()
     config = _config_from(run_dir, start, out, [f"prune.steps={SEARCH_STEPS}", *overrides])
     if config.prune.is_wanted:
-        raise DyngsError("prune.fraction and prune.mask_times are chosen with --prune R, which removes just that share")
+        raise DyngsError(
+            "prune.fraction and prune.mask_times are chosen with --prune R, which removes just that share"
+        )
     if config.model != load_resolved(run_dir).model:
-        raise DyngsError("model.*: losses are counted from RUN as it is; choose that with --prune R")
+        raise DyngsError(
+            "model.*: losses are counted from RUN as it is; choose that with --prune R"
+        )
     keep_freed_memory()
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or num_cores()), bytewise:
@@ -116,7 +138,8 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
 
 
 def unseen_images(trainer: GaussianTrainer) -> list[Image]:
-    """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people none.
+    """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people
+    none.
 
     They play other motions there, in which poses are not refined.
     """

@@ -106,7 +106,8 @@ def train(
 ) -> Path:
     """Train and return the run folder.
 
-    Poses of photos and videos are found first, and a body is fitted to a person where that is needed.
+    Poses of photos and videos are found first, and a body is fitted to a person where that is
+    needed.
 
     Example::
 
@@ -116,18 +117,22 @@ def train(
         run = dyngs.train(dyngs.load_config("static", overrides))
 
     Args:
-        config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
-            changed: the run then goes on to so many, on their schedules (``dyngs.training.extend``).
-        resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning where it was stopped
-            before its first: the result has the same bytes as if the run had never stopped.
+        config: everything that decides the run; on resuming, that of the run folder, whose
+            ``train.steps`` may be changed: the run then goes on to so many, on their schedules
+                (``dyngs.training.extend``).
+        resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning
+            where it was stopped before its first: the result has the same bytes as if the run had
+                never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
         progress: shows how far what comes before training is.
 
     Raises:
-        DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
-            cannot be kept, no GPU where one is asked for, a loss that is not finite, a full disk.
-        KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
+        DyngsError: bad input, a run folder that already holds a run or that another process writes
+            into, a budget that cannot be kept, no GPU where one is asked for, a loss that is not
+            finite, a full disk.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how
+            to go on.
     """
     folder = resume_from or config.run.dir or default_folder(config.run.name)
     processes = processes or Processes()
@@ -154,7 +159,11 @@ def train(
         resumed = _start_of_run(config, folder, resuming=resume_from is not None)
         if resume_from is not None:
             config = _with_new_length(config, folder, resumed)
-        if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
+        if (
+            resumed is not None
+            and resumed.info.step >= config.total_steps
+            and not _owes_file(config, folder)
+        ):
             print(
                 f"{folder}: all {counted(config.total_steps, 'step')} are done; train.steps=N goes on to more",
                 flush=True,
@@ -167,7 +176,16 @@ def train(
         config, choices, capture = _chosen(config, resumed)
         if resumed is not None:
             _warn_of_changed_files(folder, config, capture)
-        run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, watch=watch)
+        run = _Run(
+            config,
+            folder,
+            resumed,
+            asked,
+            capture=capture,
+            held=held,
+            processes=processes,
+            watch=watch,
+        )
         write_choices(run.folder, choices)
         lines = run.run(listeners)
         folder = run.folder
@@ -177,8 +195,11 @@ def train(
     return folder
 
 
-def _chosen(config: Config, resumed: Checkpoint | None) -> tuple[Config, list[Choice], Capture | None]:
-    """Return the configuration with all decided, what was said, and the capture, which nothing reads again."""
+def _chosen(
+    config: Config, resumed: Checkpoint | None
+) -> tuple[Config, list[Choice], Capture | None]:
+    """Return the configuration with all decided, what was said, and the capture, which nothing
+    reads again."""
     if config.model.is_network:
         return config, [], None  # it has several captures
     if resumed is not None:
@@ -187,7 +208,11 @@ def _chosen(config: Config, resumed: Checkpoint | None) -> tuple[Config, list[Ch
 
 
 def _told_again(config: Config, folder: Path) -> str:
-    longer = "" if config.prune.is_wanted else f", go on with `dyngs train --resume {as_word(folder)} train.steps=N`"
+    longer = (
+        ""
+        if config.prune.is_wanted
+        else f", go on with `dyngs train --resume {as_word(folder)} train.steps=N`"
+    )
     return (
         f"{folder} holds just this run, finished, and training again would end with the same bytes: nothing is done; "
         f"look at it with `dyngs eval {as_word(folder)}`{longer}, or give another run.dir"
@@ -201,7 +226,8 @@ class _Run:
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen.
         held: the lock of the folder, which knows where that is if it is renamed.
-        watch: seconds since the capture was read, which include those of short trainings before the run.
+        watch: seconds since the capture was read, which include those of short trainings before the
+            run.
     """
 
     def __init__(
@@ -228,8 +254,11 @@ class _Run:
         if resumed is not None:
             trainer.restore(resumed)
             watch.pause(-seconds_at(folder, resumed.info.step))
-        self.limited = LimitedRun(folder, config, self.loop, trainer) if isinstance(trainer, Trainer) else None
-        self._config, self._saved = config, self.loop.trainer.done
+        self.limited = (
+            LimitedRun(folder, config, self.loop, trainer) if isinstance(trainer, Trainer) else None
+        )
+        self._config = config
+        self._saved = self.loop.trainer.done
         self._save_timer = SaveTimer(config.train.save_minutes, watch.seconds)
         self._gaussians = self.limited if config.model.made_of_gaussians else None
         if self._gaussians is not None:
@@ -249,10 +278,15 @@ class _Run:
         return self._config if self.limited is None else self.limited.config
 
     def run(self, listeners: Sequence[Listener]) -> list[str]:
-        """Step until the end, or until interrupted, and keep the limits; return a line for each limit."""
-        options, loop, done = self.config.train, self.loop, self.loop.trainer.done
+        """Step until the end, or until interrupted, and keep the limits; return a line for each
+        limit."""
+        options = self.config.train
+        loop = self.loop
+        done = self.loop.trainer.done
         with (
-            RunLog(self.folder, done, every=options.log_every, tensorboard=options.tensorboard) as log,
+            RunLog(
+                self.folder, done, every=options.log_every, tensorboard=options.tensorboard
+            ) as log,
             Progress(loop.total, done, options.log_every, config=lambda: self.config) as progress,
             Interrupts() as interrupts,
         ):
@@ -261,7 +295,13 @@ class _Run:
             if gaussians is not None:
                 loop.subscribe(FloaterRemoval(loop, lambda: gaussians.trainer))
             loop.subscribe(
-                self._leader, *measures, *self.limits.values(), log, progress, *listeners, self._save_and_evaluate
+                self._leader,
+                *measures,
+                *self.limits.values(),
+                log,
+                progress,
+                *listeners,
+                self._save_and_evaluate,
             )
             if gaussians is not None:
                 loop.subscribe(PruneStage(loop, lambda: gaussians.trainer))
@@ -279,7 +319,9 @@ class _Run:
                 )
         return list(self._reached())
 
-    def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None, first: FirstGaussians | None) -> None:
+    def _set_limits(
+        self, run: LimitedRun, resumed: Checkpoint | None, first: FirstGaussians | None
+    ) -> None:
         minutes = run.config.train.minutes
         if minutes is not None:
             run.given = 60 * minutes
@@ -291,7 +333,9 @@ class _Run:
             self.limits[_TIME] = Deadline(
                 run, wanted, fits=resumed is None, refit_seconds=refit_seconds, save=self._save
             )
-            self._meter = CostMeter(run, wanted) if resumed is None and self._gaussians is not None else None
+            self._meter = (
+                CostMeter(run, wanted) if resumed is None and self._gaussians is not None else None
+            )
         count = count_limit(run)
         if count is not None:
             self.limits[_COUNT] = count
@@ -301,7 +345,8 @@ class _Run:
     def _save_and_evaluate(self, event: Event) -> None:
         match event:
             case StepDone():
-                options, step = self.config.train, event.step
+                options = self.config.train
+                step = event.step
                 evaluates = options.eval_every > 0 and step % options.eval_every == 0
                 is_last = step == options.steps or event.is_last
                 is_due = options.save_every > 0 and step % options.save_every == 0
@@ -322,7 +367,8 @@ class _Run:
             write_config(self.config, self.folder)
         path = save_checkpoint(self.folder, checkpoint, self.loop.watch.seconds)
         if found is None:
-            done, again = self.loop.trainer.done, f"dyngs train --resume {as_word(self.folder)}"
+            done = self.loop.trainer.done
+            again = f"dyngs train --resume {as_word(self.folder)}"
             raise DyngsError(
                 f"the folder of the run was removed, or moved to another disk; the checkpoint after step {done} is in "
                 f"{self.folder}; go on with `{again}`"
@@ -358,7 +404,11 @@ class _Run:
         for part in (_COUNT, _TIME):
             if part in self.limits:
                 yield self.limits[part].reached()
-        cost = None if self._meter is None or self._meter.steps <= self.loop.trainer.done else self._meter.found()
+        cost = (
+            None
+            if self._meter is None or self._meter.steps <= self.loop.trainer.done
+            else self._meter.found()
+        )
         if cost is not None:
             yield f"{cost}; {self._how_to_go_on(cost.steps)}"
         if self.limited is not None and self.config.budget.max_mb is not None:
@@ -366,7 +416,8 @@ class _Run:
 
 
 def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None) -> None:
-    """Print which files of the capture have changed since the run began. Raises DyngsError: it is another capture."""
+    """Print which files of the capture have changed since the run began. Raises DyngsError: it is
+    another capture."""
     changed = changed_files(folder, config.data, capture)
     if changed:
         views = counted(len(changed), "training view")
@@ -375,7 +426,8 @@ def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None
 
 
 def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
-    """Print how much memory a run will take, and a warning where that is likely to be more than is there."""
+    """Print how much memory a run will take, and a warning where that is likely to be more than is
+    there."""
     for forecast in memory_forecasts(trainer, processes):
         print(forecast, flush=True)
         forecast.require_possible()
@@ -387,13 +439,19 @@ def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
 def _free(folder: Path) -> Path:
     """Return ``folder`` if nothing is there, else one of a similar name."""
     names = (folder.with_name(f"{folder.name}_{number}") for number in counted_from(2))
-    return folder if not os.path.lexists(folder) else next(path for path in names if not os.path.lexists(path))
+    return (
+        folder
+        if not os.path.lexists(folder)
+        else next(path for path in names if not os.path.lexists(path))
+    )
 
 
 def _is_done_and_read_only(config: Config, folder: Path) -> bool:
     """Return whether nothing is to be done in the run folder, and nothing can be."""
     paths = checkpoint_paths(folder)
-    is_done = bool(paths) and step_of(paths[-1]) >= config.total_steps and not _owes_file(config, folder)
+    is_done = (
+        bool(paths) and step_of(paths[-1]) >= config.total_steps and not _owes_file(config, folder)
+    )
     return is_done and not os.access(folder, os.W_OK)
 
 
@@ -402,7 +460,8 @@ def _owes_file(config: Config, folder: Path) -> bool:
 
 
 def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint | None:
-    """Return the checkpoint to go on from; None for a run that begins, or that was stopped before its first."""
+    """Return the checkpoint to go on from; None for a run that begins, or that was stopped before
+    its first."""
     if not resuming:
         require_startable(folder, config)
         return None
@@ -414,8 +473,10 @@ def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint
 
 
 def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -> Config:
-    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another number of steps."""
-    stored, steps = load_resolved(folder), config.train.steps
+    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another
+    number of steps."""
+    stored = load_resolved(folder)
+    steps = config.train.steps
     was = stored.train.steps
     if steps == was:
         return config
@@ -428,11 +489,16 @@ def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -
     done = resumed.info.step
     longer = with_length(stored, done, steps)
     print(told(stored, longer, done), flush=True)
-    if stored.budget.max_mb is not None:  # otherwise a run that is stopped now would take it for its own
+    if stored.budget.max_mb is not None:
+        # otherwise a run that is stopped now would take it for its own
         (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
     save_config(longer, folder / RESOLVED_NAME)
     (folder / ASKED_NAME).unlink(missing_ok=True)  # what was asked for now is what is there
-    return with_length(config.model_copy(update={"train": config.train.model_copy(update={"steps": was})}), done, steps)
+    return with_length(
+        config.model_copy(update={"train": config.train.model_copy(update={"steps": was})}),
+        done,
+        steps,
+    )
 
 
 def _num_threads(config: Config, processes: Processes) -> int:
@@ -451,8 +517,10 @@ def num_cores() -> int:
 def with_capture(
     config: Config, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> Config:
-    """Return the configuration with a capture that can be trained on; what is found for it is kept for other runs."""
-    data, model = config.data, config.model
+    """Return the configuration with a capture that can be trained on; what is found for it is kept
+    for other runs."""
+    data = config.data
+    model = config.model
     if model.is_network:
         return config  # its folder holds a capture per person
     root = data.root
@@ -464,11 +532,14 @@ def with_capture(
         data = with_poses(data, needs_times=model.may_move, say=say, report=report)
     else:
         if is_unposed(data):
-            from dyngs.human.detection.find_person import with_found_person  # late: other kinds need no detector
+            # late: other kinds need no detector
+            from dyngs.human.detection.find_person import with_found_person
 
             data = with_found_person(data, say=say, report=report)
         if isinstance(model, HumanModel):
-            data = with_fitted_body(data, model, only_if_needed=not model.fit, say=say, report=report)
+            data = with_fitted_body(
+                data, model, only_if_needed=not model.fit, say=say, report=report
+            )
     if data.root == folder:  # the archive outlives the cache
         data = data.model_copy(update={"root": root})
     return config.model_copy(update={"data": data})

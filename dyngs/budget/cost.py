@@ -1,7 +1,9 @@
-"""The cost of a run of all its steps, by what was measured in one that ``train.minutes`` made shorter: a preview.
+"""The cost of a run of all its steps, by what was measured in one that ``train.minutes`` made
+shorter: a preview.
 
-A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.training.clock``), at the
-measured pace; about equally many Gaussians are added each time. How far that was from full runs: docs/budget.md.
+A step is taken to cost a constant, and in proportion to its pixels and its Gaussians
+(``dyngs.training.clock``), at the measured pace; about equally many Gaussians are added each time.
+How far that was from full runs: docs/budget.md.
 """
 
 from __future__ import annotations
@@ -24,11 +26,14 @@ SLOWER = 0.1
 """Power of the number of changes with which each adds fewer Gaussians."""
 LEAST, MOST = 0.5, 1.6
 """Factors on the Gaussians still to be added, for the range that is told."""
-USUAL_MORE, UNSEEN = 4000.0, (0.25, 1.0, 2.0)
-"""Gaussians that a change usually adds, for a preview that saw none, and the factors on them for the range. Seen:
-colmap_small 3,300 (100 px), stage 1,900 (100 px), fox 7,800 (200 px and 480 px), lego 7,400."""
+USUAL_MORE = 4000.0
+UNSEEN = (0.25, 1.0, 2.0)
+"""Gaussians that a change usually adds, for a preview that saw none, and the factors on them for
+the range. Seen: colmap_small 3,300 (100 px), stage 1,900 (100 px), fox 7,800 (200 px and 480 px),
+lego 7,400."""
 PACE, PACE_UNSEEN, MEMORY = 1.3, 2.0, 1.2
-"""Factors, up and down, by which time and memory may differ besides; time more where no growth was seen, either."""
+"""Factors, up and down, by which time and memory may differ besides; time more where no growth was
+seen, either."""
 OUTLIER = 4.0
 """Steps that took so many times longer than usual did something else, too."""
 FIRST = 5
@@ -51,7 +56,8 @@ class Range:
 
 @dataclass(frozen=True)
 class ExpectedCost:
-    """What a run of ``steps`` is expected to cost: seconds, bytes of memory and of disk, and its Gaussians."""
+    """What a run of ``steps`` is expected to cost: seconds, bytes of memory and of disk, and its
+    Gaussians."""
 
     steps: int
     seconds: Range
@@ -69,7 +75,9 @@ class CostMeter:
     """Listener that measures what steps cost."""
 
     def __init__(self, run: LimitedRun, steps: int) -> None:
-        self.run, self.steps, self.first = run, steps, run.trainer.num_gaussians
+        self.run = run
+        self.steps = steps
+        self.first = run.trainer.num_gaussians
         self._last: float | None = None
         self._paces: list[float] = []
         self._pixels = self._stepping = 0.0
@@ -92,17 +100,26 @@ class CostMeter:
             return None
         usual = median(paces)
         pace = fmean(pace for pace in paces if pace <= OUTLIER * usual)
-        config, now = with_steps(self.run.config, self.steps), self.run.trainer.num_gaussians
-        counts, has_grown = self.gaussians(config), num_changes(self.run.trainer.config, self.run.trainer.done) > 0
+        config = with_steps(self.run.config, self.steps)
+        now = self.run.trainer.num_gaussians
+        counts = self.gaussians(config)
+        has_grown = num_changes(self.run.trainer.config, self.run.trainer.done) > 0
         spread = PACE if has_grown else PACE_UNSEEN
         other = max(self.run.used - self._stepping, 0.0)
-        slow, middle, fast = (other + pace * self._whole(config, n) for n in (counts.high, counts.middle, counts.low))
-        peak, each = peak_memory() + self.run.trainer.images.bytes_to_come, gaussian_bytes(config)
-        least, expected, most = (peak + each * max(n - now, 0) for n in (counts.low, counts.middle, counts.high))
+        slow, middle, fast = (
+            other + pace * self._whole(config, n) for n in (counts.high, counts.middle, counts.low)
+        )
+        peak = peak_memory() + self.run.trainer.images.bytes_to_come
+        each = gaussian_bytes(config)
+        least, expected, most = (
+            peak + each * max(n - now, 0) for n in (counts.low, counts.middle, counts.high)
+        )
         paths = checkpoint_paths(self.run.folder)
         options = config.train
         saves_often = options.save_every > 0 or 0 < 60 * options.save_minutes < middle
-        stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if saves_often else 1)
+        stored = (
+            (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if saves_often else 1)
+        )
         return ExpectedCost(
             self.steps,
             Range(fast / spread, middle, slow * spread),
@@ -113,32 +130,42 @@ class CostMeter:
 
     def gaussians(self, config: Config) -> Range:
         """Return how many Gaussians the run of ``config`` is expected to end with."""
-        now, limit = self.run.trainer.num_gaussians, self.run.trainer.config.strategy.growth_limit
-        done, changes = num_changes(self.run.trainer.config, self.run.trainer.done), num_changes(config)
+        now = self.run.trainer.num_gaussians
+        limit = self.run.trainer.config.strategy.growth_limit
+        done = num_changes(self.run.trainer.config, self.run.trainer.done)
+        changes = num_changes(config)
         match config.strategy:
             case McmcStrategy():
                 grown = (1 + growth_per_change(self.steps)) ** min(changes, 10_000)
                 count = max(min(self.first * min(grown, 1e9), limit), now)
                 return Range(count, count, count)
             case DefaultStrategy() if config.strategy.grow:
-                more, factors = self._more(now, done, changes), (LEAST, 1.0, MOST) if done else UNSEEN
-                low, middle, high = (max(min(now + factor * more, limit), now) for factor in factors)
+                more = self._more(now, done, changes)
+                factors = (LEAST, 1.0, MOST) if done else UNSEEN
+                low, middle, high = (
+                    max(min(now + factor * more, limit), now) for factor in factors
+                )
                 return Range(low, middle, high)
             case DefaultStrategy() | FixedStrategy():
                 return Range(now, now, now)
 
     def _more(self, now: int, done: int, changes: int) -> float:
-        """Return how many Gaussians are still to be added, by what the changes ``done`` have added; else as usual."""
+        """Return how many Gaussians are still to be added, by what the changes ``done`` have added;
+        else as usual."""
         if not done:
             return changes * USUAL_MORE
         each = max(now - self.first, 0.05 * now) / done
         return each * (max(changes, 1) / done) ** -SLOWER * max(changes - done, 0)
 
     def _whole(self, config: Config, count: float) -> float:
-        """Return the cost of all steps of ``config``, whose Gaussians become ``count`` while they are added."""
-        steps, stop = config.train.steps, scaled(config.strategy.stop, config.train.steps)
+        """Return the cost of all steps of ``config``, whose Gaussians become ``count`` while they
+        are added."""
+        steps = config.train.steps
+        stop = scaled(config.strategy.stop, config.train.steps)
         more = count - self.first
-        return cost_between(config, 0, steps, self._pixels, lambda step: self.first + more * min(step / stop, 1.0))
+        return cost_between(
+            config, 0, steps, self._pixels, lambda step: self.first + more * min(step / stop, 1.0)
+        )
 
 
 def _two_digits(x: float) -> str:

@@ -1,7 +1,8 @@
-"""The number of Gaussians in the end, which ``budget.max_gaussians`` or the size of a file limits, and what that costs.
+"""The number of Gaussians in the end, which ``budget.max_gaussians`` or the size of a file limits,
+and what that costs.
 
-Growth ends at the limit, but a run may begin with more, most of which show nothing: those that matter least are removed
-late, with steps left for the others to adapt.
+Growth ends at the limit, but a run may begin with more, most of which show nothing: those that
+matter least are removed late, with steps left for the others to adapt.
 """
 
 from __future__ import annotations
@@ -34,8 +35,11 @@ class CountLimit:
         """Remove Gaussians after a step of a late stage, if there are too many."""
         count = self.run.trainer.num_gaussians
         if isinstance(event, StepDone) and count > self.most and self.run.stage:
-            before, after = self.run.remove(highest(scores_of(self.run.trainer), 1 - self.most / count))
-            self.before, self.lost = self.before or count, self.lost + before - after
+            before, after = self.run.remove(
+                highest(scores_of(self.run.trainer), 1 - self.most / count)
+            )
+            self.before = self.before or count
+            self.lost = self.lost + before - after
             self.run.say(
                 f"step {event.step}: {self._name}: {count:,} -> {counted(self.most, 'Gaussian')}; "
                 f"{after - before:+.2f} dB on training views"
@@ -60,7 +64,10 @@ class CountLimit:
         count = self.run.trainer.num_gaussians
         if self.before:
             cost = f"{self.before:,} before, {-self.lost:+.2f} dB on training views when they were removed"
-        elif CLOSE * self.most <= count and 0 < self.run.trainer.config.strategy.growth_limit <= self.most:
+        elif (
+            CLOSE * self.most <= count
+            and 0 < self.run.trainer.config.strategy.growth_limit <= self.most
+        ):
             cost = "it held growth back; what more would bring is not known"
         else:
             cost = "it cost nothing"
@@ -68,7 +75,11 @@ class CountLimit:
 
     @property
     def _name(self) -> str:
-        return "budget.max_gaussians" if self.most == self.run.trainer.config.budget.max_gaussians else "budget.max_mb"
+        return (
+            "budget.max_gaussians"
+            if self.most == self.run.trainer.config.budget.max_gaussians
+            else "budget.max_mb"
+        )
 
 
 def count_limit(run: LimitedRun) -> CountLimit | None:

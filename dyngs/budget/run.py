@@ -16,8 +16,8 @@ from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
 
 STAGES = (0.7, 0.9)
-"""Fractions of a run after which Gaussians are removed where that is needed, with steps left for the others to
-adapt."""
+"""Fractions of a run after which Gaussians are removed where that is needed, with steps left for
+the others to adapt."""
 
 
 @dataclass
@@ -48,9 +48,11 @@ class LimitedRun:
         self.trainer = self.loop.trainer = trainer
 
     def remove(self, kept: Tensor) -> tuple[float, float]:
-        """Leave only the Gaussians ``kept`` (N,); return the quality of training images before and after, dB."""
+        """Leave only the Gaussians ``kept`` (N,); return the quality of training images before and
+        after, dB."""
         trainer = self.trainer
-        before, count = quality_of(trainer, trainer.model.scene), trainer.num_gaussians
+        before = quality_of(trainer, trainer.model.scene)
+        count = trainer.num_gaussians
         trainer.model.keep(kept, trainer.done)
         self.loop.tell(TopologyChanged(trainer.done, count, trainer.num_gaussians))
         return before, quality_of(trainer, trainer.model.scene)
@@ -62,9 +64,11 @@ class LimitedRun:
 def stage(config: Config, step: int, fraction: float = 0.0) -> int:
     """Return how many stages of removal a run has come to after ``step``; the last is its end.
 
-    Where pruning follows training, its beginning is the first stage, and the others are fractions of it.
+    Where pruning follows training, its beginning is the first stage, and the others are fractions
+    of it.
     """
-    steps, total = config.train.steps, config.total_steps
+    steps = config.train.steps
+    total = config.total_steps
     if step > steps:
         later = (step - steps) / (total - steps)
         return len(STAGES) + 2 + sum(later >= x for x in (*STAGES, 1.0))

@@ -29,7 +29,9 @@ from dyngs.triangles.scene import TriangleScene
 
 KEPT = 0.7
 """Fraction of the Gaussians that each trial keeps of those of the trial before."""
-FINEST_CHANGE, LARGEST_CHANGE, COARSEST = 2**0.25, 2.0, 64.0
+FINEST_CHANGE = 2**0.25
+LARGEST_CHANGE = 2.0
+COARSEST = 64.0
 """Smallest and largest factor on the steps per trial, and the largest in all."""
 _TRIALS = 40
 
@@ -40,7 +42,8 @@ class SizeReport:
 
     Attributes:
         asked, megabytes: 1e6 bytes.
-        before, after: mean PSNR of at most 16 training images, dB: as trained, and as read from the file.
+        before, after: mean PSNR of at most 16 training images, dB: as trained, and as read from the
+            file.
         num_gaussians, num_kept: as trained, and in the file.
         coarser: than usual by this factor are the steps to which values are rounded.
     """
@@ -82,14 +85,17 @@ def has_file(run_dir: Path) -> bool:
 
 @torch.no_grad()
 def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> SizeReport:
-    """Write ``scene.dyngs``, of at most so many 1e6 bytes, into a folder of ``run_dir``, and return a report.
+    """Write ``scene.dyngs``, of at most so many 1e6 bytes, into a folder of ``run_dir``, and return
+    a report.
 
-    Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
-    makes training images better than the former alone; triangles, which would leave holes, all stay. The ``trainer`` is
-    at the end of its run and left as it is.
+    Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians,
+    as long as the latter makes training images better than the former alone; triangles, which would
+    leave holes, all stay. The ``trainer`` is at the end of its run and left as it is.
     """
-    full, config = trainer.checkpoint(), trainer.config
-    scene, images = trainer.model.scene.to(CPU), probe_images(trainer)  # files are made on the CPU
+    full = trainer.checkpoint()
+    config = trainer.config
+    scene = trainer.model.scene.to(CPU)
+    images = probe_images(trainer)  # files are made on the CPU
     before = quality_of(trainer, scene, images)
     plan = storage_plan(config, full, scene, None)
 
@@ -103,32 +109,48 @@ def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> Size
 
     chosen = stored(scene, plan.coarseness)
     if isinstance(scene, GaussianScene) and (chosen is None or chosen.coarser > 1):
-        scores, fraction = scores_of(trainer).cpu(), KEPT
+        scores = scores_of(trainer).cpu()
+        fraction = KEPT
         while fraction * len(scene) >= 1:
             kept = highest(scores, 1 - fraction)
-            found = stored(scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept])
+            found = stored(
+                scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept]
+            )
             if chosen is not None and (found is None or found.psnr <= chosen.psnr):
                 break
-            chosen, fraction = found, fraction * KEPT
+            chosen = found
+            fraction = fraction * KEPT
     if chosen is None:
-        raise DyngsError(f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}")
+        raise DyngsError(
+            f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}"
+        )
     write_scene(run_dir / EXPORT_FOLDER / SCENE_FILE, chosen.data)
     write_config(config, run_dir / EXPORT_FOLDER)
     got = 1e-6 * len(chosen.data)
-    return SizeReport(megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser)
+    return SizeReport(
+        megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser
+    )
 
 
 def _fitted(
-    info: CheckpointInfo, scene: Renderable, coarseness: Tensor | None, steps: Mapping[str, float], most: int
+    info: CheckpointInfo,
+    scene: Renderable,
+    coarseness: Tensor | None,
+    steps: Mapping[str, float],
+    most: int,
 ) -> tuple[bytes, float] | None:
-    """Return the bytes of a file of at most ``most``, and the factor on ``steps`` that this took; None: none fits."""
+    """Return the bytes of a file of at most ``most``, and the factor on ``steps`` that this took;
+    None: none fits."""
     num_values = sum(x.numel() for x in drawable(scene).values())
-    factor, tried = 1.0, set()
+    factor = 1.0
+    tried = set()
     fits: tuple[bytes, float] | None = None
     too_fine = 0.0
     while factor <= COARSEST and factor not in tried and len(tried) < _TRIALS:
         tried.add(factor)
-        data = encoded(info, scene, {n: step_below(factor * s) for n, s in steps.items()}, coarseness)
+        data = encoded(
+            info, scene, {n: step_below(factor * s) for n, s in steps.items()}, coarseness
+        )
         if len(data) <= most:
             fits = data, factor
         else:

@@ -1,7 +1,8 @@
-"""``train.minutes``: how many steps fit into a time, measured before training and again while it goes on.
+"""``train.minutes``: how many steps fit into a time, measured before training and again while it
+goes on.
 
-Seconds per step are measured; how they go on is foreseen by ``dyngs.training.clock``. Later fits correct what is wrong
-in this.
+Seconds per step are measured; how they go on is foreseen by ``dyngs.training.clock``. Later fits
+correct what is wrong in this.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ SMALLEST_SIDE = 64
 AIM = 0.97
 """Fraction of the time that a run is planned to use."""
 PILOT_STEPS, PILOT_WARM_UP, PILOT_FRACTION = 20, 2, 0.02
-"""Steps that are measured before training, fewer where they would take a larger fraction of the time."""
+"""Steps that are measured before training, fewer where they would take a larger fraction of the
+time."""
 SLOW_PILOT_FRACTION = 0.1
 """Fraction of the time after which even the warm-up ends."""
 FITS = 20
@@ -66,7 +68,8 @@ class Deadline:
         self._forecast = Forecast(0, 0.0)
 
     def __call__(self, event: Event) -> None:
-        """Go on, after a step, with as many steps as fit into the time; with none where it is over."""
+        """Go on, after a step, with as many steps as fit into the time; with none where it is
+        over."""
         config = self.run.config
         if isinstance(event, StepDone) and event.step < config.train.steps:
             done, now, (height, width) = event.step, self.run.used, event.report.truth.shape[:2]
@@ -76,12 +79,14 @@ class Deadline:
                 self._go_on(found, done)
 
     def _begin(self, done: int, now: float) -> None:
-        """Measure the pace from here on: after ``done`` steps, ``now`` seconds after the beginning."""
+        """Measure the pace from here on: after ``done`` steps, ``now`` seconds after the
+        beginning."""
         self._since = done, now
         self._forecast.restart(done, now, self.run.trainer.num_gaussians)
 
     def steps(self, config: Config, done: int, now: float) -> int:
-        """Return how many steps a run of ``config`` should have, after ``done`` in ``now`` seconds."""
+        """Return how many steps a run of ``config`` should have, after ``done`` in ``now``
+        seconds."""
         total = config.train.steps
         given = self.run.given
         if self._since is None:
@@ -114,7 +119,11 @@ class Deadline:
         asked = f"asked {self.run.given / 60:g}, got {self.run.used / 60:.2f}"
         if not self.fits:
             return f"train.minutes: {asked}: {counted(done, 'step')}"
-        cost = "; what more would bring is not known" if done < self.most_steps else ": all, it cost nothing"
+        cost = (
+            "; what more would bring is not known"
+            if done < self.most_steps
+            else ": all, it cost nothing"
+        )
         return f"train.minutes: {asked}: {done:,} of {counted(self.most_steps, 'step')}{cost}"
 
     def _go_on(self, steps: int, done: int) -> None:
@@ -126,7 +135,8 @@ class Deadline:
             prepared = run.used
             self._save()  # a resumed run goes on from here with the new schedules
             now = run.used
-            self.refit_seconds, self.save_seconds = prepared - start, now - prepared
+            self.refit_seconds = prepared - start
+            self.save_seconds = now - prepared
             self._begin(done, now)
         else:
             run.trainer.config = with_steps(run.trainer.config, done)
@@ -156,7 +166,9 @@ def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[st
         is_shrunk = True
     if is_shrunk:
         minutes = fitted.train.minutes
-        say(f"train.minutes={minutes:g}: {whole}, so images are shrunk to {side} px (data.longest_side)")
+        say(
+            f"train.minutes={minutes:g}: {whole}, so images are shrunk to {side} px (data.longest_side)"
+        )
     begin = run.used
     run.config = fitted
     run.exchange(refitted(run.trainer, fitted))
@@ -164,10 +176,12 @@ def fit_to_time(run: LimitedRun, first: FirstGaussians | None, say: Callable[[st
 
 
 def first_fit(config: Config, trainer: Trainer[Any], used: float) -> tuple[Config, int]:
-    """Return ``config`` with as many steps as fit, and how many may fit at best, by a copy of ``trainer``.
+    """Return ``config`` with as many steps as fit, and how many may fit at best, by a copy of
+    ``trainer``.
 
-    Both are at most its own steps. The number of steps is adapted later, so the first is cautious. Images
-    are shrunk for good, so the second is not. ``used``: seconds that are not there for steps.
+    Both are at most its own steps. The number of steps is adapted later, so the first is cautious.
+    Images are shrunk for good, so the second is not. ``used``: seconds that are not there for
+    steps.
     """
     seconds = 60 * (config.train.minutes or math.inf)
     begin = time.perf_counter()
@@ -205,14 +219,17 @@ def _pilot(config: Config, trainer: Trainer[Any], seconds: float) -> tuple[Forec
         if now - begin > most * seconds:
             break
         if pilot.done == PILOT_WARM_UP < config.train.steps:
-            first, since = pilot.done, now
+            first = pilot.done
+            since = now
             forecast.restart(first, since, pilot.num_gaussians)
     return forecast, (now - since) / (pilot.done - first)
 
 
 def refitted(trainer: Trainer[Any], config: Config) -> Trainer[Any]:
     """Return a trainer that is where ``trainer`` is, but on the schedules of ``config``."""
-    fitted = assemble(config, trainer.capture, restored=True, images=trainer.images, held_out=trainer.held_out)
+    fitted = assemble(
+        config, trainer.capture, restored=True, images=trainer.images, held_out=trainer.held_out
+    )
     fitted.bad_gradients = trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
     step = trainer.done + 1
@@ -221,8 +238,10 @@ def refitted(trainer: Trainer[Any], config: Config) -> Trainer[Any]:
 
 
 def fitting_steps(forecast: Forecast, config: Config, done: int, seconds: float, most: int) -> int:
-    """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in ``seconds``."""
-    low, high = done, max(most, done)
+    """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in
+    ``seconds``."""
+    low = done
+    high = max(most, done)
     while low < high:
         middle = (low + high + 1) // 2
         fits = forecast.seconds(with_steps(config, middle), middle, done) <= seconds
@@ -231,11 +250,15 @@ def fitting_steps(forecast: Forecast, config: Config, done: int, seconds: float,
 
 
 def same_phase(old: Config, new: Config, done: int) -> bool:
-    """Return whether changing ``old`` to ``new`` after ``done`` neither omits nor repeats any one-time event."""
+    """Return whether changing ``old`` to ``new`` after ``done`` neither omits nor repeats any
+    one-time event."""
     return happened(old, done) == happened(new, done)
 
 
 def happened(config: Config, done: int) -> list[bool]:
     """Return which of the one-time events of a run are over after ``done`` steps."""
-    once = motion_begins_after(config, config.train.steps), config.colour.measured_after(config.train.steps)
+    once = (
+        motion_begins_after(config, config.train.steps),
+        config.colour.measured_after(config.train.steps),
+    )
     return [done >= step for step in once if step is not None]

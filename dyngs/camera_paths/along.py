@@ -13,7 +13,8 @@ from dyngs.camera_paths.path import CameraPath
 _SMOOTHED_CAMERAS = 2.0
 """Standard deviation of the smoothing, in mean distances between cameras that follow each other."""
 _DETOUR = 2.0
-"""Cameras in the order of the capture are taken for a walk if that is at most so much longer than the shortest way."""
+"""Cameras in the order of the capture are taken for a walk if that is at most so much longer than
+the shortest way."""
 _ROUNDS = 30
 """At most so many passes of 2-opt."""
 _MOST_CAMERAS = 500
@@ -21,18 +22,23 @@ _MOST_CAMERAS = 500
 
 
 def path_along(
-    cameras: Cameras, num_frames: int, times: Sequence[float] | None = None, up: np.ndarray | None = None
+    cameras: Cameras,
+    num_frames: int,
+    times: Sequence[float] | None = None,
+    up: np.ndarray | None = None,
 ) -> CameraPath:
     """Return a smooth path along V >= 1 cameras, with intrinsics of the first.
 
-    With ``times`` (V,) that all differ, which is a clip of one moving camera, the path plays the clip from the first
-    time to the last. Otherwise it visits every position once, at even speed: in the order of the capture if that is a
-    walk, else by a short way from the first camera on. Positions, viewing directions and up directions (without ``up``)
-    are means over the cameras near on the way, with Gaussian weights.
+    With ``times`` (V,) that all differ, which is a clip of one moving camera, the path plays the
+    clip from the first time to the last. Otherwise it visits every position once, at even speed: in
+    the order of the capture if that is a walk, else by a short way from the first camera on.
+    Positions, viewing directions and up directions (without ``up``) are means over the cameras near
+    on the way, with Gaussian weights.
     """
     poses = world_from_cam(cameras)
     kept = np.linspace(0, len(poses) - 1, min(len(poses), _MOST_CAMERAS)).round().astype(int)
-    poses, times = poses[kept], times and [times[i] for i in kept]
+    poses = poses[kept]
+    times = times and [times[i] for i in kept]
     if times is not None and len(set(times)) == len(times) and len(times) > 1:
         order = np.argsort(np.asarray(times, np.float64))
         way = np.asarray(times, np.float64)[order]
@@ -46,11 +52,14 @@ def path_along(
     visited = poses[first[given][order]]
     lengths = np.linalg.norm(np.diff(features[given][order], axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(lengths)])
-    return CameraPath(with_poses(cameras, _smoothed(visited, way, np.linspace(0, way[-1], num_frames), up)))
+    return CameraPath(
+        with_poses(cameras, _smoothed(visited, way, np.linspace(0, way[-1], num_frames), up))
+    )
 
 
 def _features(poses: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return (V, 6) numbers of poses (V, 4, 4) whose distances are those between the images, in world units.
+    """Return (V, 6) numbers of poses (V, 4, 4) whose distances are those between the images, in
+    world units.
 
     Place, and viewing direction times the distance of the ``target`` (3,) that they look at.
     """
@@ -60,13 +69,15 @@ def _features(poses: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _rounded(features: np.ndarray) -> np.ndarray:
-    """Return ``features`` (V, D) to nine digits of the largest, so that equal poses are equal in any unit of length."""
+    """Return ``features`` (V, D) to nine digits of the largest, so that equal poses are equal in
+    any unit of length."""
     step = 1e-9 * (float(np.abs(features).max()) or 1.0)
     return step * (features / step).round()
 
 
 def _walk(features: np.ndarray) -> np.ndarray:
-    """Return the order (V,) in which to visit ``features`` (V, D): as they are if that is a walk, else a short way."""
+    """Return the order (V,) in which to visit ``features`` (V, D): as they are if that is a walk,
+    else a short way."""
     from scipy.spatial.distance import cdist  # late: importing it takes a tenth of a second
 
     between = cdist(features, features)
@@ -80,7 +91,8 @@ def _length(between: np.ndarray, order: np.ndarray) -> float:
 
 
 def _short_way(between: np.ndarray) -> np.ndarray:
-    """Return a short open way from 0 through all points, by their distances (V, V): the nearest next, then 2-opt."""
+    """Return a short open way from 0 through all points, by their distances (V, V): the nearest
+    next, then 2-opt."""
     left = np.ones(len(between), bool)
     order = [0]
     for _ in range(len(between) - 1):
@@ -94,10 +106,12 @@ def _short_way(between: np.ndarray) -> np.ndarray:
 
 
 def _untangled(way: np.ndarray, between: np.ndarray) -> bool:
-    """Turn round each stretch of ``way`` (V,), in place, where that makes it shorter; return whether any was."""
+    """Turn round each stretch of ``way`` (V,), in place, where that makes it shorter; return
+    whether any was."""
     changed = False
     for i in range(len(way) - 2):
-        stays = np.append(between[way[i + 1 : -1], way[i + 2 :]], 0.0)  # from each possible end to its next
+        # from each possible end to its next
+        stays = np.append(between[way[i + 1 : -1], way[i + 2 :]], 0.0)
         turned = between[way[i], way[i + 1 :]] + np.append(between[way[i + 1], way[i + 2 :]], 0.0)
         gain = between[way[i], way[i + 1]] + stays - turned
         best = int(gain.argmax())
@@ -107,8 +121,11 @@ def _untangled(way: np.ndarray, between: np.ndarray) -> bool:
     return changed
 
 
-def _smoothed(poses: np.ndarray, way: np.ndarray, steps: np.ndarray, up: np.ndarray | None) -> np.ndarray:
-    """Return poses (F, 4, 4) at ``steps`` (F,) of the way: means of poses (V, 4, 4) at ``way`` (V,) near them."""
+def _smoothed(
+    poses: np.ndarray, way: np.ndarray, steps: np.ndarray, up: np.ndarray | None
+) -> np.ndarray:
+    """Return poses (F, 4, 4) at ``steps`` (F,) of the way: means of poses (V, 4, 4) at ``way`` (V,)
+    near them."""
     spread = max(_SMOOTHED_CAMERAS * (way[-1] - way[0]) / max(len(way) - 1, 1), 1e-12)
     distance = ((steps[:, None] - way) / spread) ** 2
     near = np.exp(-0.5 * (distance - distance.min(axis=1, keepdims=True)))

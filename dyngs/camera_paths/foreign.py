@@ -1,6 +1,7 @@
 """Camera paths of other programs, rewritten as documents of ``dyngs.camera_paths.path``.
 
-Read are nerfstudio's ``camera_path.json`` and ``transforms.json``, and the ``cameras.json`` of 3DGS.
+Read are nerfstudio's ``camera_path.json`` and ``transforms.json``, and the ``cameras.json`` of
+3DGS.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ _NORMALISED = (
 
 
 def as_document(found: object, file: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return what the JSON of a camera path holds as a document with 'width', 'height' and 'frames', and notes.
+    """Return what the JSON of a camera path holds as a document with 'width', 'height' and
+    'frames', and notes.
 
-    What is no path of another program stays as it is. Raises DyngsError: a path that cannot be read.
+    What is no path of another program stays as it is. Raises DyngsError: a path that cannot be
+    read.
     """
     if isinstance(found, list):
         return _of_3dgs(found, file), ()
@@ -50,13 +53,17 @@ def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     _require_flat(found, str(file), "camera_type")
     height = found.get("render_height")
     if not is_number(height) or not 1 <= height <= 65536:
-        raise DyngsError(f"{file}: 'render_height' must be a number from 1 to 65536; export the path again")
+        raise DyngsError(
+            f"{file}: 'render_height' must be a number from 1 to 65536; export the path again"
+        )
     frames = []
     for i, view in enumerate(_listed(found["camera_path"], file)):
         where = f"{file}: camera_path[{i}]"
         degrees = view.get("fov", found.get("default_fov"))
         if not is_number(degrees) or not 0.01 <= degrees <= 179:
-            raise DyngsError(f"{where}: 'fov' is {printable(repr(degrees), 60)}; it must be 0.01 to 179 degrees")
+            raise DyngsError(
+                f"{where}: 'fov' is {printable(repr(degrees), 60)}; it must be 0.01 to 179 degrees"
+            )
         frame = {"transform_matrix": view.get("camera_to_world")}
         frame["fl_x"] = 0.5 * height / math.tan(math.radians(degrees) / 2)
         if "render_time" in view:
@@ -67,26 +74,36 @@ def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
 
 
 def _of_3dgs(found: list[Any], file: Path) -> dict[str, Any]:
-    """Return the document of a cameras.json; its positions and rotations are those of cameras in the world."""
+    """Return the document of a cameras.json; its positions and rotations are those of cameras in
+    the world."""
     views = _listed(found, file)
     size = {key: views[0].get(key) for key in ("width", "height")}
     frames = []
     for i, view in enumerate(views):
         where = f"{file}: [{i}]"
         if any(view.get(key) != value for key, value in size.items()):
-            raise DyngsError(f"{where}: has another size than the first camera; all images of a path have one size")
+            raise DyngsError(
+                f"{where}: has another size than the first camera; all images of a path have one size"
+            )
         pose = np.eye(4)
         rotation = numbers_of(f"{where}: 'rotation'", view.get("rotation"), (3, 3))
         pose[:3, :3] = rotation.T
         pose[:3, 3] = -rotation.T @ numbers_of(f"{where}: 'position'", view.get("position"), (3,))
-        frames.append({"cam_from_world": pose.tolist(), "fl_x": view.get("fx"), "fl_y": view.get("fy")})
+        frames.append(
+            {"cam_from_world": pose.tolist(), "fl_x": view.get("fx"), "fl_y": view.get("fy")}
+        )
     return {**size, "frames": frames}
 
 
 def _size_of(found: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Return the size of the images of a transforms.json, once for all frames; nothing where it states none."""
+    """Return the size of the images of a transforms.json, once for all frames; nothing where it
+    states none."""
     frames = found.get("frames")
-    own = [frame for frame in frames if isinstance(frame, dict) and "w" in frame] if isinstance(frames, list) else []
+    own = (
+        [frame for frame in frames if isinstance(frame, dict) and "w" in frame]
+        if isinstance(frames, list)
+        else []
+    )
     if any((frame["w"], frame.get("h")) != (own[0]["w"], own[0].get("h")) for frame in own):
         raise DyngsError(f"{file}: its images differ in size; all images of a path have one size")
     stated = own[0] if own else found
@@ -95,7 +112,8 @@ def _size_of(found: dict[str, Any], file: Path) -> dict[str, Any]:
 
 
 def flat_pose(matrix: np.ndarray) -> np.ndarray:
-    """Return 12 or 16 numbers in a row as a matrix, of which 16 may come column by column; any other as it is."""
+    """Return 12 or 16 numbers in a row as a matrix, of which 16 may come column by column; any
+    other as it is."""
     if matrix.shape == (12,):
         return matrix.reshape(3, 4)
     if matrix.shape != (16,):
@@ -105,8 +123,14 @@ def flat_pose(matrix: np.ndarray) -> np.ndarray:
 
 
 def _listed(views: object, file: Path) -> list[dict[str, Any]]:
-    if not isinstance(views, list) or not views or not all(isinstance(view, dict) for view in views):
-        raise DyngsError(f"{file}: a camera path needs a list of cameras, each an object; export it again")
+    if (
+        not isinstance(views, list)
+        or not views
+        or not all(isinstance(view, dict) for view in views)
+    ):
+        raise DyngsError(
+            f"{file}: a camera path needs a list of cameras, each an object; export it again"
+        )
     return views
 
 
@@ -114,4 +138,6 @@ def _require_flat(found: dict[str, Any], where: str, key: str) -> None:
     """Raise DyngsError for cameras that no pinhole can stand for."""
     kind = found.get(key)
     if isinstance(kind, str) and any(name in kind.lower() for name in _PANORAMIC):
-        raise DyngsError(f"{where}: '{key}' is {printable(kind, 40)}; cameras of a path are pinholes")
+        raise DyngsError(
+            f"{where}: '{key}' is {printable(kind, 40)}; cameras of a path are pinholes"
+        )

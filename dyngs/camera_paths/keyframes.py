@@ -19,7 +19,8 @@ class Keyframes:
         intrinsics: (K, 3, 3) in pixels, positive focal lengths.
         seconds: (K,) strictly increasing.
         times: (K,) scene times, or None for a static scene.
-        period: seconds after which a loop is back at the first keyframe, more than the keyframes span; None: no loop.
+        period: seconds after which a loop is back at the first keyframe, more than the keyframes
+            span; None: no loop.
     """
 
     cam_from_world: np.ndarray
@@ -35,10 +36,11 @@ class Keyframes:
 def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
     """Return camera and scene time at each of ``seconds``; exact at the keyframes.
 
-    Rotations are interpolated the shorter way by slerp (Shoemake 1985). Centres follow a cubic Hermite curve with
-    Catmull-Rom tangents for non-uniform knots, with continuous velocity; a tangent is shortened where the camera
-    (nearly) rests on one side of a keyframe, so that equal keyframes give a fixed camera. Focal lengths are
-    interpolated geometrically, the principal point and the scene time linearly.
+    Rotations are interpolated the shorter way by slerp (Shoemake 1985). Centres follow a cubic
+    Hermite curve with Catmull-Rom tangents for non-uniform knots, with continuous velocity; a
+    tangent is shortened where the camera (nearly) rests on one side of a keyframe, so that equal
+    keyframes give a fixed camera. Focal lengths are interpolated geometrically, the principal point
+    and the scene time linearly.
 
     Before the first and after the last of K >= 1 keyframes the camera rests, a loop repeats.
     """
@@ -50,7 +52,11 @@ def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
     index = order % count
     knots = keys.seconds[index] + (0.0 if period is None else period) * (order // count)
     first = keys.seconds[0]
-    t = np.clip(seconds, first, knots[-1]) if period is None else first + (np.asarray(seconds) - first) % period
+    t = (
+        np.clip(seconds, first, knots[-1])
+        if period is None
+        else first + (np.asarray(seconds) - first) % period
+    )
     pose = keys.cam_from_world[index]
     centers = -np.einsum("kji,kj->ki", pose[:, :3, :3], pose[:, :3, 3])
     made = np.tile(np.eye(4), (len(t), 1, 1))
@@ -58,14 +64,17 @@ def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
     made[:, :3, 3] = -np.einsum("fij,fj->fi", made[:, :3, :3], _hermite(knots, centers, t))
     intrinsics = np.tile(np.eye(3), (len(t), 1, 1))
     for axis in (0, 1):
-        intrinsics[:, axis, axis] = np.exp(np.interp(t, knots, np.log(keys.intrinsics[index, axis, axis])))
+        intrinsics[:, axis, axis] = np.exp(
+            np.interp(t, knots, np.log(keys.intrinsics[index, axis, axis]))
+        )
         intrinsics[:, axis, 2] = np.interp(t, knots, keys.intrinsics[index, axis, 2])
     times = None if keys.times is None else np.interp(t, knots, keys.times[index])
     return Keyframes(made, intrinsics, np.asarray(seconds), times)
 
 
 def _hermite(knots: np.ndarray, points: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the curve through points (K, 3) at K >= 2 knots, evaluated at (F,) ``t`` within the knots, as (F, 3)."""
+    """Return the curve through points (K, 3) at K >= 2 knots, evaluated at (F,) ``t`` within the
+    knots, as (F, 3)."""
     steps = np.diff(knots)[:, None]
     slopes = np.diff(points, axis=0) / steps
     tangents = np.empty_like(points)
@@ -73,7 +82,8 @@ def _hermite(knots: np.ndarray, points: np.ndarray, t: np.ndarray) -> np.ndarray
     speeds = np.linalg.norm(slopes, axis=1)
     tangents[1:-1] = _shortened(tangents[1:-1], _MAX_TANGENT * np.minimum(speeds[:-1], speeds[1:]))
     inner = (tangents[1], tangents[-2]) if len(points) > 2 else (slopes[0], slopes[0])
-    ends = np.stack([2 * slopes[0] - inner[0], 2 * slopes[-1] - inner[1]])  # of the parabola with the inner tangent
+    # of the parabola with the inner tangent
+    ends = np.stack([2 * slopes[0] - inner[0], 2 * slopes[-1] - inner[1]])
     tangents[[0, -1]] = _shortened(ends, _MAX_TANGENT * speeds[[0, -1]])
     i = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(steps) - 1)
     h = steps[i]
@@ -81,7 +91,11 @@ def _hermite(knots: np.ndarray, points: np.ndarray, t: np.ndarray) -> np.ndarray
     rest = 1 - u
     ease = u * u * (3 - 2 * u)
     ease_back = rest * rest * (3 - 2 * rest)
-    return ease_back * points[i] + ease * points[i + 1] + u * rest * h * (rest * tangents[i] - u * tangents[i + 1])
+    return (
+        ease_back * points[i]
+        + ease * points[i + 1]
+        + u * rest * h * (rest * tangents[i] - u * tangents[i + 1])
+    )
 
 
 def _shortened(vectors: np.ndarray, longest: np.ndarray) -> np.ndarray:

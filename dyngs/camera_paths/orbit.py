@@ -9,7 +9,15 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import look_at, look_at_point, perpendicular, unit, up_direction, with_poses, world_from_cam
+from dyngs.camera_paths.aim import (
+    look_at,
+    look_at_point,
+    perpendicular,
+    unit,
+    up_direction,
+    with_poses,
+    world_from_cam,
+)
 from dyngs.data.geometry import fraction_in_front
 from dyngs.errors import DyngsError
 
@@ -26,7 +34,8 @@ class Orbit:
     """Azimuth, height and distance of V cameras around the point (3,) that they look at.
 
     Attributes:
-        level: (2, 3) unit vectors, perpendicular to ``up``: azimuth 0, towards the first camera, and 90 degrees.
+        level: (2, 3) unit vectors, perpendicular to ``up``: azimuth 0, towards the first camera,
+            and 90 degrees.
         azimuths: (V,) radians from the middle of the arc, within half a circle.
         radii, heights: (V,) distances from the axis and along it, world units.
         middle: azimuth of the middle of the arc, radians.
@@ -48,16 +57,21 @@ class Orbit:
     def notes(self) -> tuple[str, ...]:
         """Lines for people on what an orbit does here."""
         if self.looks_in < 0.5:
-            return ("the cameras look outwards, an orbit shows little of that: --path along follows them",)
+            return (
+                "the cameras look outwards, an orbit shows little of that: --path along follows them",
+            )
         if self.width is None:
             return ()
         degrees = math.degrees(self.width)
-        return (f"the capture was filmed from an arc of {degrees:.0f} degrees: the orbit swings along it and back",)
+        return (
+            f"the capture was filmed from an arc of {degrees:.0f} degrees: the orbit swings along it and back",
+        )
 
     def eyes(self, azimuths: np.ndarray) -> np.ndarray:
         """Return positions (F, 3) at ``azimuths`` (F,) radians from the middle.
 
-        All around: at the mean radius and height. On an arc: at those of the cameras near the azimuth.
+        All around: at the mean radius and height. On an arc: at those of the cameras near the
+        azimuth.
         """
         if self.width is None:
             radii, heights = (np.full(len(azimuths), x.mean()) for x in (self.radii, self.heights))
@@ -65,7 +79,8 @@ class Orbit:
             spread = max(self.width / 6, _NARROWEST_ARC)
             near = np.exp(-0.5 * ((azimuths[:, None] - self.azimuths) / spread) ** 2)
             near /= near.sum(axis=1, keepdims=True)
-            radii, heights = near @ self.radii, near @ self.heights
+            radii = near @ self.radii
+            heights = near @ self.heights
         smallest = 0.1 * float(np.hypot(self.radii, self.heights).mean())
         radii = np.maximum(radii, smallest)
         turned = azimuths + self.middle
@@ -74,7 +89,8 @@ class Orbit:
 
 
 def orbit_of(cameras: Cameras, up: np.ndarray | None = None) -> Orbit:
-    """Return how ``cameras`` (V >= 1) stand around the point that they look at; ``up`` (3,) is theirs by default."""
+    """Return how ``cameras`` (V >= 1) stand around the point that they look at; ``up`` (3,) is
+    theirs by default."""
     poses = world_from_cam(cameras)
     center = look_at_point(cameras)
     up = up_direction(cameras) if up is None else unit(np.asarray(up, np.float64))
@@ -88,33 +104,48 @@ def orbit_of(cameras: Cameras, up: np.ndarray | None = None) -> Orbit:
     angles = np.arctan2(flat @ level[1], flat @ level[0])
     middle, width = _arc(angles[beside]) if len(beside) else (0.0, None)
     azimuths = (angles - middle + np.pi) % (2 * np.pi) - np.pi
-    return Orbit(center, up, level, azimuths, radii, heights, middle, width, fraction_in_front(poses, center))
+    return Orbit(
+        center, up, level, azimuths, radii, heights, middle, width, fraction_in_front(poses, center)
+    )
 
 
 def orbit_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None) -> Cameras:
-    """Return cameras on a level circle around the point that V >= 1 ``cameras`` look at, and ``up`` (3,) is its axis.
+    """Return cameras on a level circle around the point that V >= 1 ``cameras`` look at, and ``up``
+    (3,) is its axis.
 
-    Radius and height are means over the cameras; intrinsics, and the azimuth of frame 0, are those of the first. A ring
-    of cameras gives the ring itself. Cameras on an arc, with nobody behind: the path swings from its middle to one end,
-    to the other, and back, at the radius and height of the cameras near.
+    Radius and height are means over the cameras; intrinsics, and the azimuth of frame 0, are those
+    of the first. A ring of cameras gives the ring itself. Cameras on an arc, with nobody behind:
+    the path swings from its middle to one end, to the other, and back, at the radius and height of
+    the cameras near.
     """
     orbit = orbit_of(cameras, up)
     turn = 2 * np.pi * np.arange(num_frames) / max(num_frames, 1)
-    azimuths = turn - orbit.middle if orbit.width is None else 0.5 * max(orbit.width, _NARROWEST_ARC) * np.sin(turn)
-    return with_poses(cameras, np.stack([look_at(eye, orbit.center, orbit.up) for eye in orbit.eyes(azimuths)]))
+    azimuths = (
+        turn - orbit.middle
+        if orbit.width is None
+        else 0.5 * max(orbit.width, _NARROWEST_ARC) * np.sin(turn)
+    )
+    return with_poses(
+        cameras, np.stack([look_at(eye, orbit.center, orbit.up) for eye in orbit.eyes(azimuths)])
+    )
 
 
 def spiral_path(
-    cameras: Cameras, num_frames: int, up: np.ndarray | None = None, turns: float = 2.0, zoom: float = 0.5
+    cameras: Cameras,
+    num_frames: int,
+    up: np.ndarray | None = None,
+    turns: float = 2.0,
+    zoom: float = 0.5,
 ) -> Cameras:
     """Return cameras on a closed spiral in front of a scene seen from one side, as in LLFF.
 
-    The spiral is centred on the mean of V >= 1 cameras, which roughly face one way, and as wide as the 90% quantile of
-    their distances from it; all cameras look at the same point. ``turns``: circles per loop; ``zoom``: extent along the
-    viewing axis, relative to the width.
+    The spiral is centred on the mean of V >= 1 cameras, which roughly face one way, and as wide as
+    the 90% quantile of their distances from it; all cameras look at the same point. ``turns``:
+    circles per loop; ``zoom``: extent along the viewing axis, relative to the width.
     """
     poses = world_from_cam(cameras)
-    centers, target = poses[:, :3, 3], look_at_point(cameras)
+    centers = poses[:, :3, 3]
+    target = look_at_point(cameras)
     up = up_direction(cameras) if up is None else up
     middle = centers.mean(axis=0)
     base = look_at(middle, target, up)
@@ -123,7 +154,9 @@ def spiral_path(
     radii = np.maximum(radii, 0.02 * distance)
     radii[2] = min(zoom * radii.max(), 0.3 * distance)
     phase = 2 * np.pi * np.arange(num_frames) / max(num_frames, 1)
-    local = np.stack([np.cos(turns * phase), -np.sin(turns * phase), np.sin(phase)], axis=-1) * radii
+    local = (
+        np.stack([np.cos(turns * phase), -np.sin(turns * phase), np.sin(phase)], axis=-1) * radii
+    )
     eyes = middle + local @ base[:3, :3].T
     return with_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
 
@@ -137,9 +170,10 @@ def frame_orbit_for_points(
 ) -> Cameras:
     """Return an orbit around a set of points whose robust extent fills the image.
 
-    The centre is the median. The extent is the sphere around it that holds 99% of the points (N, 3) within the 1st to
-    99th percentile of every axis, so that outliers have no effect; those that are not finite are ignored. It is
-    ``least`` at least, such as the size of what the points stand for; 1 where both are 0.
+    The centre is the median. The extent is the sphere around it that holds 99% of the points (N, 3)
+    within the 1st to 99th percentile of every axis, so that outliers have no effect; those that are
+    not finite are ignored. It is ``least`` at least, such as the size of what the points stand for;
+    1 where both are 0.
 
     Raises:
         DyngsError: no finite point, or a zero up direction.
@@ -173,7 +207,8 @@ def frame_orbit_for_points(
 
 
 def _arc(angles: np.ndarray) -> tuple[float, float | None]:
-    """Return middle and width of the smallest arc that holds ``angles`` (V,), radians; no width: they go all around."""
+    """Return middle and width of the smallest arc that holds ``angles`` (V,), radians; no width:
+    they go all around."""
     order = np.sort(angles)
     gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
     widest = int(gaps.argmax())

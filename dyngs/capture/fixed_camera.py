@@ -1,4 +1,5 @@
-"""A video, or a folder of its frames, of a person before one fixed camera, as a capture with a guessed camera."""
+"""A video, or a folder of its frames, of a person before one fixed camera, as a capture with a
+guessed camera."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ FORMAT = "fixed_camera"
 """``Capture.format`` of what is read here."""
 MOST_FRAMES = 60  # frames that are taken where ``data.frames`` names none
 FOCAL = 1.2
-"""Guessed focal length, as a fraction of the longest side of the images: between a phone's and a film camera's."""
+"""Guessed focal length, as a fraction of the longest side of the images: between a phone's and a
+film camera's."""
 
 
 def is_plain_clip(source: Path) -> bool:
@@ -34,19 +36,23 @@ def is_plain_clip(source: Path) -> bool:
 
 
 def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture:
-    """Read a clip of one fixed camera; ``options.root`` is a video, or a folder of images in the order of names.
+    """Read a clip of one fixed camera; ``options.root`` is a video, or a folder of images in the
+    order of names.
 
-    The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else ``FOCAL`` times the
-    longest side. The world is y up if the camera is level, the camera stands at its origin. Without ``data.frames``,
-    ``MOST_FRAMES`` are taken, evenly spread. Raises DyngsError: no clip, images of different sizes, or no mask for an
-    image.
+    The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else
+    ``FOCAL`` times the longest side. The world is y up if the camera is level, the camera stands at
+    its origin. Without ``data.frames``, ``MOST_FRAMES`` are taken, evenly spread. Raises
+    DyngsError: no clip, images of different sizes, or no mask for an image.
 
     Args:
-        masks: folder of masks (white = the person), named as the images, or ``frame_000012.png`` for frame 12 of a
-            video; None: alpha, if the images have it.
+        masks: folder of masks (white = the person), named as the images, or ``frame_000012.png``
+            for frame 12 of a video; None: alpha, if the images have it.
     """
     source = options.root
-    with staying_within(source if source.is_dir() else source.parent, options.follow_links), reading(source):
+    with (
+        staying_within(source if source.is_dir() else source.parent, options.follow_links),
+        reading(source),
+    ):
         paths, fps, notes = _frames_of(source)
     numbers = _chosen(options, len(paths))
     videos = {paths[i]: VideoFrame(source, i) for i in numbers} if source.is_file() else {}
@@ -57,7 +63,10 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     first = headers[0]
     check_size(source, first.width, first.height, first.channels)
     width, height = first.upright_size
-    other = next((i for i, x in zip(numbers, headers, strict=True) if x.upright_size != (width, height)), None)
+    other = next(
+        (i for i, x in zip(numbers, headers, strict=True) if x.upright_size != (width, height)),
+        None,
+    )
     if other is not None:
         raise DyngsError(
             f"{paths[other]}: has another size than {paths[numbers[0]].name}; give the frames of one camera"
@@ -83,22 +92,27 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     has_alpha = masks is not None or first.has_alpha
     note = f"{len(numbers)} of {len(paths)} frames, focal length {focal:.0f} px "
     note += "by the EXIF tags" if first.tags.focal_px else "guessed"
-    return Capture(source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note, *notes))
+    return Capture(
+        source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note, *notes)
+    )
 
 
 def zoomed(view: View, factor: float, distance: float) -> View:
-    """Return the view of a camera with ``factor`` times the focal length that stands back by as much.
+    """Return the view of a camera with ``factor`` times the focal length that stands back by as
+    much.
 
     What is at ``distance`` before the camera is as large as before.
     """
-    intrinsics, pose = view.intrinsics.copy(), view.cam_from_world.copy()
+    intrinsics = view.intrinsics.copy()
+    pose = view.cam_from_world.copy()
     intrinsics[:2, :2] *= factor
     pose[2, 3] += (factor - 1) * distance
     return replace(view, intrinsics=intrinsics, cam_from_world=pose)
 
 
 def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
-    """Return the image files of a clip, in order, and of a video its frame rate and a line on colours."""
+    """Return the image files of a clip, in order, and of a video its frame rate and a line on
+    colours."""
     if source.is_file():
         planned = planned_frames(source)
         if not planned.paths:
@@ -106,7 +120,9 @@ def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
         return planned.paths, planned.info.fps or None, colour_notes([planned.info])
     images = _images_of(source)
     if not images:
-        raise DyngsError(f"{source}: holds no images; give a folder of the frames of a clip, or a video")
+        raise DyngsError(
+            f"{source}: holds no images; give a folder of the frames of a clip, or a video"
+        )
     return [inside(path) for path in images], None, []
 
 
@@ -120,7 +136,9 @@ def _chosen(options: DataConfig, count: int) -> list[int]:
         return evenly_spaced(count, MOST_FRAMES)
     numbers = list(range(count))[parse_frames(options.frames)]
     if not numbers:
-        raise DyngsError(f"{options.root}: data.frames={options.frames} selects none of {count} frames")
+        raise DyngsError(
+            f"{options.root}: data.frames={options.frames} selects none of {count} frames"
+        )
     return sorted(numbers)
 
 

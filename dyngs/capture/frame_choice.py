@@ -1,4 +1,5 @@
-"""Frames of a video for structure from motion: chosen by what the camera's motion shows, and by sharpness."""
+"""Frames of a video for structure from motion: chosen by what the camera's motion shows, and by
+sharpness."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 STILL = 0.003
-"""Largest motion since the first frame, as a fraction of the image's width, below which the camera stands still."""
+"""Largest motion since the first frame, as a fraction of the image's width, below which the camera
+stands still."""
 _WIDTH = 96
 _TILES = 6
 _TEXTURE = 1.0
@@ -24,7 +26,8 @@ class FrameMeasures:
 
     Attributes:
         sharpness: variance of the Laplacian of the brightness.
-        motion: of most of the image since the frame before, as a fraction of its width; ``most``: of what moves most.
+        motion: of most of the image since the frame before, as a fraction of its width; ``most``:
+            of what moves most.
         away: motion of most of the image since the first frame: noise does not add up in it.
     """
 
@@ -55,13 +58,17 @@ class FrameChoice:
 
     def summary(self) -> str:
         """The choice in a line."""
-        line = f"{len(self.numbers)} of {self.num_frames} frames taken, by motion seen and sharpness"
+        line = (
+            f"{len(self.numbers)} of {self.num_frames} frames taken, by motion seen and sharpness"
+        )
         return line + (f"; nothing moves at {self.num_static}" if self.num_static else "")
 
 
 def measured(frames: Iterable[np.ndarray]) -> FrameMeasures:
     """Measure all frames, (H, W, 3) uint8; three small images are held in memory."""
-    sharpness, motions, away = [], [], []
+    sharpness = []
+    motions = []
+    away = []
     first = before = None
     for rgb in frames:
         small = shrunk(rgb)
@@ -77,8 +84,9 @@ def measured(frames: Iterable[np.ndarray]) -> FrameMeasures:
 def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
     """Choose at most ``wanted`` frames: the sharpest in each of as many windows of equal motion.
 
-    A frame counts by the motion since the one before, at most ``_FASTEST`` times the median, and to a small part by
-    itself, so that what moves while the camera rests is not lost. Frames that repeat the one before count nothing.
+    A frame counts by the motion since the one before, at most ``_FASTEST`` times the median, and to
+    a small part by itself, so that what moves while the camera rests is not lost. Frames that
+    repeat the one before count nothing.
     """
     count = len(measures)
     still = measures.most <= _NOISE
@@ -90,7 +98,11 @@ def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
     steps = np.minimum(motion / typical, _FASTEST) * (1 - _EVEN) + _EVEN
     ends = np.cumsum(steps)
     windows = min(wanted, len(kept))
-    places = np.minimum((ends - steps / 2) / max(ends[-1], 1e-12) * windows, windows - 1) if count else ends
+    places = (
+        np.minimum((ends - steps / 2) / max(ends[-1], 1e-12) * windows, windows - 1)
+        if count
+        else ends
+    )
     numbers = []
     for window in range(windows):
         members = kept[np.floor(places).astype(int) == window]
@@ -99,31 +111,38 @@ def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
     sharp = measures.sharpness[numbers]
     limit = _BLURRED * float(np.median(sharp)) if numbers else 0.0
     blurred = tuple(number for number, value in zip(numbers, sharp, strict=True) if value < limit)
-    return FrameChoice(tuple(numbers), count, int(still.sum()), blurred, float(measures.away.max(initial=0.0)))
+    return FrameChoice(
+        tuple(numbers), count, int(still.sum()), blurred, float(measures.away.max(initial=0.0))
+    )
 
 
 def sharpness_of(rgb: np.ndarray) -> float:
     """Return the variance of the Laplacian of the brightness: higher is sharper."""
     grey = rgb[..., 1].astype(np.float32)
-    laplacian = 4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+    laplacian = (
+        4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+    )
     return float(laplacian.var()) if laplacian.size else 0.0
 
 
 def shrunk(rgb: np.ndarray) -> np.ndarray:
-    """Return the brightness (h, w) float32 with about ``_WIDTH`` columns: means of whole blocks of pixels."""
+    """Return the brightness (h, w) float32 with about ``_WIDTH`` columns: means of whole blocks of
+    pixels."""
     grey = rgb[..., 1]
     block = max(grey.shape[1] // _WIDTH, 1)
-    rows, columns = max(grey.shape[0] // block, 1), max(grey.shape[1] // block, 1)
+    rows = max(grey.shape[0] // block, 1)
+    columns = max(grey.shape[1] // block, 1)
     cut = grey[: rows * block, : columns * block].astype(np.float32)
     return cut.reshape(rows, min(block, len(cut)), columns, -1).mean((1, 3))
 
 
 def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """Return how far an image has moved, as a fraction of its width: median and maximum over tiles with texture.
+    """Return how far an image has moved, as a fraction of its width: median and maximum over tiles
+    with texture.
 
-    Of a small motion it is the length of the part along the gradients (the normal flow), which does not need to know
-    the direction; a motion by more than a pixel of the small images is underestimated. The mean brightness does not
-    matter.
+    Of a small motion it is the length of the part along the gradients (the normal flow), which does
+    not need to know the direction; a motion by more than a pixel of the small images is
+    underestimated. The mean brightness does not matter.
     """
     if min(before.shape) < 3:
         return 0.0, 0.0

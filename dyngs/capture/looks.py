@@ -17,7 +17,9 @@ LOOK_SIDE = 240
 
 def small_image(view: View, options: DataConfig) -> np.ndarray:
     """Return the small image of a view, (H, W, 4): colours on white, and alpha."""
-    small = options.model_copy(update={"downscale": 1.0, "longest_side": LOOK_SIDE, "cache_mb": 0.0})
+    small = options.model_copy(
+        update={"downscale": 1.0, "longest_side": LOOK_SIDE, "cache_mb": 0.0}
+    )
     image = ImageLoader([view], small)[0]
     rgb = image.composite(image.rgb_premultiplied.new_ones(3)).numpy()
     alpha = np.ones(rgb.shape[:2], rgb.dtype) if image.alpha is None else image.alpha.numpy()
@@ -25,7 +27,8 @@ def small_image(view: View, options: DataConfig) -> np.ndarray:
 
 
 def colours_at(xyz: np.ndarray, shown: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
-    """Return (V, P, 4) colours and alpha of the images at the points, NaN where they lie outside."""
+    """Return (V, P, 4) colours and alpha of the images at the points, NaN where they lie
+    outside."""
     found = np.full((len(shown), len(xyz), 4), np.nan)
     for i, (view, image) in enumerate(shown):
         positions, inside = projected(xyz, view)

@@ -1,4 +1,5 @@
-"""Photos for structure from motion: found below a folder, made readable, rotated upright, masks next to them."""
+"""Photos for structure from motion: found below a folder, made readable, rotated upright, masks
+next to them."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ _SAMPLE_BYTES = 2**20
 
 @dataclass(frozen=True)
 class Photo:
-    """An image ``name`` below ``images/`` with its header there; ``source``: the photo below its folder."""
+    """An image ``name`` below ``images/`` with its header there; ``source``: the photo below its
+    folder."""
 
     name: str
     header: ImageHeader
@@ -53,7 +55,8 @@ def photos_below(folder: Path) -> list[Path]:
 
 
 def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
-    """Return 16 hexadecimal digits of names, sizes and times of change of files, and of the beginnings of videos.
+    """Return 16 hexadecimal digits of names, sizes and times of change of files, and of the
+    beginnings of videos.
 
     Of a video, or of ``files`` of a folder, None: all photos below it.
     """
@@ -71,20 +74,24 @@ def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
 
 
 def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], tuple[str, ...]]:
-    """Copy all photos below ``source`` to ``images``; return them, sorted by source, and lines on what is left out.
+    """Copy all photos below ``source`` to ``images``; return them, sorted by source, and lines on
+    what is left out.
 
-    Photos that lie on their side by their EXIF tag are copied as they are: the model's sizes say that they are to be
-    rotated, and readers of ours do. Those that are upside down, mirrored or square cannot be told by their size: they
-    are written upright, as PNG, and so are HEIC photos and the first frame of GIF files. Hidden files and those of
-    ``out``, the capture that will be made, are left out; images that are there already are left. Raises DyngsError: a
-    file is no image, truncated, too large, or lies outside the folder; pillow-heif is missing.
+    Photos that lie on their side by their EXIF tag are copied as they are: the model's sizes say
+    that they are to be rotated, and readers of ours do. Those that are upside down, mirrored or
+    square cannot be told by their size: they are written upright, as PNG, and so are HEIC photos
+    and the first frame of GIF files. Hidden files and those of ``out``, the capture that will be
+    made, are left out; images that are there already are left. Raises DyngsError: a file is no
+    image, truncated, too large, or lies outside the folder; pillow-heif is missing.
     """
     result = out.resolve()
     files = [file for file in _files_below(source) if result not in file.resolve().parents]
     taken = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
     _require_heif([file for file in taken if _is_heif(file)], source)
     headers = {photo: _checked(photo) for photo in taken}
-    names = _stored_names({photo.relative_to(source): _is_converted(photo, headers[photo]) for photo in taken})
+    names = _stored_names(
+        {photo.relative_to(source): _is_converted(photo, headers[photo]) for photo in taken}
+    )
     photos = []
     conversions = set()
     for photo, header in headers.items():
@@ -92,9 +99,13 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
         target = images / names[relative]
         if not target.exists():
             conversions.add(_store(photo, target, header))
-        stored = header if header is not None and target.suffix == photo.suffix else read_header(target)
+        stored = (
+            header if header is not None and target.suffix == photo.suffix else read_header(target)
+        )
         photos.append(Photo(names[relative].as_posix(), stored, relative.as_posix()))
-    left_out = Counter(file.suffix.lower() or "without a suffix" for file in files if file not in headers)
+    left_out = Counter(
+        file.suffix.lower() or "without a suffix" for file in files if file not in headers
+    )
     notes = [f"HEIC photos: {conversion}" for conversion in sorted(conversions - {""})]
     if left_out:
         what = ", ".join(f"{count} {suffix}" for suffix, count in sorted(left_out.items()))
@@ -111,17 +122,24 @@ def copied(source: Path, target: Path) -> None:
         shutil.copyfile(source, temporary)
 
 
-def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str, Path]) -> list[str]:
-    """Write upright images under plain names into ``images`` for COLMAP, masks next to; return the names.
+def lay_out(
+    photos: list[Photo], stored_in: Path, images: Path, masks: dict[str, Path]
+) -> list[str]:
+    """Write upright images under plain names into ``images`` for COLMAP, masks next to; return the
+    names.
 
-    COLMAP ignores the orientation of EXIF, and its lists of pairs cannot hold names with white space. The folder must
-    not outlive the work, as files in it may be links to the photos; images that are there already are left.
+    COLMAP ignores the orientation of EXIF, and its lists of pairs cannot hold names with white
+    space. The folder must not outlive the work, as files in it may be links to the photos; images
+    that are there already are left.
     """
     names = []
     images.mkdir(exist_ok=True)
     for index, photo in enumerate(photos):
         stored = stored_in / photo.name
-        lies = is_lying(photo.header.tags.orientation) and photo.header.upright_size != photo.header.size
+        lies = (
+            is_lying(photo.header.tags.orientation)
+            and photo.header.upright_size != photo.header.size
+        )
         is_written = lies or photo.header.format_name not in _FOR_COLMAP
         name = f"{index:06d}" + (".png" if is_written else _FOR_COLMAP[photo.header.format_name])
         names.append(name)
@@ -136,7 +154,10 @@ def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str,
         mask = masks.get(photo.name)
         if mask is not None:
             target = images.with_name("masks") / f"{name}.png"
-            write_image(target, np.where(read_mask(inside(mask)).numpy(), 255, 0).astype(np.uint8)[..., None])
+            write_image(
+                target,
+                np.where(read_mask(inside(mask)).numpy(), 255, 0).astype(np.uint8)[..., None],
+            )
     return names
 
 
@@ -156,7 +177,8 @@ def _require_heif(photos: Sequence[Path], source: Path) -> None:
 
 
 def _checked(photo: Path) -> ImageHeader | None:
-    """Return the header of a photo that is complete; None for HEIC, which is checked when it is converted."""
+    """Return the header of a photo that is complete; None for HEIC, which is checked when it is
+    converted."""
     if _is_heif(photo):
         return None
     header = check_image(photo)
@@ -180,21 +202,24 @@ def _is_converted(photo: Path, header: ImageHeader | None) -> bool:
 
 
 def _stored_names(converted: dict[Path, bool]) -> dict[Path, Path]:
-    """Return where each photo is stored; no two differ in the suffix alone, because views are named without it, nor in
-    upper and lower case, which are one file to Windows and macOS."""
+    """Return where each photo is stored; no two differ in the suffix alone, because views are named
+    without it, nor in upper and lower case, which are one file to Windows and macOS."""
     taken: set[str] = set()
     names = {}
     for name, is_png in sorted(converted.items(), key=lambda item: (item[1], item[0])):
-        view, count = name.with_suffix(""), 1
+        view = name.with_suffix("")
+        count = 1
         while view.as_posix().casefold() in taken:
-            view, count = name.with_name(name.name if count == 1 else f"{name.name}_{count}"), count + 1
+            view = name.with_name(name.name if count == 1 else f"{name.name}_{count}")
+            count = count + 1
         taken.add(view.as_posix().casefold())
         names[name] = view.with_name(view.name + (".png" if is_png else name.suffix))
     return names
 
 
 def _store(photo: Path, target: Path, header: ImageHeader | None) -> str:
-    """Store a photo so that readers of ours show it upright; return how its colours were converted, else ""."""
+    """Store a photo so that readers of ours show it upright; return how its colours were converted,
+    else ""."""
     if header is None:
         return _convert_heif(photo, target)
     if not _is_converted(photo, header):
@@ -211,9 +236,13 @@ def _convert_heif(photo: Path, target: Path) -> str:
     from PIL import Image
 
     heif: Any = pillow_heif
-    with reading(photo, "the image is damaged; copy or convert it again"), heif.HeifImageFile(str(photo)) as image:
+    with (
+        reading(photo, "the image is damaged; copy or convert it again"),
+        heif.HeifImageFile(str(photo)) as image,
+    ):
         check_size(photo, *image.size)
-        rgb, exif = image.convert("RGB"), image.info.get("exif")
+        rgb = image.convert("RGB")
+        exif = image.info.get("exif")
         profile = image.info.get("nclx_profile") or {}
     primaries = profile.get("color_primaries", UNSPECIFIED)
     tags = ColourTags(primaries, profile.get("transfer_characteristics", UNSPECIFIED))

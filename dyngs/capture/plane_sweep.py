@@ -1,8 +1,9 @@
-"""Dense first points of a still scene: depth maps of some views by plane sweep, kept where several of them agree.
+"""Dense first points of a still scene: depth maps of some views by plane sweep, kept where several
+of them agree.
 
-For each depth of a view the neighbouring images are drawn as if everything lay that far away (Collins 1996); the depth
-at which windows around a pixel correlate best is the pixel's. A few hundred sparse points become thousands, so that
-training has less to add.
+For each depth of a view the neighbouring images are drawn as if everything lay that far away
+(Collins 1996); the depth at which windows around a pixel correlate best is the pixel's. A few
+hundred sparse points become thousands, so that training has less to add.
 """
 
 from __future__ import annotations
@@ -24,11 +25,13 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 
 SWEEP_SIDE = 120
-"""Longest side of the images that are compared, px; 200 gave no better points and took three times as long."""
+"""Longest side of the images that are compared, px; 200 gave no better points and took three times
+as long."""
 MAPS = 24
 """Views, evenly spaced, whose depth is looked for."""
 NEIGHBOURS, MIN_NEIGHBOURS = 4, 2
-"""Views that each is compared with; the two that agree best count: before others there may be something else."""
+"""Views that each is compared with; the two that agree best count: before others there may be
+something else."""
 DEPTHS = 48
 """Depths that are tried, evenly spaced in inverse depth."""
 WINDOW = 2  # pixels on each side of the middle
@@ -36,20 +39,25 @@ MIN_CORRELATION = 0.8
 AGREEMENT, MIN_AGREEING = 0.02, 2
 """Relative difference of depths up to which two maps agree on a point, and how many others must."""
 FILLED = 0.4
-"""Fraction of filled points. A ray-traced room without points (96 px, 400 steps, mean of three seeds): 24.8 dB without
-them, 27.2 with 0.2, 27.9 with 0.4. The fox (135 px, 1,000 steps): 32.2 dB with 0.2 or 0.4; from random points 25.6."""
+"""Fraction of filled points. A ray-traced room without points (96 px, 400 steps, mean of three
+seeds): 24.8 dB without them, 27.2 with 0.2, 27.9 with 0.4. The fox (135 px, 1,000 steps): 32.2 dB
+with 0.2 or 0.4; from random points 25.6."""
 MIN_POINTS = 500  # with fewer the maps have found noise
-MIN_FRACTION = 0.5  # of the pixels of given depth maps; true ones of a room agree on 0.84, of twice its size on 0.09
+# of the pixels of given depth maps; true ones of a room agree on 0.84, of twice its size on 0.09
+MIN_FRACTION = 0.5
 NEAR_ANGLE, BEST_ANGLE, FAR_ANGLE = 3.0, 12.0, 30.0
-"""Degrees between the lines of sight of neighbours to the middle of the points: from, best, up to."""
+"""Degrees between the lines of sight of neighbours to the middle of the points: from, best, up
+to."""
 _ANGLE_SPREAD = 10.0  # degrees from the best one within which others are nearly as good
-_RANGE, _MARGIN = (1.0, 99.0), 1.25  # percentiles of the points' depths that are searched, and by how much more
+_RANGE = (1.0, 99.0)
+_MARGIN = 1.25  # percentiles of the points' depths that are searched, and by how much more
 _NOISE = 1e-4  # standard deviations of a window below which it has no texture
 
 
 @dataclass(frozen=True)
 class _Shot:
-    """A small image: grey (H, W) and rgb (H, W, 3) in [0, 1], counts (H, W) bool, pose and intrinsics in float64."""
+    """A small image: grey (H, W) and rgb (H, W, 3) in [0, 1], counts (H, W) bool, pose and
+    intrinsics in float64."""
 
     grey: Tensor
     rgb: np.ndarray
@@ -59,10 +67,13 @@ class _Shot:
 
     @property
     def rays(self) -> np.ndarray:
-        """Return (H, W, 3) positions at depth 1 that the pixels' centres look at, in camera axes."""
+        """Return (H, W, 3) positions at depth 1 that the pixels' centres look at, in camera
+        axes."""
         height, width = self.grey.shape
         down, across = np.mgrid[:height, :width] + 0.5
-        return np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(self.intrinsics).T
+        return (
+            np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(self.intrinsics).T
+        )
 
     def points_at(self, depth: np.ndarray) -> np.ndarray:
         """Return the points (P, 3) in the world of the finite depths (H, W), row by row."""
@@ -74,27 +85,38 @@ class _Shot:
 def dense_points(
     views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int, fill: bool = False
 ) -> PointCloud | None:
-    """Return at most ``count`` points of surfaces that several views show, at random of all that were found.
+    """Return at most ``count`` points of surfaces that several views show, at random of all that
+    were found.
 
-    ``sparse`` (P, 3) points say how deep to look and which views show the same things. With ``fill``, ``FILLED`` of the
-    points are of pixels without texture, at the depth of the nearest pixel that has one. None where hardly any points
-    are found: without texture, neighbours, or right poses.
+    ``sparse`` (P, 3) points say how deep to look and which views show the same things. With
+    ``fill``, ``FILLED`` of the points are of pixels without texture, at the depth of the nearest
+    pixel that has one. None where hardly any points are found: without texture, neighbours, or
+    right poses.
     """
     groups = neighbours(views, sparse)
     needed = sorted({i for group in groups for i in group})
     loader = ImageLoader([views[i] for i in needed], _small(options))
     shots = {i: _shot(loader, k) for k, i in enumerate(needed)}
     maps = [
-        (shots[first], _depth_map(shots[first], [shots[i] for i in others], _depth_range(views[first], sparse)))
+        (
+            shots[first],
+            _depth_map(
+                shots[first], [shots[i] for i in others], _depth_range(views[first], sparse)
+            ),
+        )
         for first, *others in groups
     ]
     return _agreed_points(maps, count, MIN_POINTS, fill)
 
 
-def points_of_depth_maps(views: Sequence[View], options: DataConfig, count: int) -> PointCloud | None:
-    """Return at most ``count`` points of the depth maps that belong to the images, where several of them agree.
+def points_of_depth_maps(
+    views: Sequence[View], options: DataConfig, count: int
+) -> PointCloud | None:
+    """Return at most ``count`` points of the depth maps that belong to the images, where several of
+    them agree.
 
-    None without such maps, or where less than ``MIN_FRACTION`` of them agree: they are in another unit than the poses.
+    None without such maps, or where less than ``MIN_FRACTION`` of them agree: they are in another
+    unit than the poses.
     """
     chosen = [views[i] for i in evenly_spaced(len(views), MAPS)]
     loader = ImageLoader(chosen, _small(options), with_maps=True)
@@ -109,7 +131,9 @@ def points_of_depth_maps(views: Sequence[View], options: DataConfig, count: int)
 
 
 def _small(options: DataConfig) -> DataConfig:
-    return options.model_copy(update={"downscale": 1.0, "longest_side": SWEEP_SIDE, "cache_mb": 0.0})
+    return options.model_copy(
+        update={"downscale": 1.0, "longest_side": SWEEP_SIDE, "cache_mb": 0.0}
+    )
 
 
 def _agreed_points(
@@ -124,34 +148,46 @@ def _agreed_points(
     if num_filled:
         gaps = [_gaps_filled(shot, depth) for shot, depth in zip(shots, agreed, strict=True)]
         more = _at_random(shots, gaps, num_filled)
-        xyz, rgb = np.concatenate([xyz, more[0]]), np.concatenate([rgb, more[1]])
+        xyz = np.concatenate([xyz, more[0]])
+        rgb = np.concatenate([rgb, more[1]])
     return PointCloud(xyz, np.rint(255 * rgb).astype(np.uint8))
 
 
-def _at_random(shots: Sequence[_Shot], maps: Sequence[np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``count`` random points (P, 3) of depth maps in the world, and their colours (P, 3)."""
-    found = [(shot.points_at(depth), shot.rgb[np.isfinite(depth)]) for shot, depth in zip(shots, maps, strict=True)]
+def _at_random(
+    shots: Sequence[_Shot], maps: Sequence[np.ndarray], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` random points (P, 3) of depth maps in the world, and their colours (P,
+    3)."""
+    found = [
+        (shot.points_at(depth), shot.rgb[np.isfinite(depth)])
+        for shot, depth in zip(shots, maps, strict=True)
+    ]
     xyz, rgb = (np.concatenate(x) for x in zip(*found, strict=True))
     chosen = np.sort(np.random.default_rng(0).permutation(len(xyz))[:count])
     return xyz[chosen], rgb[chosen]
 
 
 def _gaps_filled(shot: _Shot, depth: np.ndarray) -> np.ndarray:
-    """Return (H, W) the depth of the nearest known pixel for pixels that are unknown and count, NaN for others."""
+    """Return (H, W) the depth of the nearest known pixel for pixels that are unknown and count, NaN
+    for others."""
     from scipy.ndimage import distance_transform_edt  # late: few scenes need it
 
     is_unknown = np.isnan(depth)
     if is_unknown.all():
         return depth
-    rows, columns = np.asarray(distance_transform_edt(is_unknown, return_distances=False, return_indices=True))
+    rows, columns = np.asarray(
+        distance_transform_edt(is_unknown, return_distances=False, return_indices=True)
+    )
     return np.where(is_unknown & shot.counts, depth[rows, columns], np.nan)
 
 
 def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
-    """Return groups of indices of views: one whose depth is looked for, then up to ``NEIGHBOURS`` to compare it with.
+    """Return groups of indices of views: one whose depth is looked for, then up to ``NEIGHBOURS``
+    to compare it with.
 
-    Those that see many of the same points, from an angle that is neither too small to tell depths apart nor too large
-    for windows to look alike; a view with fewer than ``MIN_NEIGHBOURS`` of them has no group.
+    Those that see many of the same points, from an angle that is neither too small to tell depths
+    apart nor too large for windows to look alike; a view with fewer than ``MIN_NEIGHBOURS`` of them
+    has no group.
     """
     sees = np.stack([projected(sparse, view)[1] for view in views]).astype(np.float64)
     centers = np.stack([camera_center(view.cam_from_world) for view in views])
@@ -177,26 +213,38 @@ def _shot(loader: ImageLoader, index: int) -> _Shot:
     if image.alpha is not None:
         counts &= image.alpha.numpy() >= 0.5
     rgb = image.rgb_premultiplied.clamp(0, 1)
-    pose, intrinsics = image.cameras.cam_from_world[0], image.cameras.intrinsics[0]
-    return _Shot(rgb.mean(dim=2), rgb.numpy(), counts, pose.double().numpy(), intrinsics.double().numpy())
+    pose = image.cameras.cam_from_world[0]
+    intrinsics = image.cameras.intrinsics[0]
+    return _Shot(
+        rgb.mean(dim=2), rgb.numpy(), counts, pose.double().numpy(), intrinsics.double().numpy()
+    )
 
 
 def _depth_range(view: View, sparse: np.ndarray) -> tuple[float, float]:
-    """Return the nearest and the farthest depth of the points (P, 3) that lie in the image, but for a few."""
-    depths = sparse[projected(sparse, view)[1]] @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+    """Return the nearest and the farthest depth of the points (P, 3) that lie in the image, but for
+    a few."""
+    depths = (
+        sparse[projected(sparse, view)[1]] @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+    )
     near, far = np.percentile(depths, _RANGE)
     return float(near), float(far)
 
 
 def _depth_map(shot: _Shot, others: Sequence[_Shot], depths: tuple[float, float]) -> np.ndarray:
-    """Return (H, W) depths; NaN where nothing correlates, at the ends of the range, and where pixels do not count."""
+    """Return (H, W) depths; NaN where nothing correlates, at the ends of the range, and where
+    pixels do not count."""
     near, far = depths
     inverse = np.linspace(1 / (_MARGIN * far), _MARGIN / near, DEPTHS)
     score = _mean_of_best_two([_correlation(shot, other, inverse) for other in others]).numpy()
     at = score.argmax(axis=0)
     inner = np.clip(at, 1, DEPTHS - 2)
-    before, middle, after = (np.take_along_axis(score, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
-    peak = np.clip(0.5 * (before - after) / np.minimum(before - 2 * middle + after, -1e-6), -0.5, 0.5)  # of a parabola
+    before, middle, after = (
+        np.take_along_axis(score, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1)
+    )
+    # of a parabola
+    peak = np.clip(
+        0.5 * (before - after) / np.minimum(before - 2 * middle + after, -1e-6), -0.5, 0.5
+    )
     depth = 1 / (inverse[0] + (inner + peak) * (inverse[1] - inverse[0]))
     return np.where((at == inner) & (middle > MIN_CORRELATION) & shot.counts, depth, np.nan)
 
@@ -210,17 +258,23 @@ def _mean_of_best_two(correlations: Sequence[Tensor]) -> Tensor:
 
 
 def _correlation(shot: _Shot, other: _Shot, inverse: np.ndarray) -> Tensor:
-    """Return (D, H, W) normalised correlations of windows of two images, by inverse depth; -1 outside the other one."""
+    """Return (D, H, W) normalised correlations of windows of two images, by inverse depth; -1
+    outside the other one."""
     relative = other.cam_from_world @ inverse_rigid(shot.cam_from_world)
-    turned = torch.from_numpy(np.moveaxis(shot.rays @ (other.intrinsics @ relative[:3, :3]).T, 2, 0).copy()).float()
+    turned = torch.from_numpy(
+        np.moveaxis(shot.rays @ (other.intrinsics @ relative[:3, :3]).T, 2, 0).copy()
+    ).float()
     moved = torch.from_numpy(inverse[:, None] * (other.intrinsics @ relative[:3, 3])).float()
-    x, y, z = (turned[k] + moved[:, k, None, None] for k in range(3))  # homogeneous, times the inverse depth
+    # homogeneous, times the inverse depth
+    x, y, z = (turned[k] + moved[:, k, None, None] for k in range(3))
     height, width = other.grey.shape
     scale = 2 / z.clamp_min(1e-6)
-    x, y = x * (scale / width) - 1, y * (scale / height) - 1
+    x = x * (scale / width) - 1
+    y = y * (scale / height) - 1
     images = other.grey.expand(len(inverse), 1, height, width)
     drawn = grid_sample(images, torch.stack([x, y], dim=-1), align_corners=False)[:, 0]
-    mean, mean_drawn = _window_mean(shot.grey), _window_mean(drawn)
+    mean = _window_mean(shot.grey)
+    mean_drawn = _window_mean(drawn)
     variance = _window_mean(shot.grey * shot.grey) - mean * mean
     variance_drawn = _window_mean(drawn * drawn) - mean_drawn * mean_drawn
     product = _window_mean(drawn * shot.grey) - mean * mean_drawn
@@ -230,15 +284,18 @@ def _correlation(shot: _Shot, other: _Shot, inverse: np.ndarray) -> Tensor:
 
 
 def _window_mean(x: Tensor) -> Tensor:
-    """Return (..., H - 2 WINDOW, W - 2 WINDOW) means of windows; ten times as fast as avg_pool2d."""
+    """Return (..., H - 2 WINDOW, W - 2 WINDOW) means of windows; ten times as fast as
+    avg_pool2d."""
     size = 2 * WINDOW + 1
-    height, width = x.shape[-2] - size + 1, x.shape[-1] - size + 1
+    height = x.shape[-2] - size + 1
+    width = x.shape[-1] - size + 1
     rows = reduce(add, (x[..., k : k + height, :] for k in range(size)))
     return reduce(add, (rows[..., k : k + width] for k in range(size))) / size**2
 
 
 def _agreed(shot: _Shot, depth: np.ndarray, maps: Sequence[tuple[_Shot, np.ndarray]]) -> np.ndarray:
-    """Return (H, W) bool: pixels of a depth map whose points ``MIN_AGREEING`` others have as well."""
+    """Return (H, W) bool: pixels of a depth map whose points ``MIN_AGREEING`` others have as
+    well."""
     is_known = np.isfinite(depth)
     xyz = shot.points_at(depth)
     agreeing = np.zeros(len(xyz), np.int64)
@@ -251,7 +308,8 @@ def _agreed(shot: _Shot, depth: np.ndarray, maps: Sequence[tuple[_Shot, np.ndarr
 
 
 def _agrees(xyz: np.ndarray, other: _Shot, depth: np.ndarray) -> np.ndarray:
-    """Return (P,) bool: whether the depth map of another view has the points (P, 3) about where they are."""
+    """Return (P,) bool: whether the depth map of another view has the points (P, 3) about where
+    they are."""
     local = xyz @ other.cam_from_world[:3, :3].T + other.cam_from_world[:3, 3]
     z = np.where(local[:, 2] > 0, local[:, 2], np.nan)
     across, down = (local @ other.intrinsics.T)[:, :2].T / z

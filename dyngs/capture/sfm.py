@@ -1,4 +1,5 @@
-"""Camera poses for a folder of photos or a video, by pycolmap's structure from motion on the CPU."""
+"""Camera poses for a folder of photos or a video, by pycolmap's structure from motion on the
+CPU."""
 
 from __future__ import annotations
 
@@ -18,11 +19,24 @@ from dyngs.capture.frame_choice import STILL, chosen_frames, measured
 from dyngs.capture.photos import Photo, copied, digest_of, gather_photos, lay_out
 from dyngs.capture.sfm_features import find_features, match_pairs, matched_images, pairs_to_match
 from dyngs.capture.sfm_mapping import SfmModel, better, mapped, needs_more
-from dyngs.capture.sfm_matches import Parallax, angles_deg, matched_pairs, parallax_of, turning_fraction, without_movers
+from dyngs.capture.sfm_matches import (
+    Parallax,
+    angles_deg,
+    matched_pairs,
+    parallax_of,
+    turning_fraction,
+    without_movers,
+)
 from dyngs.capture.sfm_work import SfmOptions, SfmTask, quiet_colmap, working
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.images import read_header
-from dyngs.data.images.video import colour_notes, frame_seconds, probe_video, read_frames, read_numbered_frames
+from dyngs.data.images.video import (
+    colour_notes,
+    frame_seconds,
+    probe_video,
+    read_frames,
+    read_numbered_frames,
+)
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import write_seconds
 from dyngs.errors import DyngsError, counted
@@ -95,7 +109,8 @@ class SfmResult:
 
 @dataclass(frozen=True)
 class _Images:
-    """The images in ``capture/images``, names of those that are blurred, and lines on what was taken."""
+    """The images in ``capture/images``, names of those that are blurred, and lines on what was
+    taken."""
 
     photos: list[Photo]
     blurred: tuple[str, ...] = ()
@@ -103,14 +118,19 @@ class _Images:
 
 
 def estimate_poses(
-    source: Path, out: Path, options: SfmOptions = SfmOptions(), report: ReportProgress = report_nothing
+    source: Path,
+    out: Path,
+    options: SfmOptions = SfmOptions(),
+    report: ReportProgress = report_nothing,
 ) -> SfmResult:
-    """Estimate poses of the images in ``source`` and write a COLMAP capture (``out/images``, ``out/sparse/0``).
+    """Estimate poses of the images in ``source`` and write a COLMAP capture (``out/images``,
+    ``out/sparse/0``).
 
-    Work is done in a hidden folder next to ``out``; it is renamed at the end, so ``out`` is complete or absent.
-    A stopped run leaves that folder, and the next one with the same images and options goes on with its features and
-    matches. Of several models the one with most images is kept. Raises DyngsError: too few images, an ``out`` in use, a
-    camera that stands still or only rotates, or nothing could be registered, with advice.
+    Work is done in a hidden folder next to ``out``; it is renamed at the end, so ``out`` is
+    complete or absent. A stopped run leaves that folder, and the next one with the same images and
+    options goes on with its features and matches. Of several models the one with most images is
+    kept. Raises DyngsError: too few images, an ``out`` in use, a camera that stands still or only
+    rotates, or nothing could be registered, with advice.
 
     Args:
         source: a folder of photos (subfolders included) or a video file.
@@ -137,7 +157,9 @@ def estimate_poses(
         raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
 
 
-def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress) -> SfmResult:
+def _posed_in(
+    work: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress
+) -> SfmResult:
     stages: dict[str, float] = {}
     capture = work / "capture"
 
@@ -158,13 +180,19 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
         found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *images.notes))
         raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
     with quiet_colmap():
-        with nullcontext() if options.masks is None else staying_within(options.masks, options.follow_links):
+        with (
+            nullcontext()
+            if options.masks is None
+            else staying_within(options.masks, options.follow_links)
+        ):
             task = _laid_out(work, photos, source.is_file(), options, report)
         with timed("features"):
             stronger = find_features(task)
         notes = [*images.notes]
         if stronger > 1:
-            notes.append(f"features with {stronger:g} times the usual contrast were taken: frames have many")
+            notes.append(
+                f"features with {stronger:g} times the usual contrast were taken: frames have many"
+            )
         with timed("matching"):
             match_pairs(task, pairs_to_match(task))
             notes += _parallax_seen(task)
@@ -172,7 +200,11 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
             model, more = _mapped(task)
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
-    lonely = {own[name] for name, count in matched_images(task.database).items() if count < _FEWEST_MATCHED}
+    lonely = {
+        own[name]
+        for name, count in matched_images(task.database).items()
+        if count < _FEWEST_MATCHED
+    }
     missing = _write_model(model, capture, own)
     notes += [*more, *_advice(missing, lonely, images.blurred, task.is_video)]
     found = model.reconstruction
@@ -184,27 +216,37 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
     return result
 
 
-def _laid_out(work: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ReportProgress) -> SfmTask:
+def _laid_out(
+    work: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ReportProgress
+) -> SfmTask:
     folder = work / "capture" / "images"
     found = {} if options.masks is None else find_masks(options.masks)
-    masks = {photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None}
+    masks = {
+        photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None
+    }
     if options.masks is not None and not masks:
-        raise DyngsError(f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)")
+        raise DyngsError(
+            f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)"
+        )
     names = lay_out(photos, folder, work / "images", masks)
     for name, mask in masks.items():
         target = folder.with_name("masks") / (name + mask.suffix)
         if not target.exists():
             copied(inside(mask).resolve(), target)
     used = work / "masks" if masks else None
-    return SfmTask(work / "database.db", work / "images", names, photos, options, report, is_video, used)
+    return SfmTask(
+        work / "database.db", work / "images", names, photos, options, report, is_video, used
+    )
 
 
 def _mapped(task: SfmTask) -> tuple[SfmModel, list[str]]:
     """Return the model, and lines about what was done for it.
 
-    Where it is not good, features that disagree with most of their images are left out, and the better one is kept.
+    Where it is not good, features that disagree with most of their images are left out, and the
+    better one is kept.
     """
-    model, notes = mapped(task), []
+    model = mapped(task)
+    notes = []
     if model is None or needs_more(model, task):
         still = task.database.with_name("still.db")
         shutil.copyfile(task.database, still)
@@ -213,7 +255,11 @@ def _mapped(task: SfmTask) -> tuple[SfmModel, list[str]]:
             second = mapped(replace(task, database=still))
             best = better(model, second)
             if best is second and second is not None:
-                before = "none" if model is None else f"{counted(model.registered, 'image')}, {model.error_px:.2f} px"
+                before = (
+                    "none"
+                    if model is None
+                    else f"{counted(model.registered, 'image')}, {model.error_px:.2f} px"
+                )
                 notes.append(
                     f"{fraction:.0%} of the features move with something else than the scene and were left out: "
                     f"{counted(second.registered, 'image')}, {second.error_px:.2f} px; with them {before}"
@@ -230,7 +276,8 @@ def _mapped(task: SfmTask) -> tuple[SfmModel, list[str]]:
 
 
 def _parallax_seen(task: SfmTask) -> list[str]:
-    """Return a line where the camera hardly moved, or where matches may be of something that moves; else none."""
+    """Return a line where the camera hardly moved, or where matches may be of something that moves;
+    else none."""
     found = parallax_of(matched_pairs(task.database), task.side)
     if found.kind is Parallax.NONE:
         raise DyngsError(_TURNING)
@@ -286,8 +333,11 @@ def _write_model(model: SfmModel, capture: Path, names: dict[str, str]) -> tuple
     return tuple(name for name in names.values() if name not in registered)
 
 
-def _advice(unregistered: Sequence[str], lonely: set[str], blurred: Sequence[str], is_video: bool) -> Iterator[str]:
-    """Yield lines about what to film better: images without a pose, that match few others, that are less sharp."""
+def _advice(
+    unregistered: Sequence[str], lonely: set[str], blurred: Sequence[str], is_video: bool
+) -> Iterator[str]:
+    """Yield lines about what to film better: images without a pose, that match few others, that are
+    less sharp."""
     apart = sum(name in lonely for name in unregistered)
     if apart:
         more = "move slower there" if is_video else "take more photos around them"
@@ -305,9 +355,11 @@ def _advice(unregistered: Sequence[str], lonely: set[str], blurred: Sequence[str
 def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportProgress) -> _Images:
     """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
 
-    Two passes, so that only one image is held in memory: the first one measures. Frames of a stopped run are kept.
+    Two passes, so that only one image is held in memory: the first one measures. Frames of a
+    stopped run are kept.
     """
-    images, done = capture / "images", capture.parent / "frames.json"
+    images = capture / "images"
+    done = capture.parent / "frames.json"
     if not done.is_file():
         measures = measured(read_frames(video))
         choice = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
@@ -326,6 +378,9 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
         notes = [*colour_notes([probe_video(video)]), choice.summary()]
         fields = {"names": list(names.values()), "blurred": blurred, "notes": notes}
         write_text(done, json.dumps(fields))
-    stored = {key: tuple(map(str, cast("list[object]", value))) for key, value in read_json_object(done).items()}
+    stored = {
+        key: tuple(map(str, cast("list[object]", value)))
+        for key, value in read_json_object(done).items()
+    }
     photos = [Photo(name, read_header(images / name), name) for name in stored["names"]]
     return _Images(photos, stored["blurred"], stored["notes"])

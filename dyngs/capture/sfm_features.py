@@ -1,4 +1,5 @@
-"""Features and matches of images in COLMAP's database, and which images are compared; a stopped run goes on."""
+"""Features and matches of images in COLMAP's database, and which images are compared; a stopped run
+goes on."""
 
 from __future__ import annotations
 
@@ -9,30 +10,43 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.capture.sfm_work import LENS, LONGEST_SIDE, MAX_FEATURES, SfmTask, feature_options, match_listed
+from dyngs.capture.sfm_work import (
+    LENS,
+    LONGEST_SIDE,
+    MAX_FEATURES,
+    SfmTask,
+    feature_options,
+    match_listed,
+)
 
 _AT_ONCE, _MATCHING_CALLS = 8, 16
-_SMALL_PX = 1000  # images up to this long are doubled in size for finding features: they have few otherwise
+# images up to this long are doubled in size for finding features: they have few otherwise
+_SMALL_PX = 1000
 _PEAK = 0.02 / 3
-_STRONGER, _TRIED = (1.0, 1.5, 2.0, 3.0, 4.0), 3
-ENOUGH = 4000  # features of a frame of a video, on average over three of them, above which weak ones are left out
+_STRONGER = (1.0, 1.5, 2.0, 3.0, 4.0)
+_TRIED = 3
+# features of a frame of a video, on average over three of them, above which weak ones are left out
+ENOUGH = 4000
 
 
 def find_features(task: SfmTask) -> float:
     """Find SIFT features of all images that have none in the database yet.
 
-    Returns how many times the usual contrast a feature must have: more than 1 where frames of a video have more than
-    ``ENOUGH``. The largest features would be the coarse ones, whose positions are not exact.
+    Returns how many times the usual contrast a feature must have: more than 1 where frames of a
+    video have more than ``ENOUGH``. The largest features would be the coarse ones, whose positions
+    are not exact.
 
-    COLMAP is called for some images at a time: it has no callbacks, and its database must not be opened by another
-    copy of SQLite in the same process, whose end would take away COLMAP's locks.
+    COLMAP is called for some images at a time: it has no callbacks, and its database must not be
+    opened by another copy of SQLite in the same process, whose end would take away COLMAP's locks.
 
-    Images and cameras are entered first, in order: with several threads COLMAP would number them as they are done,
-    and what follows depends on the numbers. Focal lengths of the EXIF tags are taken as first values.
+    Images and cameras are entered first, in order: with several threads COLMAP would number them as
+    they are done, and what follows depends on the numbers. Focal lengths of the EXIF tags are taken
+    as first values.
     """
     import pycolmap
 
-    reader, mode = pycolmap.ImageReaderOptions(camera_model=LENS), pycolmap.CameraMode.PER_IMAGE
+    reader = pycolmap.ImageReaderOptions(camera_model=LENS)
+    mode = pycolmap.CameraMode.PER_IMAGE
     if task.masks is not None:
         reader.mask_path = task.masks
     if task.has_one_lens:
@@ -75,8 +89,10 @@ def find_features(task: SfmTask) -> float:
 
 
 def match_pairs(task: SfmTask, pairs: Sequence[tuple[int, int]]) -> None:
-    """Match pairs of images, given by their places in the order, and verify them; those of before are left."""
-    ordered = sorted(set(pairs))  # of few images at a time: COLMAP prepares each one anew in every call
+    """Match pairs of images, given by their places in the order, and verify them; those of before
+    are left."""
+    # of few images at a time: COLMAP prepares each one anew in every call
+    ordered = sorted(set(pairs))
     step = max(len(ordered) // _MATCHING_CALLS, _AT_ONCE)
     for first in range(0, len(ordered), step):
         part = ordered[first : first + step]
@@ -128,14 +144,17 @@ def _enter_focal_lengths(task: SfmTask) -> None:
 
 _EXHAUSTIVE_PHOTOS, _EXHAUSTIVE_FRAMES = 60, 24
 _STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Distances in the order of names at which images are compared: dense near, sparse far (loops of a few seconds)."""
-_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24  # images that look most alike, compared with each one next to its neighbours
+"""Distances in the order of names at which images are compared: dense near, sparse far (loops of a
+few seconds)."""
+# images that look most alike, compared with each one next to its neighbours
+_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24
 _WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
 
 
 def pairs_to_match(task: SfmTask) -> list[tuple[int, int]]:
     """Return the pairs to match, by places in the order of names, the smaller one first."""
-    matching, count = task.options.matching, len(task.names)
+    matching = task.options.matching
+    count = len(task.names)
     limit = _EXHAUSTIVE_FRAMES if task.is_video else _EXHAUSTIVE_PHOTOS
     if matching == "exhaustive" or (matching == "auto" and count <= limit):
         return list(combinations(range(count), 2))
@@ -146,21 +165,27 @@ def pairs_to_match(task: SfmTask) -> list[tuple[int, int]]:
 def _alike_pairs(task: SfmTask) -> list[tuple[int, int]]:
     """Return pairs of each image with the others that look most alike by their features.
 
-    An image is described by its SIFT descriptors, counted by which of 64 typical ones is nearest (found by k-means
-    among these images), as sums of differences from it (VLAD: Jegou et al. 2010, "Aggregating local descriptors into
-    a compact image representation"). Nothing random is left to chance: the same features give the same pairs.
+    An image is described by its SIFT descriptors, counted by which of 64 typical ones is nearest
+    (found by k-means among these images), as sums of differences from it (VLAD: Jegou et al. 2010,
+    "Aggregating local descriptors into a compact image representation"). Nothing random is left to
+    chance: the same features give the same pairs.
     """
     import pycolmap
 
     with pycolmap.Database.open(task.database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
-        found = [np.asarray(opened.read_descriptors(ids[name]).data).astype(np.float32) for name in task.names]
+        found = [
+            np.asarray(opened.read_descriptors(ids[name]).data).astype(np.float32)
+            for name in task.names
+        ]
     described = _described(found)
     alike = described @ described.T
     np.fill_diagonal(alike, -np.inf)
     pairs = set()
     for i, row in enumerate(alike):
-        for j in np.argsort(-row, kind="stable")[: _ALIKE_FRAMES if task.is_video else _ALIKE_PHOTOS].tolist():
+        for j in np.argsort(-row, kind="stable")[
+            : _ALIKE_FRAMES if task.is_video else _ALIKE_PHOTOS
+        ].tolist():
             if np.isfinite(row[j]):
                 pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)

@@ -1,4 +1,5 @@
-"""What matches tell: whether poses fit them, whether the camera moved or only rotated, and which are of movers."""
+"""What matches tell: whether poses fit them, whether the camera moved or only rotated, and which
+are of movers."""
 
 from __future__ import annotations
 
@@ -14,13 +15,15 @@ if TYPE_CHECKING:
 
 
 _FITS_PX = 4.0
-"""Median distance from the epipolar lines up to which a pair fits its poses, in pixels of images up to 1,000 px."""
+"""Median distance from the epipolar lines up to which a pair fits its poses, in pixels of images up
+to 1,000 px."""
 _WELL = 30  # matches of a pair that is looked at
 _MOST_FITTED_PAIRS = 2000
 
 
 def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
-    """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit the poses."""
+    """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit
+    the poses."""
     import pycolmap
 
     posed = {key: image for key, image in model.images.items() if image.has_pose}
@@ -28,8 +31,15 @@ def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int)
     fits = []
     with pycolmap.Database.open(database) as opened:
         ids, geometries = opened.read_two_view_geometries()
-        found = [(pycolmap.pair_id_to_image_pair(i), g.inlier_matches) for i, g in zip(ids, geometries, strict=True)]
-        found = [(pair, matches) for pair, matches in found if len(matches) >= _WELL and set(pair) <= posed.keys()]
+        found = [
+            (pycolmap.pair_id_to_image_pair(i), g.inlier_matches)
+            for i, g in zip(ids, geometries, strict=True)
+        ]
+        found = [
+            (pair, matches)
+            for pair, matches in found
+            if len(matches) >= _WELL and set(pair) <= posed.keys()
+        ]
         for (a, b), matches in found[:: max(len(found) // _MOST_FITTED_PAIRS, 1)]:
             for key in (a, b):
                 if key not in rays:
@@ -41,12 +51,15 @@ def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int)
             essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a.rotation.matrix()
             distances = _sampson(essential, rays[a][matches[:, 0]], rays[b][matches[:, 1]])
             focal = model.cameras[posed[a].camera_id].mean_focal_length()
-            fits.append(np.nanmedian(distances) * focal <= _FITS_PX * max(longest_side, 1000) / 1000)
+            fits.append(
+                np.nanmedian(distances) * focal <= _FITS_PX * max(longest_side, 1000) / 1000
+            )
     return float(np.mean(fits)) if fits else 1.0
 
 
 def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
-    """Return the largest angle under which each of some 2,000 points is seen from two images, in degrees."""
+    """Return the largest angle under which each of some 2,000 points is seen from two images, in
+    degrees."""
     centres = {i: image.projection_center() for i, image in model.images.items() if image.has_pose}
     angles = []
     ids = sorted(model.points3D)
@@ -59,13 +72,18 @@ def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def turning_fraction(database: Path) -> float:
-    """Return the fraction of matched pairs that a homography explains: rotating on the spot, or one flat surface."""
+    """Return the fraction of matched pairs that a homography explains: rotating on the spot, or one
+    flat surface."""
     import pycolmap
 
     kinds = pycolmap.TwoViewGeometryConfiguration
     flat = {int(kinds.PLANAR_OR_PANORAMIC), int(kinds.PANORAMIC), int(kinds.PLANAR)}
     with pycolmap.Database.open(database) as opened:
-        found = [int(g.config) for g in opened.read_two_view_geometries()[1] if len(g.inlier_matches) >= _WELL]
+        found = [
+            int(g.config)
+            for g in opened.read_two_view_geometries()[1]
+            if len(g.inlier_matches) >= _WELL
+        ]
     return sum(kind in flat for kind in found) / len(found) if found else 0.0
 
 
@@ -79,7 +97,8 @@ _NONE, _NONE_PX = 0.0015, 1.0
 """Parallax below which the camera did not move: fraction of the longest side, and pixels."""
 _SMALL, _SMALL_PX = 0.008, 2.0  # the same, below which it hardly moved
 _COVERED, _CELLS = 0.5, 8
-"""Fraction of the image that matches must cover to tell that, in cells of which the longest side has so many."""
+"""Fraction of the image that matches must cover to tell that, in cells of which the longest side
+has so many."""
 
 
 class Parallax(Enum):
@@ -92,7 +111,8 @@ class Parallax(Enum):
 
 @dataclass(frozen=True)
 class SeenParallax:
-    """Parallax as a fraction of the longest side, what it says, and ``MatchedPair.covered`` (median over pairs)."""
+    """Parallax as a fraction of the longest side, what it says, and ``MatchedPair.covered`` (median
+    over pairs)."""
 
     fraction: float
     kind: Parallax
@@ -100,7 +120,8 @@ class SeenParallax:
 
     @property
     def may_follow_a_mover(self) -> bool:
-        """Whether so little of the images matches that it may be a thing that moves: clips at hand have 62 to 94 %."""
+        """Whether so little of the images matches that it may be a thing that moves: clips at hand
+        have 62 to 94 %."""
         return self.covered < _COVERED
 
 
@@ -121,11 +142,12 @@ class MatchedPair:
 def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
     """Return the parallax of the pairs that have most of it (90 % have less).
 
-    The parallax of a pair is the distance that three quarters of its matches stay below after the turn of the camera
-    that explains them best, with the focal length, common to all, that leaves least. It is that of noise where the
-    camera only rotated, however far, and about the focal length times the shift over the depth where it moved.
-    Without pairs nothing is known, and it is 1. Nor is it where matches cover less than half of the images: what
-    else is in them may be elsewhere in the other ones, and the matches those of a thing that moves. Noise of matches is
+    The parallax of a pair is the distance that three quarters of its matches stay below after the
+    turn of the camera that explains them best, with the focal length, common to all, that leaves
+    least. It is that of noise where the camera only rotated, however far, and about the focal
+    length times the shift over the depth where it moved. Without pairs nothing is known, and it is
+    1. Nor is it where matches cover less than half of the images: what else is in them may be
+      elsewhere in the other ones, and the matches those of a thing that moves. Noise of matches is
     about half a pixel.
     """
     if not pairs:
@@ -136,7 +158,8 @@ def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
 
     coarse = left_with(_FOCALS)
     best = int(coarse.mean(1).argmin())
-    low, high = _FOCALS[max(best - 1, 0)], _FOCALS[min(best + 1, len(_FOCALS) - 1)]
+    low = _FOCALS[max(best - 1, 0)]
+    high = _FOCALS[min(best + 1, len(_FOCALS) - 1)]
     fine = left_with(np.linspace(low, high, _FINE))
     fraction = float(np.percentile(fine[fine.mean(1).argmin()], _WIDEST))
     covered = float(np.median([pair.covered for pair in pairs]))
@@ -155,7 +178,11 @@ def matched_pairs(database: Path) -> list[MatchedPair]:
     with pycolmap.Database.open(database) as opened:
         ids, geometries = opened.read_two_view_geometries()
         found = [(i, np.asarray(g.inlier_matches)) for i, g in zip(ids, geometries, strict=True)]
-        found = [(pycolmap.pair_id_to_image_pair(i), matches) for i, matches in found if len(matches) >= _WELL]
+        found = [
+            (pycolmap.pair_id_to_image_pair(i), matches)
+            for i, matches in found
+            if len(matches) >= _WELL
+        ]
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         owners = {image.image_id: cameras[image.camera_id] for image in opened.read_all_images()}
 
@@ -193,18 +220,21 @@ def _left(pair: MatchedPair, focal: float) -> float:
 
 
 _OUTSIDE_PX = 2.0
-"""Distance from the epipolar line, in pixels of an image up to 1,000 px long, from which a match disagrees."""
+"""Distance from the epipolar line, in pixels of an image up to 1,000 px long, from which a match
+disagrees."""
 _FEWEST_PAIRS = 3
 _MOST_OUTSIDE = 0.4
 _FEWEST_MATCHES = 15
 
 
 def without_movers(database: Path, longest_side: int) -> float:
-    """Remove matches of moving features from all verified pairs; return the fraction of matched features that move.
+    """Remove matches of moving features from all verified pairs; return the fraction of matched
+    features that move.
 
-    Each match of two images agrees or disagrees with the epipolar geometry of most of their matches. A feature moves
-    if it disagrees in more than ``_MOST_OUTSIDE`` of its pairs (three at least). A thing that fills most of *some*
-    pairs wins these, and loses them once its features are known to move by the others.
+    Each match of two images agrees or disagrees with the epipolar geometry of most of their
+    matches. A feature moves if it disagrees in more than ``_MOST_OUTSIDE`` of its pairs (three at
+    least). A thing that fills most of *some* pairs wins these, and loses them once its features are
+    known to move by the others.
     """
     import pycolmap
 
@@ -212,7 +242,10 @@ def without_movers(database: Path, longest_side: int) -> float:
     with pycolmap.Database.open(database) as opened:
         ids, geometries = opened.read_two_view_geometries()
         pairs = [pycolmap.pair_id_to_image_pair(key) for key in ids]
-        places = {i.image_id: np.asarray(opened.read_keypoints(i.image_id))[:, :2] for i in opened.read_all_images()}
+        places = {
+            i.image_id: np.asarray(opened.read_keypoints(i.image_id))[:, :2]
+            for i in opened.read_all_images()
+        }
         seen = {image: np.zeros(len(xy), int) for image, xy in places.items()}
         outside = {image: np.zeros(len(xy), int) for image, xy in places.items()}
         for a, b in pairs:
@@ -224,31 +257,41 @@ def without_movers(database: Path, longest_side: int) -> float:
                 np.add.at(seen[image], rows, 1)
                 np.add.at(outside[image], rows, wrong)
         moves = {
-            image: (seen[image] >= _FEWEST_PAIRS) & (outside[image] > _MOST_OUTSIDE * seen[image]) for image in places
+            image: (seen[image] >= _FEWEST_PAIRS) & (outside[image] > _MOST_OUTSIDE * seen[image])
+            for image in places
         }
         for (a, b), geometry in zip(pairs, geometries, strict=True):
             inliers = np.asarray(geometry.inlier_matches)
             if len(inliers):
-                geometry.inlier_matches = inliers[~(moves[a][inliers[:, 0]] | moves[b][inliers[:, 1]])]
+                geometry.inlier_matches = inliers[
+                    ~(moves[a][inliers[:, 0]] | moves[b][inliers[:, 1]])
+                ]
                 opened.update_two_view_geometry(a, b, geometry)
     matched = sum(int((count > 0).sum()) for count in seen.values())
     return sum(int(move.sum()) for move in moves.values()) / max(matched, 1)
 
 
 def _distances(first: np.ndarray, second: np.ndarray, limit_px: float) -> np.ndarray:
-    """Return the Sampson distances, px, of matches (M, 2) to the matrix that most agree with; zeros without one."""
+    """Return the Sampson distances, px, of matches (M, 2) to the matrix that most agree with; zeros
+    without one."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = limit_px, 0
-    first, second = first.astype(np.float64), second.astype(np.float64)
+    first = first.astype(np.float64)
+    second = second.astype(np.float64)
     found = pycolmap.estimate_fundamental_matrix(first, second, options)
-    return np.zeros(len(first)) if found is None else _sampson(np.asarray(found["F"]), first, second)
+    return (
+        np.zeros(len(first)) if found is None else _sampson(np.asarray(found["F"]), first, second)
+    )
 
 
 def _sampson(matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the Sampson distances (M,) of places (M, 2) to a (3, 3) fundamental or essential matrix."""
-    a, b = np.c_[first, np.ones(len(first))], np.c_[second, np.ones(len(second))]
-    lines_b, lines_a = a @ matrix.T, b @ matrix
+    """Return the Sampson distances (M,) of places (M, 2) to a (3, 3) fundamental or essential
+    matrix."""
+    a = np.c_[first, np.ones(len(first))]
+    b = np.c_[second, np.ones(len(second))]
+    lines_b = a @ matrix.T
+    lines_a = b @ matrix
     slope = (lines_b[:, :2] ** 2).sum(1) + (lines_a[:, :2] ** 2).sum(1)
     return np.abs((b * lines_b).sum(1)) / np.sqrt(np.maximum(slope, 1e-18))

@@ -1,4 +1,5 @@
-"""Structure from motion: options, the images laid out for COLMAP, its calls, and the folder to work in."""
+"""Structure from motion: options, the images laid out for COLMAP, its calls, and the folder to work
+in."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 LENS = "SIMPLE_RADIAL"
 """COLMAP's name of the lens model that is fitted."""
 LONGEST_SIDE, MAX_FEATURES = 1600, 8192
-"""Images are shrunk to so many px for finding so many SIFT features at most; poses refer to the full size."""
+"""Images are shrunk to so many px for finding so many SIFT features at most; poses refer to the
+full size."""
 SEED = 0
 
 
@@ -32,15 +34,18 @@ class SfmOptions:
     """Options of pose estimation.
 
     Attributes:
-        matching: pairs that are compared; auto = all of up to 60 photos or 24 frames, beyond that neighbours by name
-            (some far ones, too) and those that look alike; sequential = the same without what looks alike.
-        mapper: COLMAP's mapping; auto = global for a video, incremental for photos, the other where that finds less.
-        num_frames: images to take at most from a video, None = 100; of several videos time steps, None =
-            ``times.MOST_STEPS``, fewer for many cameras.
+        matching: pairs that are compared; auto = all of up to 60 photos or 24 frames, beyond that
+            neighbours by name (some far ones, too) and those that look alike; sequential = the same
+            without what looks alike.
+        mapper: COLMAP's mapping; auto = global for a video, incremental for photos, the other where
+            that finds less.
+        num_frames: images to take at most from a video, None = 100; of several videos time steps,
+            None = ``times.MOST_STEPS``, fewer for many cameras.
         masks: folder of masks of the photos, named as in captures; white = keep. None without.
-        starts: of several videos: camera to the second at which its video begins; None: as in ``videos.json``, else
-            found.
-        num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is always the same.
+        starts: of several videos: camera to the second at which its video begins; None: as in
+            ``videos.json``, else found.
+        num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is
+            always the same.
         follow_links: photos and videos may be links that lead out of their folder.
         max_megapixels: larger images and videos are refused.
     """
@@ -61,7 +66,8 @@ class SfmTask:
 
     Attributes:
         database: COLMAP's; made where it is missing.
-        images: folder of upright images, ``names`` in order; ``photos``: the same ones, with their tags.
+        images: folder of upright images, ``names`` in order; ``photos``: the same ones, with their
+            tags.
         is_video: they are frames of a video.
         masks: folder of masks ``NAME.png``, white = keep; None without.
     """
@@ -82,33 +88,47 @@ class SfmTask:
 
     @property
     def has_one_lens(self) -> bool:
-        """Whether all images share a lens: of a video, or of the same size, camera model and focal length (EXIF)."""
-        kinds = {(p.header.upright_size, p.header.tags.model, p.header.tags.focal_px) for p in self.photos}
+        """Whether all images share a lens: of a video, or of the same size, camera model and focal
+        length (EXIF)."""
+        kinds = {
+            (p.header.upright_size, p.header.tags.model, p.header.tags.focal_px)
+            for p in self.photos
+        }
         return self.is_video or len(kinds) == 1
 
 
 def feature_options(num_threads: int, side: int, count: int) -> pycolmap.FeatureExtractionOptions:
-    """Return COLMAP's options for up to ``count`` SIFT features in images of up to ``side`` px, on the CPU."""
+    """Return COLMAP's options for up to ``count`` SIFT features in images of up to ``side`` px, on
+    the CPU."""
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, num_threads or -1, side
+    extraction.use_gpu = False
+    extraction.num_threads = num_threads or -1
+    extraction.max_image_size = side
     extraction.sift.max_num_features = count
     return extraction
 
 
-def matching_options(num_threads: int) -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
+def matching_options(
+    num_threads: int,
+) -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
     """Return COLMAP's options for matching on the CPU, and for verification."""
     import pycolmap
 
-    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    matching.use_gpu, matching.num_threads = False, num_threads or -1
+    matching = pycolmap.FeatureMatchingOptions()
+    verification = pycolmap.TwoViewGeometryOptions()
+    matching.use_gpu = False
+    matching.num_threads = num_threads or -1
     verification.ransac.random_seed = SEED
     return matching, verification
 
 
-def match_listed(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], num_threads: int) -> None:
-    """Match pairs of images, given by their places among the names, and verify them; those of before are left."""
+def match_listed(
+    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], num_threads: int
+) -> None:
+    """Match pairs of images, given by their places among the names, and verify them; those of
+    before are left."""
     import pycolmap
 
     matching, verification = matching_options(num_threads)
@@ -135,18 +155,25 @@ class ColmapError(DyngsError):
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP's log out of the terminal, and make it start from a seed; its errors in the block are ours."""
+    """Keep COLMAP's log out of the terminal, and make it start from a seed; its errors in the block
+    are ours."""
     import pycolmap
 
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     try:
         yield
     except (RuntimeError, ValueError) as error:
         lines = str(error).strip().splitlines()
-        if "database factory" in str(error):  # all that COLMAP says where it cannot open or fill one
-            raise ColmapError("COLMAP can make no database there: free some space, or check the disk") from error
-        raise ColmapError(f"structure from motion failed: {lines[-1] if lines else error}") from error
+        if "database factory" in str(error):
+            # all that COLMAP says where it cannot open or fill one
+            raise ColmapError(
+                "COLMAP can make no database there: free some space, or check the disk"
+            ) from error
+        raise ColmapError(
+            f"structure from motion failed: {lines[-1] if lines else error}"
+        ) from error
     finally:
         pycolmap.logging.minloglevel = level
 
@@ -156,11 +183,13 @@ _KEY = "task.txt"
 
 @contextmanager
 def working(out: Path, task: str) -> Iterator[Path]:
-    """Yield the hidden work folder next to ``out``, which holds what a stopped run of the same task has done.
+    """Yield the hidden work folder next to ``out``, which holds what a stopped run of the same task
+    has done.
 
-    It is removed when the block ends, and when it raises an error of ours: what failed once fails again. It stays
-    where the user or the system stops the program. ``task``: images and options in words; a folder of another task is
-    emptied first. Raises DyngsError: another process works there; it cannot be made.
+    It is removed when the block ends, and when it raises an error of ours: what failed once fails
+    again. It stays where the user or the system stops the program. ``task``: images and options in
+    words; a folder of another task is emptied first. Raises DyngsError: another process works
+    there; it cannot be made.
     """
     work = out.parent / f".{out.name}.sfm"
     if work.is_symlink():

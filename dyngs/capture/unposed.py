@@ -1,4 +1,5 @@
-"""Photos and videos without poses, given as a capture: their poses are estimated first, and cached."""
+"""Photos and videos without poses, given as a capture: their poses are estimated first, and
+cached."""
 
 from __future__ import annotations
 
@@ -31,12 +32,13 @@ def with_poses(
     say: Callable[[str], None] = show,
     report: ReportProgress = report_nothing,
 ) -> DataConfig:
-    """Return the options with a capture that has poses as their folder: the same one, unless it has none.
+    """Return the options with a capture that has poses as their folder: the same one, unless it has
+    none.
 
-    Photos and videos without poses go through structure from motion once; the same ones are found in the user's cache
-    from then on. Of a folder that holds ``images``, those are the photos: masks and maps next to them are not. Raises
-    DyngsError: photos without times where they are needed, several videos where nothing is to move, or poses that
-    cannot be found.
+    Photos and videos without poses go through structure from motion once; the same ones are found
+    in the user's cache from then on. Of a folder that holds ``images``, those are the photos: masks
+    and maps next to them are not. Raises DyngsError: photos without times where they are needed,
+    several videos where nothing is to move, or poses that cannot be found.
 
     Args:
         data: its ``root`` is a capture of any format, a folder of photos, or a video.
@@ -56,15 +58,21 @@ def with_poses(
             f"{source}: photos have no times, so nothing can move; give data.times=order if their names are in the "
             "order of time, a video, or train configs/static.yaml"
         )
-    files = [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
+    files = (
+        [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
+    )
     beside = data.root / "masks"
     masks = beside if source != data.root and beside.is_dir() else None
     digest = digest_of(source, files) + ("" if masks is None else digest_of(masks))
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
 
     def estimate() -> None:
-        say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
-        options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
+        say(
+            f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
+        )
+        options = SfmOptions(
+            masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels
+        )
         if videos:
             say(poses_of_videos(source, folder, options, report))
         else:
@@ -76,7 +84,8 @@ def with_poses(
 
 
 def is_unposed(data: DataConfig) -> bool:
-    """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of captures knows.
+    """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of
+    captures knows.
 
     Raises DyngsError: a folder of a single video, which it names; one or two photos.
     """
@@ -105,10 +114,16 @@ def is_several_videos(source: Path) -> bool:
 
 
 def is_videos(source: Path) -> bool:
-    """Whether ``source`` is a video file, or a folder of videos that is no capture and holds no photos."""
+    """Whether ``source`` is a video file, or a folder of videos that is no capture and holds no
+    photos."""
     if source.is_file():
         return source.suffix.lower() in VIDEO_SUFFIXES
-    return source.is_dir() and not is_capture(source) and not _holds_photos(source) and bool(videos_in(source))
+    return (
+        source.is_dir()
+        and not is_capture(source)
+        and not _holds_photos(source)
+        and bool(videos_in(source))
+    )
 
 
 def _holds_photos(folder: Path) -> bool:

@@ -1,10 +1,12 @@
 """The ``dyngs`` command: one module of this package per subcommand.
 
-Every module offers ``add_parser(commands)``, which adds its command, and a ``run(arguments) -> int``. What is heavy
-(torch, the native core, readers) is imported inside ``run``, so that ``dyngs --help`` is instant.
+Every module offers ``add_parser(commands)``, which adds its command, and a ``run(arguments) ->
+int``. What is heavy (torch, the native core, readers) is imported inside ``run``, so that ``dyngs
+--help`` is instant.
 
-Exit codes: 0 done; 2 bad input or usage, after one line on stderr; 130 interrupted. Anything unexpected keeps its
-traceback, because it is a bug. With ``--debug`` the traceback of any error comes before its line.
+Exit codes: 0 done; 2 bad input or usage, after one line on stderr; 130 interrupted. Anything
+unexpected keeps its traceback, because it is a bug. With ``--debug`` the traceback of any error
+comes before its line.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ from dyngs.files.containment import following_links_of_runs
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
-_OUT_OF_MEMORY = "out of memory; use smaller images (data.longest_side) or a smaller cache (data.cache_mb)"
+_OUT_OF_MEMORY = (
+    "out of memory; use smaller images (data.longest_side) or a smaller cache (data.cache_mb)"
+)
 _TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
 _GPU_OUT_OF_MEMORY = "CUDA out of memory"
 _GPU_IS_FULL = "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
@@ -104,14 +108,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except (DyngsError, MemoryError, RuntimeError) as error:
         full = _GPU_IS_FULL if _GPU_OUT_OF_MEMORY in str(error) else _OUT_OF_MEMORY
-        if isinstance(error, RuntimeError) and full == _OUT_OF_MEMORY and _TORCH_OUT_OF_MEMORY not in str(error):
+        if (
+            isinstance(error, RuntimeError)
+            and full == _OUT_OF_MEMORY
+            and _TORCH_OUT_OF_MEMORY not in str(error)
+        ):
             raise
         if debug:
             traceback.print_exception(error)
         return _fail(str(error) if isinstance(error, DyngsError) else full)
     except KeyboardInterrupt as interrupt:
         with suppress(OSError):  # the terminal may be closed
-            print(f"\ndyngs: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
+            print(
+                f"\ndyngs: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr
+            )
         _abandon_if_broken(sys.stdout)
         _abandon_if_broken(sys.stderr)
         return EXIT_INTERRUPTED
@@ -123,14 +133,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _without_debug(arguments: list[str]) -> tuple[list[str], bool]:
-    """Return the arguments without ``--debug``, which may stand anywhere before ``--``, and whether it was given."""
+    """Return the arguments without ``--debug``, which may stand anywhere before ``--``, and whether
+    it was given."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
     kept = [word for word in arguments[:end] if word != "--debug"]
     return kept + arguments[end:], len(kept) < end
 
 
 def _show_any_name() -> None:
-    """Print file names that are not valid text with escapes on stdout, as stderr does; a closed one takes nothing."""
+    """Print file names that are not valid text with escapes on stdout, as stderr does; a closed one
+    takes nothing."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # as after >&-
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - for the life of the process
@@ -142,7 +154,9 @@ def _dispatch(arguments: list[str]) -> int:
     for word in arguments:
         require_name(word)
     if arguments and arguments[0] in _OF_DATA:
-        raise DyngsError(f"the command {arguments[0]!r} belongs to data: run `dyngs data {arguments[0]}`")
+        raise DyngsError(
+            f"the command {arguments[0]!r} belongs to data: run `dyngs data {arguments[0]}`"
+        )
     if not arguments:
         print(_NEXT)
         return 0
@@ -159,7 +173,9 @@ def _dispatch(arguments: list[str]) -> int:
             require_outputs_apart(parsed.parser, parsed)
             return parsed.run(parsed)
     except NoCaptureError as error:
-        if not (getattr(parsed, "takes_root", False) or getattr(parsed, "resume", None)) or _names_root(parsed):
+        if not (
+            getattr(parsed, "takes_root", False) or getattr(parsed, "resume", None)
+        ) or _names_root(parsed):
             raise
         again = " ".join(map(quoted, ["dyngs", *arguments, "data.root=FOLDER"]))
         raise DyngsError(f"{error}; if it was moved: `{again}`") from error
@@ -170,7 +186,8 @@ def _names_root(parsed: argparse.Namespace) -> bool:
 
 
 def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:
-    """Parse arguments; overrides may stand anywhere, also after options, where argparse allows none."""
+    """Parse arguments; overrides may stand anywhere, also after options, where argparse allows
+    none."""
     parsed, rest = parser.parse_known_args(arguments)
     overrides = getattr(parsed, "overrides", None)
     unknown = [word for word in rest if overrides is None or not _OVERRIDE.fullmatch(word)]
@@ -182,9 +199,12 @@ def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.N
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line; what it returns also holds the ``parser`` of the command itself."""
+    """A parser whose errors are one line; what it returns also holds the ``parser`` of the command
+    itself."""
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[argparse.Namespace, list[str]]:
+    def parse_known_args(
+        self, args: Any = None, namespace: Any = None
+    ) -> tuple[argparse.Namespace, list[str]]:
         parsed, rest = super().parse_known_args(args, namespace)
         if "parser" not in parsed:
             parsed.parser = self
@@ -195,8 +215,11 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser(only: str = "") -> argparse.ArgumentParser:
-    """Return the parser of all commands, or, in a fraction of the time, of the command ``only`` where there is one."""
-    parser = _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
+    """Return the parser of all commands, or, in a fraction of the time, of the command ``only``
+    where there is one."""
+    parser = _Parser(
+        prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU."
+    )
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
@@ -213,7 +236,8 @@ def _fail(message: str) -> int:
 
 
 def _abandon_if_broken(stream: TextIO) -> None:
-    """Redirect a broken stream to the null device, because the interpreter would fail to flush it at exit."""
+    """Redirect a broken stream to the null device, because the interpreter would fail to flush it
+    at exit."""
     try:
         stream.flush()
     except OSError:

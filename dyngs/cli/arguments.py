@@ -35,7 +35,9 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """Add a command that ``run`` carries out; return its parser."""
     formatter = argparse.HelpFormatter if epilog is None else argparse.RawDescriptionHelpFormatter
-    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=formatter)
+    parser = commands.add_parser(
+        name, help=help, description=description, epilog=epilog, formatter_class=formatter
+    )
     parser.set_defaults(run=run)
     return parser
 
@@ -59,7 +61,8 @@ def output_path(text: str) -> Path:
 
 
 def whole(what: str, low: int, high: int, more: str = "") -> Callable[[str], int]:
-    """Return the type of an argument that is a whole number; ``what`` is its name with an article, for messages."""
+    """Return the type of an argument that is a whole number; ``what`` is its name with an article,
+    for messages."""
 
     def parse(text: str) -> int:
         if not (text.isascii() and text.isdigit() and len(text) < 10 and low <= int(text) <= high):
@@ -78,7 +81,9 @@ def scene_time(text: str) -> float:
     except ValueError:
         time = math.nan
     if not math.isfinite(time):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time; write a number from 0 to 1, for instance 0.5")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a time; write a number from 0 to 1, for instance 0.5"
+        )
     return time
 
 
@@ -86,7 +91,9 @@ def image_size(text: str) -> tuple[int, int]:
     """Return width and height from ``WIDTHxHEIGHT``."""
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
     if not match or "0" in match.groups():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for instance 1280x720")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a size; write WIDTHxHEIGHT, for instance 1280x720"
+        )
     return int(match[1]), int(match[2])
 
 
@@ -95,7 +102,9 @@ def image_size(text: str) -> tuple[int, int]:
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
     kind = whole("a number of threads", 0, 1024, ", 0 for all cores")
-    parser.add_argument("--threads", type=kind, default=0, metavar="N", help="number of threads, 0 = all cores")
+    parser.add_argument(
+        "--threads", type=kind, default=0, metavar="N", help="number of threads, 0 = all cores"
+    )
 
 
 def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
@@ -105,7 +114,9 @@ def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
 
 def add_run_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--device`` to a command that trains: it sets ``run.device``."""
-    parser.add_argument("--device", choices=_DEVICES, help="what computes, as run.device=... (default auto)")
+    parser.add_argument(
+        "--device", choices=_DEVICES, help="what computes, as run.device=... (default auto)"
+    )
 
 
 def run_device(arguments: argparse.Namespace) -> list[str]:
@@ -118,11 +129,17 @@ def add_ray(parser: argparse.ArgumentParser) -> None:
         "train several runs at once by Ray (pip install 'dyngs[ray]'), with so many cores for each, on this machine or "
         "the cluster of RAY_ADDRESS, whose machines must share the files"
     )
-    parser.add_argument("--ray", type=whole("a number of cores", 1, 1024), metavar="CORES", help=about)
+    parser.add_argument(
+        "--ray", type=whole("a number of cores", 1, 1024), metavar="CORES", help=about
+    )
 
 
-def add_split(parser: argparse._ActionsContainer, about: str = "default test", default: str | None = "test") -> None:
-    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default=default, help=about)
+def add_split(
+    parser: argparse._ActionsContainer, about: str = "default test", default: str | None = "test"
+) -> None:
+    parser.add_argument(
+        "--split", choices=("test", "val", "train", "pose"), default=default, help=about
+    )
 
 
 def add_up(parser: argparse.ArgumentParser, of: str = "") -> None:
@@ -144,11 +161,14 @@ def add_keep_feet(parser: argparse.ArgumentParser) -> None:
 def require_motion_for_feet(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for ``--keep-feet`` without ``--motion``."""
     if arguments.keep_feet and arguments.motion is None:
-        raise DyngsError("--keep-feet goes with --motion FILE: it is about feet in a motion; add one, or leave it out")
+        raise DyngsError(
+            "--keep-feet goes with --motion FILE: it is about feet in a motion; add one, or leave it out"
+        )
 
 
 def in_motion(arguments: argparse.Namespace, opened: Opened) -> Opened:
-    """Return the person in ``--motion``, or all as it is without; print what was found of its feet."""
+    """Return the person in ``--motion``, or all as it is without; print what was found of its
+    feet."""
     if arguments.motion is None:
         return opened
     moved = opened.in_motion(arguments.motion, keep_feet=arguments.keep_feet)
@@ -168,7 +188,8 @@ def add_data_root(parser: argparse.ArgumentParser) -> None:
 
 
 def data_root(arguments: argparse.Namespace) -> Path | None:
-    """Return the folder of ``add_data_root``; None: the capture was not moved. Raises DyngsError: another word."""
+    """Return the folder of ``add_data_root``; None: the capture was not moved. Raises DyngsError:
+    another word."""
     found = None
     for word in arguments.overrides:
         key, equals, value = word.partition("=")
@@ -187,7 +208,12 @@ def follows_links(overrides: Sequence[str]) -> bool:
     """Return whether overrides say that files of captures may lie outside their folders."""
     from dyngs.config.yaml_reader import read_override
 
-    leaves = [leaf for word in overrides if word.startswith("data") and "=" in word for leaf in read_override(word)]
+    leaves = [
+        leaf
+        for word in overrides
+        if word.startswith("data") and "=" in word
+        for leaf in read_override(word)
+    ]
     return any(leaf.keys == ("data", "follow_links") and leaf.value is True for leaf in leaves)
 
 
@@ -205,25 +231,35 @@ def data_section(overrides: list[str], capture_format: str = "auto") -> DataConf
 
 
 def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Check that no output of a command would replace what it reads, as far as its arguments and overrides say.
+    """Check that no output of a command would replace what it reads, as far as its arguments and
+    overrides say.
 
     Raises DyngsError: see ``dyngs.files.outputs.Inputs.require_output``.
     """
     words = [word.partition("=") for word in getattr(arguments, "overrides", ())]
-    outputs = [*_values(parser, arguments, output_path), *(value for key, _, value in words if key == "run.dir")]
+    outputs = [
+        *_values(parser, arguments, output_path),
+        *(value for key, _, value in words if key == "run.dir"),
+    ]
     existing = [Path(out) for out in outputs if os.path.lexists(out)]
     if not existing:
         return
     from dyngs.runs.inputs import inputs_of
 
     named = (value if equals else key for key, equals, value in words if key != "run.dir")
-    read = [*_values(parser, arguments, input_path), *_values(parser, arguments, input_word), *named]
+    read = [
+        *_values(parser, arguments, input_path),
+        *_values(parser, arguments, input_word),
+        *named,
+    ]
     inputs = inputs_of(*(Path(one) for one in read if os.path.lexists(one)))
     for out in existing:
         inputs.require_output(out)
 
 
-def _values(parser: argparse.ArgumentParser, arguments: argparse.Namespace, kind: object) -> Iterator[str | Path]:
+def _values(
+    parser: argparse.ArgumentParser, arguments: argparse.Namespace, kind: object
+) -> Iterator[str | Path]:
     """Yield the values of the arguments of a type."""
     for action in parser._actions:
         value = getattr(arguments, action.dest, None)
@@ -232,13 +268,15 @@ def _values(parser: argparse.ArgumentParser, arguments: argparse.Namespace, kind
 
 
 def computing_device(choice: str) -> torch.device:
-    """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line on stderr says why.
+    """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line
+    on stderr says why.
 
     Raises DyngsError: ``cuda`` where no GPU can be used.
     """
     from dyngs.ops.device import device_for, why_on_cpu
 
-    device, reason = device_for(choice), why_on_cpu(choice)
+    device = device_for(choice)
+    reason = why_on_cpu(choice)
     if reason is not None:
         print(f"dyngs: {reason}", file=sys.stderr)
     return device
@@ -255,7 +293,8 @@ def is_avatar_file(path: Path) -> bool:
 
 
 def run_of_scene_file(path: Path) -> Path:
-    """Return the run folder of a ``scene.dyngs``, the ``meta.json`` of an unpacked .sog, and any other path as it is.
+    """Return the run folder of a ``scene.dyngs``, the ``meta.json`` of an unpacked .sog, and any
+    other path as it is.
 
     A run with checkpoints is drawn from those, which a note says.
 
@@ -271,7 +310,9 @@ def run_of_scene_file(path: Path) -> Path:
     from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 
     if path.name != SCENE_FILE:
-        raise DyngsError(f"{path}: must be called {SCENE_FILE}, with the config.yaml of its run beside it")
+        raise DyngsError(
+            f"{path}: must be called {SCENE_FILE}, with the config.yaml of its run beside it"
+        )
     if checkpoint_paths(path.parent):
         print_notes((f"{path.parent} has checkpoints: the newest one is drawn, not {SCENE_FILE}",))
     return path.parent

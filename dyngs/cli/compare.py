@@ -1,4 +1,5 @@
-"""``dyngs compare``: several models on one capture, or networks on people, with the same time, steps, size or views."""
+"""``dyngs compare``: several models on one capture, or networks on people, with the same time,
+steps, size or views."""
 
 from __future__ import annotations
 
@@ -35,21 +36,42 @@ def add_parser(commands: args.Commands) -> None:
         "page with synchronised crops (.html) and, with the extra plots, quality over seconds (.svg, .png).",
         _EPILOG,
     )
-    parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help="capture with cameras, in any format")
+    parser.add_argument(
+        "capture",
+        type=args.input_path,
+        metavar="CAPTURE",
+        help="capture with cameras, in any format",
+    )
     args.add_overrides(parser, "key=value", "overrides for all models")
     names = "presets and YAML files, or networks that predict people, separated by commas"
     parser.add_argument("--models", type=_names, required=True, metavar="A,B,...", help=names)
     limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--minutes", type=_positive, metavar="M", help="train each for so many minutes")
-    limit.add_argument("--steps", type=args.whole("a number of steps", 1, 10**8), metavar="N", help="or so many steps")
-    limit.add_argument("--max-mb", type=_positive, metavar="MB", help="or to a file of at most so many 1e6 bytes")
-    parser.add_argument("--out", type=args.output_path, metavar="DIR", help="output folder (default compare/CAPTURE)")
+    limit.add_argument(
+        "--minutes", type=_positive, metavar="M", help="train each for so many minutes"
+    )
+    limit.add_argument(
+        "--steps",
+        type=args.whole("a number of steps", 1, 10**8),
+        metavar="N",
+        help="or so many steps",
+    )
+    limit.add_argument(
+        "--max-mb", type=_positive, metavar="MB", help="or to a file of at most so many 1e6 bytes"
+    )
+    parser.add_argument(
+        "--out",
+        type=args.output_path,
+        metavar="DIR",
+        help="output folder (default compare/CAPTURE)",
+    )
     predict = "predict each person of a folder of captures from so many views, and compare with views between them"
     parser.add_argument("--predict", type=_counts, metavar="N,N,...", help=predict)
     spread = "with --predict: from views evenly around the person, not 30 degrees apart"
     parser.add_argument("--spread", action="store_true", help=spread)
     kind = args.whole("a number of views", 1, 20)
-    parser.add_argument("--views", type=kind, default=4, metavar="N", help="views on the page (default 4)")
+    parser.add_argument(
+        "--views", type=kind, default=4, metavar="N", help="views on the page (default 4)"
+    )
     args.add_split(parser)
     args.add_threads(parser)
     args.add_device(parser)
@@ -59,7 +81,9 @@ def add_parser(commands: args.Commands) -> None:
 def _names(text: str) -> list[str]:
     names = [name.strip() for name in text.split(",")]
     if not all(names):
-        raise argparse.ArgumentTypeError(f"{text!r} has an empty name; write for instance static,mip")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} has an empty name; write for instance static,mip"
+        )
     return names
 
 
@@ -73,12 +97,15 @@ def _positive(text: str) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is not possible; write a number above 0, for instance 2")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not possible; write a number above 0, for instance 2"
+        )
     return value
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train, compare, print the table and write the report; the folder is locked against other commands."""
+    """Train, compare, print the table and write the report; the folder is locked against other
+    commands."""
     if arguments.predict is not None:
         return _predict(arguments)
     if arguments.spread:
@@ -102,23 +129,30 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             results, left_out = compare(bench, plan, show, arguments.ray)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("finished models are kept; the same command continues") from None
+            raise KeyboardInterrupt(
+                "finished models are kept; the same command continues"
+            ) from None
         files = write_report(bench, results, left_out)
     print_tables(numbers_table(about(bench, results), *table_cells(table_rows(results))))
     for name, problem in left_out.items():
         show(f"left out: {name}: {problem}")
     if was_finished:
-        print(f"{arguments.out or bench.out}: holds just this comparison, finished: nothing was trained")
+        print(
+            f"{arguments.out or bench.out}: holds just this comparison, finished: nothing was trained"
+        )
     print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")
     if not can_plot():
         print(f"note: {MISSING}")
     if arguments.ray is not None and arguments.minutes is not None:
-        print(f"note: {counted(len(results), 'model')} by Ray: the same minutes are less on a slower or busier machine")
+        print(
+            f"note: {counted(len(results), 'model')} by Ray: the same minutes are less on a slower or busier machine"
+        )
     return 0
 
 
 def _predict(arguments: argparse.Namespace) -> int:
-    """Compare networks that predict people; with --minutes an avatar that is trained on the same images, too."""
+    """Compare networks that predict people; with --minutes an avatar that is trained on the same
+    images, too."""
     from dyngs.compare.people import STEM, PeopleBench, compare_people
     from dyngs.ops.native import kernel_threads
 
@@ -127,7 +161,9 @@ def _predict(arguments: argparse.Namespace) -> int:
             raise DyngsError(f"--{option.replace('_', '-')} does not go with --predict")
     other = [word for word in arguments.overrides if not word.startswith("data.")]
     if other:
-        raise DyngsError(f"{other[0]}: networks are compared as they were trained; only data.* can be given")
+        raise DyngsError(
+            f"{other[0]}: networks are compared as they were trained; only data.* can be given"
+        )
     bench = PeopleBench(
         people=arguments.capture,
         networks=[Path(name) for name in arguments.models],
@@ -137,7 +173,8 @@ def _predict(arguments: argparse.Namespace) -> int:
         data=[word.removeprefix("data.") for word in arguments.overrides],
     )
     out = arguments.out or Path("compare", Path(os.path.abspath(arguments.capture)).name)
-    with kernel_threads(arguments.threads or 1):  # its times are CPU seconds, of which waiting threads take some
+    with kernel_threads(arguments.threads or 1):
+        # its times are CPU seconds, of which waiting threads take some
         head, cells = compare_people(bench, out)
     print_tables(numbers_table("box of the person on white", head, cells))
     print(f"written: {out / STEM}.md, .csv and pictures of truth, prediction and error")
@@ -148,7 +185,9 @@ def _bench(arguments: argparse.Namespace) -> Bench:
     from dyngs.compare.plan import Bench, Limit
 
     if arguments.minutes is None and arguments.steps is None and arguments.max_mb is None:
-        raise DyngsError("say what all models get the same of: --minutes M, --steps N or --max-mb MB")
+        raise DyngsError(
+            "say what all models get the same of: --minutes M, --steps N or --max-mb MB"
+        )
     capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
     return Bench(
         capture=capture,

@@ -1,4 +1,5 @@
-"""``dyngs completion``: what the Tab key of a shell offers, by argcomplete: commands, presets, keys, values, runs."""
+"""``dyngs completion``: what the Tab key of a shell offers, by argcomplete: commands, presets,
+keys, values, runs."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def finder(parser: argparse.ArgumentParser) -> CompletionFinder:
-    """Return what tells a shell that asks, by environment variables, what it may offer, when called with ``parser``."""
+    """Return what tells a shell that asks, by environment variables, what it may offer, when called
+    with ``parser``."""
     from argcomplete.finders import CompletionFinder
 
     _prepare(parser)
@@ -66,27 +68,44 @@ def _values(action: argparse.Action, prefix: str, **_: object) -> Iterator[str]:
     if metavar == "TOPIC":
         yield from (path.stem for path in docs_folder().glob("*.md"))
         return
-    runs = [f"runs/{path.parent.name}" for path in Path("runs").glob("*/config.yaml")] if "RUN" in metavar else []
+    runs = (
+        [f"runs/{path.parent.name}" for path in Path("runs").glob("*/config.yaml")]
+        if "RUN" in metavar
+        else []
+    )
     yield from runs
     if "CONFIG" in metavar:
         yield from _presets()
     if action.type in (None, input_path, input_word, output_path):
-        found = (path for path in _paths(prefix) if path.endswith("/") or metavar not in ("RUN", "NET_RUN"))
+        found = (
+            path
+            for path in _paths(prefix)
+            if path.endswith("/") or metavar not in ("RUN", "NET_RUN")
+        )
         yield from (path for path in found if path.removesuffix("/") not in runs)
 
 
-def _overrides(action: argparse.Action, prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
+def _overrides(
+    action: argparse.Action, prefix: str, parsed_args: argparse.Namespace, **_: object
+) -> list[str]:
     """Return presets and keys, section by section, or the values of the key that is there."""
     from dyngs.cli.train import WITH_RESUME
     from dyngs.config.schema import config_keys
 
-    resumes, metavar = getattr(parsed_args, "resume", None) is not None, str(action.metavar)
+    resumes = getattr(parsed_args, "resume", None) is not None
+    metavar = str(action.metavar)
     key, equals, text = prefix.partition("=")
     known = [k for k in config_keys() if not resumes or k.name in WITH_RESUME]
     known = [k for k in known if "key" in metavar or k.name == "data.root"]
     if equals:
-        return [f"{key}={value}" for k in known if k.name == key for value in _allowed(k.allowed, text)]
-    presets = [*_presets(), *_paths(prefix, (".yaml", ".yml"))] if "CONFIG" in metavar and not resumes else []
+        return [
+            f"{key}={value}" for k in known if k.name == key for value in _allowed(k.allowed, text)
+        ]
+    presets = (
+        [*_presets(), *_paths(prefix, (".yaml", ".yml"))]
+        if "CONFIG" in metavar and not resumes
+        else []
+    )
     presets = [preset for preset in presets if preset.startswith(prefix)]
     names = [f"{k.name}=" for k in known if k.name.startswith(prefix)]
     sections = {f"{name.split('.')[0]}." for name in names}

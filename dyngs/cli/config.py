@@ -1,4 +1,5 @@
-"""``dyngs config``: every key of a preset or a run, with its value, its default and what it means."""
+"""``dyngs config``: every key of a preset or a run, with its value, its default and what it
+means."""
 
 from __future__ import annotations
 
@@ -12,8 +13,12 @@ def add_parser(commands: Commands) -> None:
         "Print the configuration of a preset, a YAML file or a run: every key with its value, its default and what it "
         "means. The output is a preset itself: save it, change it, train with it."
     )
-    parser = add_command(commands, "config", run, "print all configuration keys of a preset or a run", about)
-    parser.add_argument("source", type=input_path, metavar="CONFIG_OR_RUN", help="preset, YAML file or run folder")
+    parser = add_command(
+        commands, "config", run, "print all configuration keys of a preset or a run", about
+    )
+    parser.add_argument(
+        "source", type=input_path, metavar="CONFIG_OR_RUN", help="preset, YAML file or run folder"
+    )
     add_overrides(parser, "key=value", "overrides, as for `dyngs train`")
 
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from dyngs.cli.arguments import Commands, add_command, input_path, output_path, print_notes, print_written
+from dyngs.cli.arguments import (
+    Commands,
+    add_command,
+    input_path,
+    output_path,
+    print_notes,
+    print_written,
+)
 from dyngs.cli.splats import add_axes, print_redrawn
 from dyngs.errors import counted
 
@@ -21,9 +28,15 @@ def add_parser(commands: Commands) -> None:
         "Read a file of Gaussians, of dyngs or of any other program, and write it in another format; the suffixes name "
         "the formats."
     )
-    parser = add_command(commands, "convert", run, "write a file of Gaussians in another format", about, _EPILOG)
-    parser.add_argument("source", type=input_path, metavar="IN", help="file to read, such as a .ply or .spz")
-    parser.add_argument("target", type=output_path, metavar="OUT", help="file to write, such as a .glb or .sog")
+    parser = add_command(
+        commands, "convert", run, "write a file of Gaussians in another format", about, _EPILOG
+    )
+    parser.add_argument(
+        "source", type=input_path, metavar="IN", help="file to read, such as a .ply or .spz"
+    )
+    parser.add_argument(
+        "target", type=output_path, metavar="OUT", help="file to write, such as a .glb or .sog"
+    )
     add_axes(parser)
 
 
@@ -40,7 +53,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
     rotated = upright(splat, arguments.up, arguments.target)
-    said = f"up is {rotated.up} in the file" + (f", it was {splat.up}" if rotated.up != splat.up else ", as it was")
+    said = f"up is {rotated.up} in the file" + (
+        f", it was {splat.up}" if rotated.up != splat.up else ", as it was"
+    )
     print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
     written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree, own=own)
     print_redrawn(written.notes, [compare_splats(splat, written)])

@@ -1,4 +1,5 @@
-"""``dyngs data``: inspect a capture, estimate poses, fit a body, convert a motion, write a synthetic capture."""
+"""``dyngs data``: inspect a capture, estimate poses, fit a body, convert a motion, write a
+synthetic capture."""
 
 from __future__ import annotations
 
@@ -29,7 +30,10 @@ _OF_A_FIT = {
         "PATH",
         "a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
     ),
-    "body": ("FILE", "body file (SMPL, ...) that posed vertices belong to, if it is not the one that is fitted"),
+    "body": (
+        "FILE",
+        "body file (SMPL, ...) that posed vertices belong to, if it is not the one that is fitted",
+    ),
     "person": (
         "PATH",
         "a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found, by the "
@@ -38,14 +42,21 @@ _OF_A_FIT = {
 }
 """Options of ``dyngs data fit``, which are fields of ``FitInputs``."""
 _OF_A_TEMPLATE = {
-    "template": ("FILE", "fit this body file of SMPL, SMPL-H or SMPL-X instead of the free template"),
+    "template": (
+        "FILE",
+        "fit this body file of SMPL, SMPL-H or SMPL-X instead of the free template",
+    ),
     "uv": ("FILE", ".obj with the texture coordinates of --template, if it has none"),
 }
 
 
 def add_parser(commands: args.Commands) -> None:
-    about = "inspect a capture, estimate poses, fit a body, convert a motion, write a synthetic capture"
-    verbs = commands.add_parser("data", help=about).add_subparsers(title="commands", metavar="COMMAND", required=True)
+    about = (
+        "inspect a capture, estimate poses, fit a body, convert a motion, write a synthetic capture"
+    )
+    verbs = commands.add_parser("data", help=about).add_subparsers(
+        title="commands", metavar="COMMAND", required=True
+    )
     _add_inspect(verbs)
     _add_sfm(verbs)
     _add_fit(verbs)
@@ -66,20 +77,38 @@ def _add_inspect(verbs: args.Commands) -> None:
     path = "capture (folder or .zip), video, or folder of videos"
     parser.add_argument("path", type=args.input_path, metavar="PATH", help=path)
     args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
-    parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
-    parser.add_argument("--image", type=args.output_path, metavar="FILE", help="draw cameras and points to this image")
+    parser.add_argument(
+        "--format",
+        default="auto",
+        help="format of the capture (default: detected; docs/formats.md)",
+    )
+    parser.add_argument(
+        "--image",
+        type=args.output_path,
+        metavar="FILE",
+        help="draw cameras and points to this image",
+    )
     parser.add_argument("--deep", action="store_true", help="decode every image in full (slow)")
 
 
 def _add_sfm(verbs: args.Commands) -> None:
     about = "Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`."
-    parser = args.add_command(verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about)
+    parser = args.add_command(
+        verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about
+    )
     images = "folder or .zip of photos, a video file, or folder of videos that ran at once"
     parser.add_argument("images", type=args.input_path, metavar="IMAGES", help=images)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
-    parser.add_argument("--mapper", choices=("auto", "global", "incremental"), default="auto", help="COLMAP's mapping")
-    parser.add_argument("--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep")
+    parser.add_argument(
+        "--mapper",
+        choices=("auto", "global", "incremental"),
+        default="auto",
+        help="COLMAP's mapping",
+    )
+    parser.add_argument(
+        "--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep"
+    )
     frames = "frames to take of a video (default 100; of each of several: up to 300)"
     parser.add_argument("--frames", type=int, metavar="N", help=frames)
     start = "when a video of several begins; once for each"
@@ -118,7 +147,13 @@ def _add_people(verbs: args.Commands) -> None:
     about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    parser.add_argument("--person", type=int, default=1, metavar="N", help="which of several people (1: the largest)")
+    parser.add_argument(
+        "--person",
+        type=int,
+        default=1,
+        metavar="N",
+        help="which of several people (1: the largest)",
+    )
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
@@ -134,13 +169,27 @@ def _add_motion(verbs: args.Commands) -> None:
         "AMASS SMPL-X, y up.",
     )
     parser.add_argument(
-        "file", type=args.input_path, metavar="FILE", help="AMASS, SMPL-X .npz, .bvh, .glb, .gltf, .vrma"
+        "file",
+        type=args.input_path,
+        metavar="FILE",
+        help="AMASS, SMPL-X .npz, .bvh, .glb, .gltf, .vrma",
     )
     parser.add_argument("out", type=args.output_path, metavar="OUT.npz", help="a new file")
-    parser.add_argument("--fps", type=float, metavar="F", help="resample to this rate; that of an .npz without one")
-    parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")
-    parser.add_argument("--clip", metavar="NAME", help="name of the animation if a glTF file has several")
-    parser.add_argument("--body", type=args.input_path, metavar="BODY", help="body template (default: that of dyngs)")
+    parser.add_argument(
+        "--fps", type=float, metavar="F", help="resample to this rate; that of an .npz without one"
+    )
+    parser.add_argument(
+        "--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)"
+    )
+    parser.add_argument(
+        "--clip", metavar="NAME", help="name of the animation if a glTF file has several"
+    )
+    parser.add_argument(
+        "--body",
+        type=args.input_path,
+        metavar="BODY",
+        help="body template (default: that of dyngs)",
+    )
 
 
 def _add_synth(verbs: args.Commands) -> None:
@@ -156,7 +205,9 @@ def _add_synth(verbs: args.Commands) -> None:
         "parameters; with --style teleport one image per time, as in D-NeRF, without them. people: many people, a "
         "capture each, with depth maps and key points, for networks that predict people.",
     )
-    parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
+    parser.add_argument(
+        "scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES)
+    )
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     size = "width and height (default 128, for people 256)"
     parser.add_argument("--size", type=int, metavar="PX", help=size)
@@ -166,7 +217,9 @@ def _add_synth(verbs: args.Commands) -> None:
     parser.add_argument("--style", choices=("teleport", "moving", "fixed"), help=style)
     cameras = "training cameras for human and people, or fixed ones of any scene that moves (default 8; for people 24)"
     parser.add_argument("--cameras", type=int, metavar="N", help=cameras)
-    parser.add_argument("--people", type=int, metavar="N", help="for people: how many (default 100)")
+    parser.add_argument(
+        "--people", type=int, metavar="N", help="for people: how many (default 100)"
+    )
     seed = "random seed of cameras, for human of the clothes, for people of everything (default 0)"
     parser.add_argument("--seed", type=int, default=0, metavar="N", help=seed)
     varied = "for human: the seed is also that of body shape, light and clip"
@@ -184,7 +237,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     arguments.path = capture_folder(arguments.path)
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
-    options = args.data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
+    options = args.data_section(arguments.overrides, arguments.format).model_copy(
+        update={"root": arguments.path}
+    )
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
@@ -204,7 +259,9 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
     from dyngs.files.containment import images_up_to
 
     if arguments.image is not None:
-        raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
+        raise DyngsError(
+            f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first"
+        )
     with images_up_to(args.data_section(arguments.overrides).max_megapixels):
         show(video_report(arguments.path))
     return 0
@@ -218,7 +275,8 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     from dyngs.capture.unposed import is_several_videos
     from dyngs.data.read import capture_folder
 
-    limits, out = args.data_section(arguments.overrides), arguments.out
+    limits = args.data_section(arguments.overrides)
+    out = arguments.out
     images = capture_folder(arguments.images)
     several = is_several_videos(images)
     if several:
@@ -249,7 +307,9 @@ def _require_options_of_videos(arguments: argparse.Namespace) -> None:
     """Refuse options that several videos do not have."""
     usual = {"matching": "auto", "mapper": "auto", "masks": None}
     for option in (name for name, value in usual.items() if getattr(arguments, name) != value):
-        raise DyngsError(f"{arguments.images}: --{option} is for one video or photos; leave it out for several videos")
+        raise DyngsError(
+            f"{arguments.images}: --{option} is for one video or photos; leave it out for several videos"
+        )
     if arguments.frames is not None and arguments.frames < 2:
         raise DyngsError("--frames must be at least 2")
 
@@ -264,7 +324,9 @@ def _starts(words: list[str]) -> dict[str, float] | None:
         except ValueError:
             name = ""
         if not name:
-            raise DyngsError(f"--start {word!r}: give the name of a video without its suffix and seconds, as cam01=0.5")
+            raise DyngsError(
+                f"--start {word!r}: give the name of a video without its suffix and seconds, as cam01=0.5"
+            )
     return starts or None
 
 
@@ -276,7 +338,9 @@ def run_fit(arguments: argparse.Namespace) -> int:
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
     passed = {name: getattr(arguments, name) for name in _OF_A_FIT}
     if arguments.uv is not None and arguments.template is None:
-        raise DyngsError(f"--uv {arguments.uv} goes with --template; the free template has its own texture coordinates")
+        raise DyngsError(
+            f"--uv {arguments.uv} goes with --template; the free template has its own texture coordinates"
+        )
     with ProgressBar() as report:
         template = HumanModel(body=arguments.template, uv=arguments.uv)
         inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person), template=template)
@@ -295,7 +359,9 @@ def run_people(arguments: argparse.Namespace) -> int:
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
-        result = write_found_person(options, arguments.out, detector, report, number=arguments.person)
+        result = write_found_person(
+            options, arguments.out, detector, report, number=arguments.person
+        )
     show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
@@ -353,7 +419,10 @@ def run_synth(arguments: argparse.Namespace) -> int:
         return _synth_people(arguments)
     if arguments.people is not None:
         raise DyngsError("--people is for the scene people only; leave it out")
-    out, scene, size, seed = arguments.out, arguments.scene, arguments.size or 128, arguments.seed
+    out = arguments.out
+    scene = arguments.scene
+    size = arguments.size or 128
+    seed = arguments.seed
     by_poses = scene == "human" and arguments.style is None
     views = (12 if by_poses else 48) if arguments.views is None else arguments.views
     cameras = 8 if arguments.cameras is None else arguments.cameras
@@ -361,28 +430,51 @@ def run_synth(arguments: argparse.Namespace) -> int:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
     style = arguments.style or ("fixed" if arguments.cameras is not None else None)
     if arguments.cameras is not None and (cameras < 1 or scene in _STILL or style != "fixed"):
-        raise DyngsError("--cameras must be at least 1, and is for scenes that move, with fixed cameras")
-    if arguments.style is not None and (scene in _STILL or (scene == "human" and style != "teleport")):
+        raise DyngsError(
+            "--cameras must be at least 1, and is for scenes that move, with fixed cameras"
+        )
+    if arguments.style is not None and (
+        scene in _STILL or (scene == "human" and style != "teleport")
+    ):
         raise DyngsError("--style is for scenes that move; for human only teleport")
     if (arguments.varied and not by_poses) or (arguments.usual_clothes and scene != "human"):
-        raise DyngsError("--varied and --usual-clothes are for the scene human only, --varied without --style")
+        raise DyngsError(
+            "--varied and --usual-clothes are for the scene human only, --varied without --style"
+        )
     require_new_folder(out)
     if scene == "human":
-        from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture, write_walking_capture
+        from dyngs.human.synthetic.capture import (
+            HumanOptions,
+            varied,
+            write_human_capture,
+            write_walking_capture,
+        )
 
-        options = HumanOptions(size, views, num_cameras=cameras, seed=seed, usual_clothes=arguments.usual_clothes)
+        options = HumanOptions(
+            size, views, num_cameras=cameras, seed=seed, usual_clothes=arguments.usual_clothes
+        )
         if by_poses:
             write_human_capture(out, varied(options, seed) if arguments.varied else options)
         else:
             write_walking_capture(out, replace(options, num_test=min(12, views - 1)))
     elif scene == "still":
-        synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
+        synthetic.write_still_capture(
+            out, synthetic.StillOptions(size=size, num_train=views, seed=seed)
+        )
     elif scene == "polyhedra":
-        synthetic.write_polyhedra_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
+        synthetic.write_polyhedra_capture(
+            out, synthetic.StillOptions(size=size, num_train=views, seed=seed)
+        )
     else:
-        moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed, style=style)
+        moving = synthetic.DynamicOptions(
+            size=size, num_times=views, num_cameras=cameras, seed=seed, style=style
+        )
         synthetic.write_dynamic_capture(scene, out, moving)
-    preset = "human" if by_poses else {"still": "static", "polyhedra": "bg_triangle"}.get(scene, "dynamic")
+    preset = (
+        "human"
+        if by_poses
+        else {"still": "static", "polyhedra": "bg_triangle"}.get(scene, "dynamic")
+    )
     print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")
     return 0
 
@@ -392,12 +484,18 @@ def _synth_people(arguments: argparse.Namespace) -> int:
     from dyngs.human.synthetic.people import PeopleOptions, write_people
 
     if arguments.style is not None or arguments.varied or arguments.usual_clothes:
-        raise DyngsError("--style, --varied and --usual-clothes are not for people, who all differ; leave them out")
+        raise DyngsError(
+            "--style, --varied and --usual-clothes are not for people, who all differ; leave them out"
+        )
     given = {name: getattr(arguments, name) for name in ("people", "size", "cameras", "seed")}
     given["frames"] = arguments.views
-    options = replace(PeopleOptions(), **{name: value for name, value in given.items() if value is not None})
+    options = replace(
+        PeopleOptions(), **{name: value for name, value in given.items() if value is not None}
+    )
     with ProgressBar() as report:
         write_people(arguments.out, options, report)
     word = as_word(arguments.out)
-    print(f"written: {arguments.out}, {counted(options.people, 'capture')}\nnext:    dyngs train gps data.root={word}")
+    print(
+        f"written: {arguments.out}, {counted(options.people, 'capture')}\nnext:    dyngs train gps data.root={word}"
+    )
     return 0

@@ -11,11 +11,16 @@ from dyngs.errors import as_word
 
 def add_parser(commands: Commands) -> None:
     about = "Ray trace a small moving scene, train on it, evaluate, render images and a video, write a .ply."
-    parser = add_command(commands, "demo", run, "train, evaluate and render a built-in moving scene", about)
-    out, default = "output folder (default dyngs-demo)", Path("dyngs-demo")
+    parser = add_command(
+        commands, "demo", run, "train, evaluate and render a built-in moving scene", about
+    )
+    out = "output folder (default dyngs-demo)"
+    default = Path("dyngs-demo")
     parser.add_argument("--out", type=output_path, default=default, metavar="DIR", help=out)
     kind = whole("a number of steps", 1, 10**9)
-    parser.add_argument("--steps", type=kind, default=3000, metavar="N", help="training steps (default 3000)")
+    parser.add_argument(
+        "--steps", type=kind, default=3000, metavar="N", help="training steps (default 3000)"
+    )
     add_threads(parser)
 
 
@@ -32,6 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"orbit video           {result.video}")
     print(f"for other viewers     {result.ply}")
     print(f"run folder            {result.run_dir}")
-    print(f"to look around        dyngs view {as_word(result.run_dir)}    (pip install 'dyngs[view]')")
+    print(
+        f"to look around        dyngs view {as_word(result.run_dir)}    (pip install 'dyngs[view]')"
+    )
     print(f"one page to share     dyngs export {as_word(result.run_dir)} --out scene.html")
     return 0

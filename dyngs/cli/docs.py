@@ -19,8 +19,12 @@ _FRONT = "README"
 def add_parser(commands: Commands) -> None:
     about = "Show a page of the documentation (without a terminal: as Markdown), or the list of all pages."
     parser = add_command(commands, "docs", run, "the documentation", about)
-    parser.add_argument("topic", nargs="?", metavar="TOPIC", help="name of a page, for instance cli or photos")
-    parser.add_argument("--path", action="store_true", help="print only where the page, or the folder, lies")
+    parser.add_argument(
+        "topic", nargs="?", metavar="TOPIC", help="name of a page, for instance cli or photos"
+    )
+    parser.add_argument(
+        "--path", action="store_true", help="print only where the page, or the folder, lies"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -40,7 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
             console.print(Markdown(_with_commands(text, folder)))
     else:
         print(text, end="")
-    others = sorted({Path(match[2]).stem for match in _LINK.finditer(text) if match[2].endswith(".md")} - {path.stem})
+    others = sorted(
+        {Path(match[2]).stem for match in _LINK.finditer(text) if match[2].endswith(".md")}
+        - {path.stem}
+    )
     known = [name for name in others if (folder / f"{name}.md").is_file()]
     if known:
         print(f"pages that this one names: dyngs docs {' | '.join(known)}", file=sys.stderr)
@@ -48,7 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def docs_folder() -> Path:
-    """Return the folder of the pages: in an installation that of the package, in a checkout that of the repository.
+    """Return the folder of the pages: in an installation that of the package, in a checkout that of
+    the repository.
 
     Raises DyngsError: it is not there.
     """
@@ -60,21 +68,26 @@ def docs_folder() -> Path:
 
 
 def page(folder: Path, topic: str) -> Path:
-    """Return the page of a topic. Raises DyngsError: there is none; names those that are similar."""
+    """Return the page of a topic. Raises DyngsError: there is none; names those that are
+    similar."""
     pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
     name = topic.removesuffix(".md")
     if name in pages:
         return pages[name]
     close = get_close_matches(name.lower(), pages, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise DyngsError(f"no page {topic!r}{hint}; there are {', '.join(key for key in pages if key != _FRONT)}")
+    raise DyngsError(
+        f"no page {topic!r}{hint}; there are {', '.join(key for key in pages if key != _FRONT)}"
+    )
 
 
 def _with_commands(text: str, folder: Path) -> str:
-    """Return Markdown in which a link to another page is the command that shows it, as a terminal can open no page."""
+    """Return Markdown in which a link to another page is the command that shows it, as a terminal
+    can open no page."""
 
     def command(match: re.Match[str]) -> str:
-        words, target = match[1], Path(match[2])
+        words = match[1]
+        target = Path(match[2])
         if target.suffix != ".md" or not (folder / target.name).is_file():
             return match[0]
         shown = f"`dyngs docs {target.stem}`"

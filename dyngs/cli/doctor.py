@@ -14,8 +14,22 @@ from typing import Literal
 from dyngs.cli.arguments import Commands, add_command
 from dyngs.errors import DyngsError
 
-_SAME = ("torch", "numpy", "pydantic", "safetensors", "rich", "pycolmap", "trimesh", "kornia", "OpenImageIO", "scipy")
-_REQUIRED = {name: name for name in (*_SAME, "av", "argcomplete")} | {"pyyaml": "yaml", "scikit-image": "skimage"}
+_SAME = (
+    "torch",
+    "numpy",
+    "pydantic",
+    "safetensors",
+    "rich",
+    "pycolmap",
+    "trimesh",
+    "kornia",
+    "OpenImageIO",
+    "scipy",
+)
+_REQUIRED = {name: name for name in (*_SAME, "av", "argcomplete")} | {
+    "pyyaml": "yaml",
+    "scikit-image": "skimage",
+}
 """Packages, and the modules that they have."""
 _OPTIONAL = {
     "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install 'dyngs[metrics]'"),
@@ -35,7 +49,9 @@ class Check:
 
 
 def add_parser(commands: Commands) -> None:
-    add_command(commands, "doctor", run, "report versions, cores, instruction set and optional packages")
+    add_command(
+        commands, "doctor", run, "report versions, cores, instruction set and optional packages"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -47,11 +63,15 @@ def run(arguments: argparse.Namespace) -> int:
     table = Table(show_header=False, box=None, pad_edge=False)
     colours = {"ok": "green", "absent": "yellow", "broken": "red"}
     for finding in findings:
-        table.add_row(finding.name, f"[{colours[finding.verdict]}]{finding.verdict}", escape(finding.value))
+        table.add_row(
+            finding.name, f"[{colours[finding.verdict]}]{finding.verdict}", escape(finding.value)
+        )
     Console().print(table)
     broken = [finding.name for finding in findings if finding.verdict == "broken"]
     if broken:
-        raise DyngsError(f"this installation cannot work: {', '.join(broken)} (see the rows marked broken)")
+        raise DyngsError(
+            f"this installation cannot work: {', '.join(broken)} (see the rows marked broken)"
+        )
     return 0
 
 
@@ -60,12 +80,20 @@ def examine() -> Iterator[Check]:
     yield Check("python", f"{platform.python_version()} on {platform.platform()}")
     yield Check("cores", f"{_usable_cores()} usable of {os.cpu_count()}")
     for name, module in _REQUIRED.items():
-        yield Check(name, _version(name) or "") if util.find_spec(module) else Check(name, "missing", "broken")
+        yield (
+            Check(name, _version(name) or "")
+            if util.find_spec(module)
+            else Check(name, "missing", "broken")
+        )
     yield from _examine_core()
     yield from _examine_gpu()
     for name, (module, purpose) in _OPTIONAL.items():
         found = util.find_spec(module) is not None
-        yield Check(name, _version(name) or "") if found else Check(name, f"needed for {purpose}", "absent")
+        yield (
+            Check(name, _version(name) or "")
+            if found
+            else Check(name, f"needed for {purpose}", "absent")
+        )
 
 
 def _examine_core() -> Iterator[Check]:
@@ -74,14 +102,17 @@ def _examine_core() -> Iterator[Check]:
     except (ImportError, DyngsError) as error:
         yield Check("native core", str(error), "broken")
         return
-    isa, newest = active_isa(), core.best_isa()
+    isa = active_isa()
+    newest = core.best_isa()
     value = f"instruction set {isa} ({ISA_NAMES[isa]}), compiled: {', '.join(built_isas())}"
     if newest not in built_isas():
         value += f"; this processor also runs {newest} ({ISA_NAMES[newest]}): install again on it for more speed"
     yield Check("native core", value)
     runtimes = openmp_runtimes()
     if runtimes is not None:
-        yield Check("OpenMP runtimes", f"{len(runtimes)}: {', '.join(path.name for path in runtimes)}")
+        yield Check(
+            "OpenMP runtimes", f"{len(runtimes)}: {', '.join(path.name for path in runtimes)}"
+        )
 
 
 def _examine_gpu() -> Iterator[Check]:
@@ -93,15 +124,22 @@ def _examine_gpu() -> Iterator[Check]:
     reason = why_no_gpu()
     for name, value in findings().items():
         yield Check(name, value)
-    yield Check("device", "cuda") if reason is None else Check("device", f"cpu; for a GPU: {reason}", "absent")
+    yield (
+        Check("device", "cuda")
+        if reason is None
+        else Check("device", f"cpu; for a GPU: {reason}", "absent")
+    )
 
 
 def openmp_runtimes() -> list[Path] | None:
-    """Return the OpenMP runtimes loaded in this process (several compete for the cores); None where unknown."""
+    """Return the OpenMP runtimes loaded in this process (several compete for the cores); None where
+    unknown."""
     maps = Path("/proc/self/maps")
     if not maps.is_file():
         return None
-    paths = {Path(line.split(maxsplit=5)[5]) for line in maps.read_text().splitlines() if line.count("/")}
+    paths = {
+        Path(line.split(maxsplit=5)[5]) for line in maps.read_text().splitlines() if line.count("/")
+    }
     return sorted(path for path in paths if path.name.startswith(("libgomp", "libiomp", "libomp")))
 
 

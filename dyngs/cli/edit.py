@@ -1,4 +1,5 @@
-"""``dyngs edit``: another frame for a scene, a part of it, what spoils it taken away, several scenes in one."""
+"""``dyngs edit``: another frame for a scene, a part of it, what spoils it taken away, several
+scenes in one."""
 
 from __future__ import annotations
 
@@ -43,9 +44,13 @@ def add_parser(commands: args.Commands) -> None:
         _EPILOG,
     )
     parser._negative_number_matcher = _NEGATIVE  # else "-1,0,2" would be taken for an option
-    parser.add_argument("source", type=args.input_path, metavar="RUN|FILE", help="run folder, or file of Gaussians")
+    parser.add_argument(
+        "source", type=args.input_path, metavar="RUN|FILE", help="run folder, or file of Gaussians"
+    )
     about = "file to write, such as a .ply, .spz, .glb, or .4dgs of what moves; without a suffix the folder of a run"
-    parser.add_argument("--out", type=args.output_path, required=True, metavar="FILE|RUN2", help=about)
+    parser.add_argument(
+        "--out", type=args.output_path, required=True, metavar="FILE|RUN2", help=about
+    )
     frame = parser.add_argument_group("frame")
     about = "direction that is up: an axis such as -y, x,y,z, or auto, by the cameras of the run"
     frame.add_argument("--up", metavar="DIRECTION", help=about)
@@ -64,8 +69,15 @@ def add_parser(commands: args.Commands) -> None:
     about = "largest loss of PSNR of views held out by --clean, dB (default 0.1)"
     part.add_argument("--max-loss", metavar="DB", help=about)
     about = "files of Gaussians, or runs, to be added; all still"
-    part.add_argument("--merge", nargs="+", default=[], type=args.input_path, metavar="FILE", help=about)
-    part.add_argument("--time", type=args.scene_time, metavar="T", help="time of a moving scene, 0 to 1 (default 0)")
+    part.add_argument(
+        "--merge", nargs="+", default=[], type=args.input_path, metavar="FILE", help=about
+    )
+    part.add_argument(
+        "--time",
+        type=args.scene_time,
+        metavar="T",
+        help="time of a moving scene, 0 to 1 (default 0)",
+    )
     args.add_threads(parser)
     args.add_data_root(parser)
 
@@ -97,15 +109,20 @@ def _note(text: str) -> None:
 
 
 def _edits(arguments: argparse.Namespace) -> Edits:
-    """Return what the options ask for. Raises DyngsError: they do not go together, or are no points or numbers."""
+    """Return what the options ask for. Raises DyngsError: they do not go together, or are no points
+    or numbers."""
     from dyngs.edit.crop import region_of
     from dyngs.edit.frame import Frame, direction, geo_frame, number, point, scale_of
     from dyngs.edit.scene_file import Edits
 
-    alone = [f"--{name}" for name in ("up", "origin", "scale") if getattr(arguments, name) is not None]
+    alone = [
+        f"--{name}" for name in ("up", "origin", "scale") if getattr(arguments, name) is not None
+    ]
     whole = [f"--{name}" for name in ("geo", "undo") if getattr(arguments, name)]
     if len(whole) + bool(alone) > 1 and whole:
-        raise DyngsError(f"{whole[0]} gives the whole frame, so leave out {' and '.join([*whole[1:], *alone])}")
+        raise DyngsError(
+            f"{whole[0]} gives the whole frame, so leave out {' and '.join([*whole[1:], *alone])}"
+        )
     if arguments.outside and arguments.crop is None:
         raise DyngsError("--outside goes with --crop, which names what is left out")
     if arguments.max_loss is not None and not arguments.clean:

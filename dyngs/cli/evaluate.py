@@ -23,9 +23,16 @@ MOST_THINGS = 5
 def add_parser(commands: args.Commands) -> None:
     about = "Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split)."
     parser = args.add_command(commands, "eval", run, "evaluate a run on held-out views", about)
-    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`")
+    parser.add_argument(
+        "run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`"
+    )
     args.add_split(parser)
-    parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
+    parser.add_argument(
+        "--lpips-net",
+        choices=("alex", "vgg"),
+        default="alex",
+        help="backbone of LPIPS (default alex)",
+    )
     args.add_threads(parser)
     args.add_device(parser)
     args.add_data_root(parser)
@@ -46,7 +53,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.refine and arguments.split != "train":
         load_resolved(arguments.run_dir)  # what is no run is refused before anything is announced
-        print("refining poses on the tested images, beside the scores as given: this takes a while", file=sys.stderr)
+        print(
+            "refining poses on the tested images, beside the scores as given: this takes a while",
+            file=sys.stderr,
+        )
     report = evaluate_run(
         arguments.run_dir,
         arguments.split,
@@ -67,10 +77,14 @@ def report_table(report: EvalReport) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("metric", "value", title=f"{counted(report.num_views, 'view')} of the {report.split} split")
+    table = Table(
+        "metric", "value", title=f"{counted(report.num_views, 'view')} of the {report.split} split"
+    )
     table.add_row("PSNR", f"{report.psnr:.2f} dB")
     if report.psnr_white is not None and report.psnr_black is not None:
-        table.add_row("PSNR on white, on black", f"{report.psnr_white:.2f} dB, {report.psnr_black:.2f} dB")
+        table.add_row(
+            "PSNR on white, on black", f"{report.psnr_white:.2f} dB, {report.psnr_black:.2f} dB"
+        )
     if report.psnr_right is not None and report.psnr_right_fitted is not None:
         right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
         table.add_row("PSNR of right halves", right)
@@ -79,7 +93,10 @@ def report_table(report: EvalReport) -> Table:
     table.add_row("SSIM", f"{report.ssim:.4f}")
     for label, value in (*_rows_of_person(report), *_rows_of_regions(report)):
         table.add_row(label, escape(escaped(value)))
-    for label, name, value in (("FLIP", "flip", report.flip), (f"LPIPS ({report.lpips_net})", "lpips", report.lpips)):
+    for label, name, value in (
+        ("FLIP", "flip", report.flip),
+        (f"LPIPS ({report.lpips_net})", "lpips", report.lpips),
+    ):
         reason = escape(report.reasons.get(name, "not measured"))
         table.add_row(label, reason if value is None else f"{value:.4f}")
     for label, value in _rows_over_time(report):
@@ -101,9 +118,14 @@ def report_table(report: EvalReport) -> Table:
 
 
 def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the scores of a person: as given, from silhouettes, refined on the images."""
+    """Return labels and values of the scores of a person: as given, from silhouettes, refined on
+    the images."""
     rows: list[tuple[str, str]] = []
-    for scores, suffix in ((report, ""), (report.silhouette_poses, _OUTLINED), (report.own_poses, _REFINED)):
+    for scores, suffix in (
+        (report, ""),
+        (report.silhouette_poses, _OUTLINED),
+        (report.own_poses, _REFINED),
+    ):
         if scores is None:
             continue
         for label, psnr, ssim, lpips in (
@@ -117,19 +139,29 @@ def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the PSNR of parts of images; of a static capture only what is known."""
+    """Return labels and values of the PSNR of parts of images; of a static capture only what is
+    known."""
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
-    moving, static = report.psnr_moving, report.psnr_static
-    for label, name, value in (("on what moves", "psnr_moving", moving), ("on what does not", "psnr_static", static)):
+    moving = report.psnr_moving
+    static = report.psnr_static
+    for label, name, value in (
+        ("on what moves", "psnr_moving", moving),
+        ("on what does not", "psnr_static", static),
+    ):
         if value is not None:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
         elif report.psnr_per_time:
             rows.append((label, report.reasons.get(name, "not measured")))
     if len(report.psnr_things) > 1:
         things = sorted(report.psnr_things.items(), key=lambda item: item[1])[:MOST_THINGS]
-        rows.append(("on the worst things", ", ".join(f"{label}: {value:.2f} dB" for label, value in things)))
+        rows.append(
+            (
+                "on the worst things",
+                ", ".join(f"{label}: {value:.2f} dB" for label, value in things),
+            )
+        )
     return rows
 
 
@@ -138,13 +170,22 @@ def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
         return []
     values = [at.psnr for at in report.psnr_per_time]
     worst = min(report.psnr_per_time, key=lambda at: at.psnr)
-    low, mean, high = min(values), sum(values) / len(values), max(values)
+    low = min(values)
+    mean = sum(values) / len(values)
+    high = max(values)
     spread = f"min {low:.2f}, mean {mean:.2f}, max {high:.2f} dB; worst at time {worst.time:g}"
     rows = [(f"PSNR at {counted(len(values), 'time')}", spread)]
-    flickers = (("flicker", "flicker", report.flicker), ("flicker error", "flicker_error", report.flicker_error))
+    flickers = (
+        ("flicker", "flicker", report.flicker),
+        ("flicker error", "flicker_error", report.flicker_error),
+    )
     for label, name, value in flickers:
         reason = report.reasons.get(name, "not measured")
-        known = "0 (nothing moves)" if name == "flicker" and not report.num_moving else f"{value or 0:.3f} of 255"
+        known = (
+            "0 (nothing moves)"
+            if name == "flicker" and not report.num_moving
+            else f"{value or 0:.3f} of 255"
+        )
         rows.append((label, reason if value is None else known))
     if report.track_error_px is not None:
         close = f"{report.track_within_5px or 0:.0%} within 5 px"

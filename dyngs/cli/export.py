@@ -1,4 +1,5 @@
-"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, a person, cameras, or a .dyngs file."""
+"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, a person, cameras, or
+a .dyngs file."""
 
 from __future__ import annotations
 
@@ -18,10 +19,17 @@ if TYPE_CHECKING:
     from dyngs.export.splat_files import Part
     from dyngs.runs.opened import Opened
 
-_OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
+_OTHER_SUFFIXES = {
+    f".{MOVING}": MOVING,
+    ".npz": "tracks",
+    ".safetensors": "avatar",
+    ".dyngs": "dyngs",
+}
 _OTHER_SUFFIXES |= {".html": "html", ".json": "cameras"}
 
-_TIMES, _PARTS, _AXES = ("time", "times"), ("static", "dynamic"), ("up", "from_up", "sh_degree")
+_TIMES = ("time", "times")
+_PARTS = ("static", "dynamic")
+_AXES = ("up", "from_up", "sh_degree")
 _SHOWN = {"surface": "mesh"}  # Names of --format, where these are others
 _FOR_SPLATS = dict.fromkeys(_AXES, "it goes with files of Gaussians")
 _UNFIT: dict[str, dict[str, str]] = {
@@ -32,20 +40,30 @@ _UNFIT: dict[str, dict[str, str]] = {
         "up": "the page turns with the scene; --from-up names its axis",
         "sh_degree": "the page has the colours of the run",
     },
-    "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES, "compress"), "the file has the rest pose, y up"),
-    "surface": dict.fromkeys(("motion", *_PARTS, "sh_degree"), "the file has the surface at its time"),
+    "mesh": dict.fromkeys(
+        (*_TIMES, *_PARTS, *_AXES, "compress"), "the file has the rest pose, y up"
+    ),
+    "surface": dict.fromkeys(
+        ("motion", *_PARTS, "sh_degree"), "the file has the surface at its time"
+    ),
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
-    "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
+    "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses")
+    | _FOR_SPLATS,
     "network": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
     "tracks": _FOR_SPLATS | {"static": "Gaussians that never move have none"},
     "bodies": dict.fromkeys(
-        ("times", "motion", "joints", "folder", "sh_degree", "compress", *_PARTS), "the file has the whole clip"
+        ("times", "motion", "joints", "folder", "sh_degree", "compress", *_PARTS),
+        "the file has the whole clip",
     ),
 }
 """Options that do not go with a format, and why."""
 _ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of a person"))
 _ONLY |= {"folder": ("html sog", "html or sog"), "max_gaussians_drawn": ("html", "html --folder")}
-_ONLY |= {"max_change": ("dyngs", "dyngs"), "spz_version": ("spz", "spz"), "compress": ("glb", "glb")}
+_ONLY |= {
+    "max_change": ("dyngs", "dyngs"),
+    "spz_version": ("spz", "spz"),
+    "compress": ("glb", "glb"),
+}
 """Options, the formats that they go with, and how these are asked for."""
 
 _EPILOG = """\
@@ -81,15 +99,34 @@ def add_parser(commands: args.Commands) -> None:
         ".dyngs file, as a page that plays by itself, a person as an avatar or a mesh, or the cameras.",
         _EPILOG,
     )
-    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder, or an avatar (.safetensors)")
-    formats = (*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras", "network")
+    parser.add_argument(
+        "run_dir",
+        type=args.input_path,
+        metavar="RUN",
+        help="run folder, or an avatar (.safetensors)",
+    )
+    formats = (
+        *SPLAT_FORMATS,
+        MOVING,
+        "tracks",
+        "dyngs",
+        "avatar",
+        "mesh",
+        "html",
+        "cameras",
+        "network",
+    )
     about = "file format (default: what the suffix of --out names, else ply)"
     parser.add_argument("--format", choices=formats, help=about)
     about = "file, or folder of a sequence (default: splats... in RUN)"
     parser.add_argument("--out", type=args.output_path, metavar="PATH", help=about)
     when = parser.add_mutually_exclusive_group()
-    when.add_argument("--time", type=args.scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
-    when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
+    when.add_argument(
+        "--time", type=args.scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)"
+    )
+    when.add_argument(
+        "--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)"
+    )
     args.add_motion(parser)
     args.add_keep_feet(parser)
     about = (
@@ -105,7 +142,9 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--segments", type=int, metavar="N", help=about)
     about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
-    args.add_most_drawn(parser, "--folder: so many Gaussians of an image are drawn at most, as on phones")
+    args.add_most_drawn(
+        parser, "--folder: so many Gaussians of an image are drawn at most, as on phones"
+    )
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "what moves rigidly as animated nodes of a .glb; the rest stands as at --time"
@@ -127,7 +166,12 @@ def run(arguments: argparse.Namespace) -> int:
     kind = _kind(arguments)
     kind = "surface" if kind == "mesh" and _has_surface(arguments) else kind
     _require_fitting(arguments, kind)
-    writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
+    writers = {
+        "html": _export_page,
+        "cameras": _export_cameras,
+        "avatar": _export_avatar,
+        "dyngs": _export_dyngs,
+    }
     writers |= {"surface": _export_surface, "network": _export_network}
     if arguments.bodies:
         return _export_bodies(arguments)
@@ -135,7 +179,9 @@ def run(arguments: argparse.Namespace) -> int:
         return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
-        raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
+        raise DyngsError(
+            f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH"
+        )
     if kind in writers:
         return writers[kind](arguments)
     times = _times(arguments)
@@ -155,25 +201,35 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
     """Raise for the first option that does not go with a format, with the reason."""
-    shown = "bodies" if arguments.bodies else "joints" if arguments.joints else f"format {_SHOWN.get(kind, kind)}"
+    shown = (
+        "bodies"
+        if arguments.bodies
+        else "joints"
+        if arguments.joints
+        else f"format {_SHOWN.get(kind, kind)}"
+    )
     unfit = "bodies" if arguments.bodies else "mesh" if arguments.joints else kind
     for name, reason in _UNFIT.get(unfit, {}).items():
         passed = getattr(arguments, name)
         if passed is not None and passed is not False:  # a time may be 0
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with --{shown}{reason and f': {reason}'}")
+            raise DyngsError(
+                f"--{name.replace('_', '-')} does not go with --{shown}{reason and f': {reason}'}"
+            )
     for name, (only, asked) in _ONLY.items():
         if kind not in only.split() and getattr(arguments, name) not in (None, False):
             raise DyngsError(f"--{name.replace('_', '-')} goes with --format {asked}")
 
 
 def _kind(arguments: argparse.Namespace) -> str:
-    """Return the name of the format: what --format says, else what the suffix of --out names, else ply.
+    """Return the name of the format: what --format says, else what the suffix of --out names, else
+    ply.
 
     Raises DyngsError: an unknown suffix, or one of another format than --format.
     """
     from dyngs.splats.formats import all_suffixes, known_format
 
-    out, stated = arguments.out, arguments.format
+    out = arguments.out
+    stated = arguments.format
     if out is None or out.is_dir():
         return stated or "ply"
     found = known_format(out)
@@ -186,11 +242,17 @@ def _kind(arguments: argparse.Namespace) -> str:
         if _is_sequence(arguments) and not out.suffix:
             return "ply"
         known = f"{all_suffixes()}, {', '.join(_OTHER_SUFFIXES)}"
-        raise DyngsError(f"{out}: which format? Give --format, or a name that ends in one of {known}")
+        raise DyngsError(
+            f"{out}: which format? Give --format, or a name that ends in one of {known}"
+        )
     if stated is not None and named is not None and stated != named:
-        raise DyngsError(f"{out}: --format {stated} does not write files of that suffix, which is that of {named}")
+        raise DyngsError(
+            f"{out}: --format {stated} does not write files of that suffix, which is that of {named}"
+        )
     if stated is not None and named is None and out.suffix and stated in SPLAT_FORMATS:
-        raise DyngsError(f"{out}: viewers do not know this suffix as {stated}; use one of {all_suffixes()}")
+        raise DyngsError(
+            f"{out}: viewers do not know this suffix as {stated}; use one of {all_suffixes()}"
+        )
     return stated or named or "ply"
 
 
@@ -212,7 +274,9 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
 
     if arguments.times is None and arguments.time is None:
         return None
-    inside, warnings = clamped_times((arguments.time,) if arguments.times is None else parse_times(arguments.times))
+    inside, warnings = clamped_times(
+        (arguments.time,) if arguments.times is None else parse_times(arguments.times)
+    )
     args.print_notes((), warnings)
     return inside
 
@@ -224,15 +288,28 @@ def _part(arguments: argparse.Namespace) -> Part:
 def _export_splats(
     arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None, kind: str
 ) -> list[Path]:
-    """Write a sequence if several times of a moving scene are requested, else one file; return the paths."""
+    """Write a sequence if several times of a moving scene are requested, else one file; return the
+    paths."""
     from dyngs.export.redrawn import compare_run
-    from dyngs.export.splat_files import scene_part, write_run_levels, write_run_sequence, write_run_splats, writing_of
+    from dyngs.export.splat_files import (
+        scene_part,
+        write_run_levels,
+        write_run_sequence,
+        write_run_splats,
+        writing_of,
+    )
     from dyngs.splats.formats import chosen_variant, format_named, known_format, read_splats
 
-    own, part = format_named(kind), _part(arguments)
-    suffix, scene = own.suffixes[0], scene_part(opened.scene, part)
+    own = format_named(kind)
+    part = _part(arguments)
+    suffix = own.suffixes[0]
+    scene = scene_part(opened.scene, part)
     if opened.scene.colour is not None:
-        args.print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
+        args.print_notes(
+            (
+                "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",
+            )
+        )
     how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     how = replace(how, own=chosen_variant(own, arguments.spz_version, arguments.compress))
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
@@ -240,11 +317,15 @@ def _export_splats(
     is_sequence = _is_sequence(arguments)
     is_file = out is not None and known_format(out) is not None
     if is_sequence and is_file and not arguments.static:
-        raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
+        raise DyngsError(
+            f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file"
+        )
     args.print_notes((line,))
     if arguments.folder:
         if is_file or is_sequence:
-            raise DyngsError(f"{out}: --folder writes a folder of one time; give --out FOLDER, and --time T")
+            raise DyngsError(
+                f"{out}: --folder writes a folder of one time; give --out FOLDER, and --time T"
+            )
         path = out or arguments.run_dir / "sog"
         counts, notes = write_run_levels(opened, path, (times or (0.0,))[0], part, how)
         levels = f"levels of {', '.join(f'{count:,}' for count in counts)} Gaussians"
@@ -252,12 +333,18 @@ def _export_splats(
         return [path]
     if is_sequence and not arguments.static:
         moments = times or ()
-        written = write_run_sequence(opened, out or arguments.run_dir / stem, moments, part, how, suffix)
+        written = write_run_sequence(
+            opened, out or arguments.run_dir / stem, moments, part, how, suffix
+        )
     else:
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
-            args.print_notes(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
+            args.print_notes(
+                (
+                    "this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",
+                )
+            )
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
         written = [write_run_splats(opened, path, moments[0], part, how)]
@@ -274,20 +361,36 @@ def _shown(count: int) -> list[int]:
     return sorted({0, count // 2, count - 1})
 
 
-def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]) -> list[Path]:
+def _export_moving(
+    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]
+) -> list[Path]:
     """Write all times as one file of moving Gaussians."""
     from dyngs.export.redrawn import compare_run
-    from dyngs.export.splat_files import SUFFIX, UP, read_moment, scene_part, write_moving, writing_of
+    from dyngs.export.splat_files import (
+        SUFFIX,
+        UP,
+        read_moment,
+        scene_part,
+        write_moving,
+        writing_of,
+    )
 
     if arguments.sh_degree is not None:
-        raise DyngsError(f"--sh-degree does not go with --format {MOVING}, which holds no harmonics")
+        raise DyngsError(
+            f"--sh-degree does not go with --format {MOVING}, which holds no harmonics"
+        )
     how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
     args.print_notes((line,))
-    part, scene = _part(arguments), scene_part(opened.scene, _part(arguments))
+    part = _part(arguments)
+    scene = scene_part(opened.scene, _part(arguments))
     out = arguments.out or arguments.run_dir
     if not out.is_dir() and out.suffix.lower() != SUFFIX:
-        raise DyngsError(f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}")
-    written = write_moving(opened, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how)
+        raise DyngsError(
+            f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}"
+        )
+    written = write_moving(
+        opened, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how
+    )
     found = [
         compare_run(opened, scene, times[i], written.splats[i], read_moment(written.path, i))
         for i in _shown(len(times))
@@ -296,7 +399,9 @@ def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[f
     return [written.path]
 
 
-def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None) -> list[Path]:
+def _export_tracks(
+    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None
+) -> list[Path]:
     from dyngs.export.splat_files import tracks_of, write_tracks
 
     part = "moving" if arguments.dynamic else "all"
@@ -314,13 +419,17 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
 
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
-        raise DyngsError(f"--max-change {max_change:g}: give {SMALLEST_CHANGE:g} to 64 grey levels of 255")
+        raise DyngsError(
+            f"--max-change {max_change:g}: give {SMALLEST_CHANGE:g} to 64 grey levels of 255"
+        )
     out: Path = arguments.out or arguments.run_dir
     if out.suffix == ".dyngs":
         raise DyngsError(
             f"{out}: --format dyngs writes a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
         )
-    written = write_scene_file(arguments.run_dir, out, max_change, data_root=args.data_root(arguments))
+    written = write_scene_file(
+        arguments.run_dir, out, max_change, data_root=args.data_root(arguments)
+    )
     change = written.precision.change
     if change is None:
         warning = (
@@ -329,9 +438,13 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
         )
         args.print_notes((), (warning,))
     else:
-        args.print_notes((f"images change by {change:.2f} grey levels of 255 (rms over some training views)",))
+        args.print_notes(
+            (f"images change by {change:.2f} grey levels of 255 (rms over some training views)",)
+        )
     ratio = written.num_bytes_exact / written.num_bytes
-    print(f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)")
+    print(
+        f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)"
+    )
     return 0
 
 
@@ -398,9 +511,17 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         name = out / f"{stem}{suffix}" if out.is_dir() else f"{out.stem}{suffix}"
         raise DyngsError(f"{out}: {option} writes one file; give --out {name}")
     if suffix == ".ply" and arguments.motion is not None:
-        raise DyngsError("--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb")
-    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments))).in_own_frame()
-    played = Played(arguments.motion.stem, opened.fps or FRAME_RATE) if arguments.motion is not None else None
+        raise DyngsError(
+            "--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb"
+        )
+    opened = _moved(
+        arguments, open_scene(source, data_root=args.data_root(arguments))
+    ).in_own_frame()
+    played = (
+        Played(arguments.motion.stem, opened.fps or FRAME_RATE)
+        if arguments.motion is not None
+        else None
+    )
     written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
     args.print_notes(written.notes)
     args.print_written(written.path)
@@ -408,12 +529,15 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
 
 
 def _has_surface(arguments: argparse.Namespace) -> bool:
-    """Return whether the run is of something whose surface is looked for: all but people, who have a body."""
+    """Return whether the run is of something whose surface is looked for: all but people, who have
+    a body."""
     from dyngs.config.io import load_resolved
 
     source: Path = arguments.run_dir
     if source.is_file() and not args.is_avatar_file(source):
-        raise DyngsError(f"{source}: a file has no training views, whose depths make a surface; give the run")
+        raise DyngsError(
+            f"{source}: a file has no training views, whose depths make a surface; give the run"
+        )
     return source.is_dir() and not load_resolved(source).model.is_posed
 
 
@@ -425,10 +549,14 @@ def _export_surface(arguments: argparse.Namespace) -> int:
 
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
     if arguments.times and out.suffix:
-        raise DyngsError(f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one")
+        raise DyngsError(
+            f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one"
+        )
     opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
     cut = Cut(arguments.level, arguments.cells, arguments.segments)
-    how, line = upright_surface(opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up)
+    how, line = upright_surface(
+        opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
+    )
     args.print_notes((line,))
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
@@ -442,12 +570,15 @@ def _export_surface(arguments: argparse.Namespace) -> int:
 
 
 def _export_page(arguments: argparse.Namespace) -> int:
-    """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it is seen."""
+    """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it
+    is seen."""
     from dyngs.export.html.page import write_folder, write_page
     from dyngs.runs.opened import open_scene
 
     source: Path = arguments.run_dir
-    most, folder, time = arguments.max_gaussians_drawn, arguments.folder, arguments.time or 0.0
+    most = arguments.max_gaussians_drawn
+    folder = arguments.folder
+    time = arguments.time or 0.0
     if most is not None and not folder:
         raise DyngsError("--max-gaussians-drawn goes with --folder")
     if arguments.out is None and not source.is_dir():
@@ -455,11 +586,19 @@ def _export_page(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out or source / ("scene" if folder else "scene.html")
     is_page = out.suffix.lower() in (".html", ".htm")
     if folder == is_page or (not folder and out.is_dir()):
-        what, suffix = ("--folder writes a folder", "") if folder else ("--format html writes one file", ".html")
+        what, suffix = (
+            ("--folder writes a folder", "")
+            if folder
+            else ("--format html writes one file", ".html")
+        )
         raise DyngsError(f"{out}: {what}; give --out {out.with_suffix(suffix)}")
     opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
-    written = write_folder(opened, out, most=most, time=time) if folder else write_page(opened, out, time=time)
+    written = (
+        write_folder(opened, out, most=most, time=time)
+        if folder
+        else write_page(opened, out, time=time)
+    )
     served = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
     args.print_notes(written.notes)
     where = served if folder else "it plays in any browser with WebGL 2, offline"
@@ -482,19 +621,34 @@ def _export_cameras(arguments: argparse.Namespace) -> int:
     run = open_run(source, data_root=args.data_root(arguments))
     capture = run.capture
     if path.resolve().parent == capture.root.resolve():
-        raise DyngsError(f"{path}: would stand in for the cameras of the capture; give another folder")
+        raise DyngsError(
+            f"{path}: would stand in for the cameras of the capture; give another folder"
+        )
     found = found_corrections(source, run, capture.splits["train"])
     if found is None and run.config.camera.refine == "always":
-        raise DyngsError(f"{source}: refined cameras lie in checkpoints, and there is none; restore one or train again")
-    splits: dict[Split, Sequence[View]] = {name: views for name, views in capture.splits.items() if name != "pose"}
+        raise DyngsError(
+            f"{source}: refined cameras lie in checkpoints, and there is none; restore one or train again"
+        )
+    splits: dict[Split, Sequence[View]] = {
+        name: views for name, views in capture.splits.items() if name != "pose"
+    }
     if found is None:
-        args.print_notes(("camera.refine was not used in this run: these are the cameras of the capture",))
-    else:
-        splits = {name: [found.corrected_view(view) for view in views] for name, views in splits.items()}
         args.print_notes(
-            ("training cameras as training found them; others have the capture's poses, and known lenses",)
+            ("camera.refine was not used in this run: these are the cameras of the capture",)
+        )
+    else:
+        splits = {
+            name: [found.corrected_view(view) for view in views] for name, views in splits.items()
+        }
+        args.print_notes(
+            (
+                "training cameras as training found them; others have the capture's poses, and known lenses",
+            )
         )
     written = write_cameras(path, capture, splits, run.world)
-    count, root = counted(len(all_views(capture.splits)), "camera"), as_word(path.parent)
-    print(f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them")
+    count = counted(len(all_views(capture.splits)), "camera")
+    root = as_word(path.parent)
+    print(
+        f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"
+    )
     return 0

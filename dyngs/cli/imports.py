@@ -12,9 +12,10 @@ from contextlib import contextmanager
 def heavy_imports() -> Iterator[None]:
     """Import torch and what needs it in the block, with the garbage collector at rest.
 
-    Nearly all of the 200,000 objects that this makes live until the exit. Looking through them takes a quarter of the
-    time of import and exit, so that they are left out of later collections, too. Where torch is imported already, the
-    collector stays as it is: what is there need not be for good.
+    Nearly all of the 200,000 objects that this makes live until the exit. Looking through them
+    takes a quarter of the time of import and exit, so that they are left out of later collections,
+    too. Where torch is imported already, the collector stays as it is: what is there need not be
+    for good.
     """
     if "torch" in sys.modules or not gc.isenabled():
         yield

@@ -38,10 +38,14 @@ def add_parser(commands: Commands) -> None:
     about = "run folder of a network, a file of its weights, or gps or human_predictor where these are installed"
     parser.add_argument("network", type=input_path, metavar="NET", help=about)
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
-    parser.add_argument("--out", type=output_path, required=True, metavar="RUN", help="new run folder")
+    parser.add_argument(
+        "--out", type=output_path, required=True, metavar="RUN", help="new run folder"
+    )
     views = "number or names of the views to predict from (default: model.source_views of the network; gps: 2)"
     parser.add_argument("--views", type=parse_views, metavar="N|NAME,..", help=views)
-    steps = "human_predictor: first train the network on these images for so many steps (default 10)"
+    steps = (
+        "human_predictor: first train the network on these images for so many steps (default 10)"
+    )
     parser.add_argument("--steps", type=int, metavar="N", help=steps)
 
 
@@ -58,13 +62,21 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = arguments.out
     with ProgressBar() as report:
-        made = predict(arguments.network, arguments.capture, out, arguments.views, steps=arguments.steps, report=report)
-    trained = f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
+        made = predict(
+            arguments.network,
+            arguments.capture,
+            out,
+            arguments.views,
+            steps=arguments.steps,
+            report=report,
+        )
+    trained = (
+        f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
+    )
     what = counted(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
     word = as_word(out)
-    refine = (
-        f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""
-    )  # fields are not trained
+    # fields are not trained
+    refine = f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""
     show(
         f"predicted: {what} from {', '.join(made.views)}\n"
         f"time:      {made.seconds:.2f} s{trained}\n"

@@ -14,7 +14,8 @@ SECONDS_BETWEEN_LINES = 10.0
 class ProgressBar:
     """Context manager that shows how far work has come, to be called as a ``ReportProgress``.
 
-    On a terminal, one bar for each kind of work; elsewhere plain lines, none for work that is soon done.
+    On a terminal, one bar for each kind of work; elsewhere plain lines, none for work that is soon
+    done.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
@@ -39,7 +40,9 @@ class ProgressBar:
             self._what, self._since = what, now
         if now - self._last_line >= SECONDS_BETWEEN_LINES and 0 < done < total:
             left = (now - self._since) / done * (total - done)
-            print(f"{what}: {done} of {total}, about {left:.0f} s left", file=self._stream, flush=True)
+            print(
+                f"{what}: {done} of {total}, about {left:.0f} s left", file=self._stream, flush=True
+            )
             self._last_line = now
 
     def __enter__(self) -> ProgressBar:
@@ -54,7 +57,18 @@ class ProgressBar:
 def _rich_bars(stream: IO[str]) -> Any:
     """Return rich progress bars, not yet shown."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     return Progress(*columns, console=Console(file=stream), refresh_per_second=4)

@@ -39,17 +39,25 @@ def add_parser(commands: args.Commands) -> None:
         "folder with its file and prints quality, speed and size before and after.",
         _EPILOG,
     )
-    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`")
-    parser.add_argument("--out", type=args.output_path, required=True, metavar="RUN2", help="folder of the new run")
+    parser.add_argument(
+        "run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`"
+    )
+    parser.add_argument(
+        "--out", type=args.output_path, required=True, metavar="RUN2", help="folder of the new run"
+    )
     about = f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})"
     parser.add_argument("--max-loss", type=_decibels, metavar="DB", help=about)
     about = "no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else"
     parser.add_argument("--prune", metavar="R", help=about)
     scores = ("variation", "sensitivity", "contribution")
-    parser.add_argument("--score", choices=scores, help="importance score of a Gaussian (default sensitivity)")
+    parser.add_argument(
+        "--score", choices=scores, help="importance score of a Gaussian (default sensitivity)"
+    )
     about = "no search: number of key times of visibility masks (default: no masks)"
     parser.add_argument("--masks", metavar="K", help=about)
-    parser.add_argument("--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000")
+    parser.add_argument(
+        "--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000"
+    )
     args.add_threads(parser)
     args.add_run_device(parser)
     args.add_overrides(parser, "key=value", "other config keys of the run (docs/cli.md)")
@@ -68,16 +76,25 @@ def run(arguments: argparse.Namespace) -> int:
     keys = {"prune": "fraction", "score": "score", "masks": "mask_times", "steps": "steps"}
     asked = {key: getattr(arguments, option) for option, key in keys.items()}
     overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
-    overrides += [f"run.threads={arguments.threads}", *args.run_device(arguments), *arguments.overrides]
+    overrides += [
+        f"run.threads={arguments.threads}",
+        *args.run_device(arguments),
+        *arguments.overrides,
+    ]
     folder, promise = _pruned(arguments, overrides)
     pruned = load_run(folder)
     device = args.computing_device(pruned.config.run.device)
     before, after = compared(
-        [arguments.run_dir, file_of(folder)], arguments.threads or num_cores(), device, pruned.config.data.root
+        [arguments.run_dir, file_of(folder)],
+        arguments.threads or num_cores(),
+        device,
+        pruned.config.data.root,
     )
     Console().print(cost_table(before, after, promise))
     if pruned.config.prune.mask_times > 1 and pruned.scene.masks is None:
-        print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
+        print(
+            "note: --masks was ignored; they are for scenes in which a deformation field moves something"
+        )
     print(
         f"written: {folder}, and the file in {file_of(folder)}\n"
         f"next:    dyngs eval {as_word(folder)}\n         dyngs render {as_word(file_of(folder))} "
@@ -87,12 +104,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, Promise | None]:
-    """Prune as requested; return the new folder, and what is promised of it where the fraction was searched for."""
+    """Prune as requested; return the new folder, and what is promised of it where the fraction was
+    searched for."""
     from dyngs.api.prune import prune_run, prune_within
 
     chosen = any(text.startswith(("prune.fraction=", "prune.mask_times=")) for text in overrides)
     if chosen and arguments.max_loss is not None:
-        raise DyngsError("--max-loss finds what can go; leave out --prune and --masks, which say it")
+        raise DyngsError(
+            "--max-loss finds what can go; leave out --prune and --masks, which say it"
+        )
     if chosen:
         return prune_run(arguments.run_dir, arguments.out, overrides), None
     most = MAX_LOSS if arguments.max_loss is None else arguments.max_loss
@@ -115,7 +135,9 @@ def cost_table(before: Cost, after: Cost, promise: Promise | None = None) -> Tab
     # Short cells, so that no label wraps at 80 columns.
     table = Table("", "before", "pruned file", "")
     ratio = before.num_gaussians / after.num_gaussians
-    table.add_row("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", f"{ratio:.1f}x fewer")
+    table.add_row(
+        "Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", f"{ratio:.1f}x fewer"
+    )
     rows = [
         ("PSNR, training views", before.psnr_train, after.psnr_train),
         ("PSNR, held-out views", before.psnr_test, after.psnr_test),
@@ -125,10 +147,23 @@ def cost_table(before: Cost, after: Cost, promise: Promise | None = None) -> Tab
     for label, old, new in rows:
         if old is not None and new is not None:
             table.add_row(label, f"{old:.2f} dB", f"{new:.2f} dB", f"{new - old:+.2f} dB")
-    faster, smaller = after.fps / before.fps, before.megabytes / after.megabytes
-    table.add_row("rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", f"{faster:.1f}x as fast")
-    table.add_row("model", f"{before.megabytes:.2f} MB", f"{after.megabytes:.2f} MB", f"{smaller:.1f}x smaller")
+    faster = after.fps / before.fps
+    smaller = before.megabytes / after.megabytes
+    table.add_row(
+        "rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", f"{faster:.1f}x as fast"
+    )
+    table.add_row(
+        "model",
+        f"{before.megabytes:.2f} MB",
+        f"{after.megabytes:.2f} MB",
+        f"{smaller:.1f}x smaller",
+    )
     if after.stored is not None:
         smaller = before.megabytes / after.stored
-        table.add_row("file", f"{before.megabytes:.2f} MB", f"{after.stored:.3f} MB", f"{smaller:.1f}x smaller")
+        table.add_row(
+            "file",
+            f"{before.megabytes:.2f} MB",
+            f"{after.stored:.3f} MB",
+            f"{smaller:.1f}x smaller",
+        )
     return table

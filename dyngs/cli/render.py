@@ -44,19 +44,26 @@ def add_parser(commands: args.Commands) -> None:
     path = "camera path: orbit (default for a file), spiral, along (as the capture was filmed), or a .json file"
     cameras.add_argument("--path", type=args.input_word, metavar="PATH", help=path)
     when = parser.add_mutually_exclusive_group()
-    when.add_argument("--time", type=args.scene_time, metavar="T", help="render the scene at this time, from 0 to 1")
+    when.add_argument(
+        "--time",
+        type=args.scene_time,
+        metavar="T",
+        help="render the scene at this time, from 0 to 1",
+    )
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B, one per frame")
     view = "without --path: render from the camera of this view (default: the first one)"
     parser.add_argument("--view", metavar="NAME|N", help=view)
     person = parser.add_mutually_exclusive_group()
     args.add_motion(person)
-    person.add_argument("--pose", choices=("rest",), help="show a person in the rest pose of the template")
-    args.add_keep_feet(parser)
-    parser.add_argument("--video", type=args.output_path, metavar="FILE.mp4", help="write a video as well")
-    frames, kind = (
-        "number of frames of orbit, spiral and along (default 120)",
-        args.whole("a number of frames", 1, 10**9),
+    person.add_argument(
+        "--pose", choices=("rest",), help="show a person in the rest pose of the template"
     )
+    args.add_keep_feet(parser)
+    parser.add_argument(
+        "--video", type=args.output_path, metavar="FILE.mp4", help="write a video as well"
+    )
+    frames = "number of frames of orbit, spiral and along (default 120)"
+    kind = args.whole("a number of frames", 1, 10**9)
     parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     fps = "frames per second of the video (default 30, or as in the .json)"
     parser.add_argument("--fps", type=float, metavar="F", help=fps)
@@ -68,7 +75,9 @@ def add_parser(commands: args.Commands) -> None:
     background = "background of all images (default: that of training)"
     parser.add_argument("--background", choices=("white", "black"), help=background)
     args.add_up(parser, " of the path")
-    args.add_most_drawn(parser, "of a still scene: draw far parts coarser, and N Gaussians of each image at most")
+    args.add_most_drawn(
+        parser, "of a still scene: draw far parts coarser, and N Gaussians of each image at most"
+    )
     args.add_threads(parser)
     args.add_device(parser)
     args.add_data_root(parser)
@@ -87,7 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Raise DyngsError for nothing to render, nowhere to write, or an option that does not apply."""
+    """Raise DyngsError for nothing to render, nowhere to write, or an option that does not
+    apply."""
     args.require_motion_for_feet(arguments)
     arguments.source = args.run_of_scene_file(arguments.source)
     known = command_for(arguments.source)
@@ -95,15 +105,23 @@ def _check(arguments: argparse.Namespace) -> None:
         raise DyngsError(f"{arguments.source}: nothing that can be drawn; {known}")
     is_file = arguments.source.is_file()
     if is_file and arguments.split:
-        raise DyngsError(f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json")
+        raise DyngsError(
+            f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json"
+        )
     if arguments.view is not None and arguments.path:
-        raise DyngsError("--view renders from a fixed camera, --path from a moving one; give one of them")
+        raise DyngsError(
+            "--view renders from a fixed camera, --path from a moving one; give one of them"
+        )
     if arguments.times is not None and arguments.frames is not None:
         raise DyngsError("--times and --frames both set the number of frames; give one of them")
     if arguments.out is None and (arguments.video is None or not _is_path(arguments)):
-        raise DyngsError("where to? Give --out DIR (or --video FILE.mp4 with --path, --time, --times or --view)")
+        raise DyngsError(
+            "where to? Give --out DIR (or --video FILE.mp4 with --path, --time, --times or --view)"
+        )
     if not arguments.source.exists():
-        raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a file")
+        raise DyngsError(
+            f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a file"
+        )
     if arguments.up and not (is_file or arguments.path):
         raise DyngsError("--up goes with --path orbit, spiral or along")
     if arguments.size and not _is_path(arguments):
@@ -135,16 +153,22 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not _is_path(arguments):
         with ProgressBar() as report:
-            opened = _before(arguments, open_run(arguments.source, data_root=args.data_root(arguments)))
+            opened = _before(
+                arguments, open_run(arguments.source, data_root=args.data_root(arguments))
+            )
             opened = _coarser(arguments, opened)
-            return write_split_images(opened, arguments.split or "test", arguments.out, output, report, device)
+            return write_split_images(
+                opened, arguments.split or "test", arguments.out, output, report, device
+            )
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
     args.print_notes((*opened.notes, *path.notes), path.warnings)
     if not arguments.fps:
         output = replace(output, fps=path.fps)
     with ProgressBar() as report:
-        return write_path_images(_coarser(arguments, opened).to(device), path, arguments.out, output, report)
+        return write_path_images(
+            _coarser(arguments, opened).to(device), path, arguments.out, output, report
+        )
 
 
 def _opened(arguments: argparse.Namespace) -> Opened:
@@ -179,7 +203,8 @@ def _path_options(arguments: argparse.Namespace) -> PathOptions:
     from dyngs.camera_paths.path import parse_times
     from dyngs.export.chosen_path import PathOptions
 
-    times, num_frames = None if arguments.time is None else (arguments.time,), arguments.frames
+    times = None if arguments.time is None else (arguments.time,)
+    num_frames = arguments.frames
     if arguments.times is not None:
         times = parse_times(arguments.times)
         num_frames = len(times)

@@ -1,4 +1,5 @@
-"""What commands that write files of Gaussians share: names of formats, options about axes, lines about the result."""
+"""What commands that write files of Gaussians share: names of formats, options about axes, lines
+about the result."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ if TYPE_CHECKING:
     from dyngs.export.redrawn import Redrawn
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
-"""Names of ``dyngs.splats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not import them."""
+"""Names of ``dyngs.splats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not
+import them."""
 MOVING = "4dgs"
 """Name and suffix of the format of moving Gaussians."""
 
@@ -35,8 +37,11 @@ def add_axes(parser: argparse.ArgumentParser) -> None:
 
 
 def print_redrawn(notes: tuple[str, ...], found: Sequence[Redrawn]) -> None:
-    """Print what the format could not hold, and how the files differ from the scene: the worst of them."""
+    """Print what the format could not hold, and how the files differ from the scene: the worst of
+    them."""
     worst = min(found, key=lambda one: one.psnr)
     print_notes((*notes, worst.line))
     if worst.is_faint:
-        print_notes((), (f"the file shows the scene with visible differences ({worst.psnr:.1f} dB)",))
+        print_notes(
+            (), (f"the file shows the scene with visible differences ({worst.psnr:.1f} dB)",)
+        )

@@ -41,10 +41,14 @@ def add_parser(commands: args.Commands) -> None:
     target = "run folder, or a config to train first"
     parser.add_argument("target", type=args.input_word, metavar="RUN_OR_CONFIG", help=target)
     args.add_overrides(parser, "key=value", "overrides of the config")
-    parser.add_argument("--out", type=args.output_path, metavar="DIR", help="output folder (default RUN/tradeoff)")
+    parser.add_argument(
+        "--out", type=args.output_path, metavar="DIR", help="output folder (default RUN/tradeoff)"
+    )
     vary = "vary only this setting, weaker values first; repeatable (default: all settings)"
     parser.add_argument("--vary", action="append", default=[], metavar="SETTING[=A,B]", help=vary)
-    parser.add_argument("--train", action="store_true", help="also vary settings that need training from scratch")
+    parser.add_argument(
+        "--train", action="store_true", help="also vary settings that need training from scratch"
+    )
     for name, low, default, about in (
         ("finetune", 0, 0, "fine-tuning steps after pruning (default: none)"),
         ("combine", 0, 4, "combinations in each of three directions (default 4)"),
@@ -65,7 +69,8 @@ def add_parser(commands: args.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print and write the tables, and choose a run; the folder is locked against other commands."""
+    """Measure, print and write the tables, and choose a run; the folder is locked against other
+    commands."""
     from contextlib import nullcontext
 
     from dyngs.files.lock import writing
@@ -88,9 +93,13 @@ def _run(arguments: argparse.Namespace) -> int:
     is_run = Path(arguments.target).is_dir()
     variations = parse_variations(arguments.vary, trains=arguments.train or not is_run)
     requirements = parse_requirements(arguments.require) if arguments.require is not None else ()
-    goal = parse_goal(arguments.minimize or arguments.maximize or "psnr", smallest=arguments.minimize is not None)
+    goal = parse_goal(
+        arguments.minimize or arguments.maximize or "psnr", smallest=arguments.minimize is not None
+    )
     run_dir = Path(arguments.target) if is_run else _trained(arguments)
-    runs = VariantRuns(run_dir, arguments.out or run_dir / "tradeoff", arguments.threads, arguments.device)
+    runs = VariantRuns(
+        run_dir, arguments.out or run_dir / "tradeoff", arguments.threads, arguments.device
+    )
     plan = Plan(
         variations,
         arguments.finetune,
@@ -103,10 +112,15 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         measurements = sweep(runs, plan, show)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("finished measurements are kept; the same command continues") from None
+        raise KeyboardInterrupt(
+            "finished measurements are kept; the same command continues"
+        ) from None
     files = write_report(runs.out, measurements)
-    rows, rates = table_rows(measurements), exchange_rates(measurements[0], measurements)
-    alone = numbers_table("each setting alone", EXCHANGE_HEAD, [exchange_cells(rate) for rate in rates])
+    rows = table_rows(measurements)
+    rates = exchange_rates(measurements[0], measurements)
+    alone = numbers_table(
+        "each setting alone", EXCHANGE_HEAD, [exchange_cells(rate) for rate in rates]
+    )
     print_tables(_variants_table(rows, measurements), alone)
     print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")
     if not can_plot():
@@ -116,7 +130,9 @@ def _run(arguments: argparse.Namespace) -> int:
         folder = write_chosen(runs, best.variant)
         print(f"chosen:  {best.name}: {best.psnr:.2f} dB, {best.fps:.1f} fps, {best.mb:.2f} MB")
         if best.variant.scale < 1:
-            print(f"note: rendered at {best.variant.scale:g} of the size; upscale it where it is shown")
+            print(
+                f"note: rendered at {best.variant.scale:g} of the size; upscale it where it is shown"
+            )
         print(f"written: {folder}")
     return 0
 
@@ -133,7 +149,11 @@ def _trained(arguments: argparse.Namespace) -> Path:
     if arguments.out is None:
         raise DyngsError(f"{arguments.target}: give --out DIR; a config is trained there first")
     folder = arguments.out / "run"
-    own = [f"run.dir={folder}", f"run.threads={arguments.threads}", f"run.device={arguments.device}"]
+    own = [
+        f"run.dir={folder}",
+        f"run.threads={arguments.threads}",
+        f"run.device={arguments.device}",
+    ]
     return finished(load_config(config, [*arguments.overrides, *own]), folder)
 
 
@@ -143,10 +163,14 @@ def _variants_table(rows: Sequence[TableRow], measurements: Sequence[Measurement
     head = ("  changed", "PSNR", "SSIM", *optional, "fps", "speed x", "MB", "RAM MB")
     cells = []
     for row in rows:
-        lpips, memory = ("" if x is None else f"{x:.{n}f}" for x, n in ((row.lpips, 4), (row.memory_mb, 0)))
+        lpips, memory = (
+            "" if x is None else f"{x:.{n}f}" for x, n in ((row.lpips, 4), (row.memory_mb, 0))
+        )
         quality = (f"{row.psnr:.2f}", f"{row.ssim:.4f}", *(lpips for _ in optional))
         name = f"{'* ' if row.on_front else '  '}{row.name}"
         cells.append((name, *quality, f"{row.fps:.1f}", f"{row.gain:.2f}", f"{row.mb:.2f}", memory))
     return numbers_table(
-        f"{counted(measurements[0].num_views, 'view')}; * Pareto front of PSNR, speed and size", head, cells
+        f"{counted(measurements[0].num_views, 'view')}; * Pareto front of PSNR, speed and size",
+        head,
+        cells,
     )

@@ -34,7 +34,10 @@ CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap,
 human, human_predictor.
 All keys are listed in docs/cli.md.
 """
-_LOGGING = tuple(f"train.{name}" for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard"))
+_LOGGING = tuple(
+    f"train.{name}"
+    for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard")
+)
 _FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
 """Keys that change nothing that a run ends with."""
 WITH_RESUME = ("train.steps", "data.root", "data.follow_links", *_FOR_THIS_CALL)
@@ -43,19 +46,26 @@ WITH_RESUME = ("train.steps", "data.root", "data.follow_links", *_FOR_THIS_CALL)
 
 def add_parser(commands: args.Commands) -> None:
     about = "Train a model from a capture. Writes a run folder (default runs/NAME)."
-    parser = args.add_command(commands, "train", run, "train a model from a capture", about, _EPILOG)
+    parser = args.add_command(
+        commands, "train", run, "train a model from a capture", about, _EPILOG
+    )
     args.add_overrides(parser, "CONFIG key=value", "preset or YAML file, and overrides")
     resume = "continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one"
     parser.add_argument("--resume", type=args.input_path, metavar="RUN", help=resume)
     about = "begin with the Gaussians of a scene; init.trains=colour, init.box=[x,y,z,x,y,z] freeze a part of it"
-    parser.add_argument("--from", dest="begun", type=args.input_path, metavar="RUN|FILE", help=about)
-    parser.add_argument("--view", action="store_true", help="show the scene in a browser while it trains")
+    parser.add_argument(
+        "--from", dest="begun", type=args.input_path, metavar="RUN|FILE", help=about
+    )
+    parser.add_argument(
+        "--view", action="store_true", help="show the scene in a browser while it trains"
+    )
     add_serving_arguments(parser)
     args.add_run_device(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train and print the next commands; with others, where ``torchrun`` has started several processes."""
+    """Train and print the next commands; with others, where ``torchrun`` has started several
+    processes."""
     if os.environ.get("WORLD_SIZE", "1") == "1":
         return _run(arguments)
     from dyngs.api.following import together
@@ -75,7 +85,11 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
     with ExitStack() as stack:
         listeners = [stack.enter_context(_view(arguments, config))] if arguments.view else []
         folder = train(
-            config, resume_from=arguments.resume, listeners=listeners, processes=processes, progress=ProgressBar
+            config,
+            resume_from=arguments.resume,
+            listeners=listeners,
+            processes=processes,
+            progress=ProgressBar,
         )
     for line in _about_motion(folder, config):
         print(line)
@@ -84,7 +98,9 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
     if config.model.is_network:
         print(f"next:    dyngs predict {word} CAPTURE --out RUN")
     else:
-        print(f"next:    dyngs eval {word}\n         dyngs render {word} --out {as_word(folder / 'images')}")
+        print(
+            f"next:    dyngs eval {word}\n         dyngs render {word} --out {as_word(folder / 'images')}"
+        )
     return 0
 
 
@@ -107,18 +123,22 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     if not isinstance(config.model, DynamicModel):
         return []
     run = load_run(folder)
-    scene, limit = run.scene, config.model.freeze_below_px
+    scene = run.scene
+    limit = config.model.freeze_below_px
     if not run.config.model.may_move:
         return ["motion:  none, so this is a static model, like those of configs/static.yaml"]
     if not scene.times:
         return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_static:
         return [f"motion:  nothing moves by {limit:g} px or more, so this became a static model"]
-    return [f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"]
+    return [
+        f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"
+    ]
 
 
 def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None = None) -> Config:
-    """Return the configuration for the words after ``dyngs train``; ``begun``: of ``--from``. Raises DyngsError."""
+    """Return the configuration for the words after ``dyngs train``; ``begun``: of ``--from``.
+    Raises DyngsError."""
     from dyngs.config.io import load_config, load_resolved
 
     if begun is not None and resume is not None:
@@ -129,10 +149,14 @@ def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None =
     preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)
     paths = [word for word in overrides if "=" not in word and Path(word).exists()]
     if paths:
-        raise DyngsError(f"{paths[0]!r}: a capture, photos or a video are given as data.root={as_word(paths[0])}")
+        raise DyngsError(
+            f"{paths[0]!r}: a capture, photos or a video are given as data.root={as_word(paths[0])}"
+        )
     if resume is None:
         if not words:
-            raise DyngsError("give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`")
+            raise DyngsError(
+                "give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`"
+            )
         return load_config(preset, overrides)
     other = [word for word in words if word.partition("=")[0].strip() not in WITH_RESUME]
     if other:

@@ -24,14 +24,20 @@ Needs viser: pip install 'dyngs[view]'. All controls are in docs/viewer.md.
 
 def add_parser(commands: args.Commands) -> None:
     about = "Serve a page that shows a scene from anywhere at any time, next to the truth of its capture."
-    parser = args.add_command(commands, "view", run, "look at a run or a file in a browser", about, _EPILOG)
-    parser.add_argument("source", type=args.input_path, metavar="RUN_OR_FILE", help="run, file, or a folder of runs")
+    parser = args.add_command(
+        commands, "view", run, "look at a run or a file in a browser", about, _EPILOG
+    )
+    parser.add_argument(
+        "source", type=args.input_path, metavar="RUN_OR_FILE", help="run, file, or a folder of runs"
+    )
     add_serving_arguments(parser)
     about = "motion file for a person, or a folder of them"
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
     about = "for a network of people: whom to predict, or a folder of people"
     parser.add_argument("--capture", type=args.input_path, metavar="PATH", help=about)
-    args.add_most_drawn(parser, "of a large still scene: so many are drawn at most while anything moves")
+    args.add_most_drawn(
+        parser, "of a large still scene: so many are drawn at most while anything moves"
+    )
     args.add_up(parser)
     args.add_threads(parser)
     args.add_device(parser)
@@ -43,7 +49,9 @@ def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
     about = "address to listen on (default: this machine only); others get a link with a token"
     parser.add_argument("--host", default="127.0.0.1", help=about)
     kind = args.whole("a port", 1, 65535)
-    parser.add_argument("--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)")
+    parser.add_argument(
+        "--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -62,11 +70,14 @@ def run(arguments: argparse.Namespace) -> int:
         torch.set_num_threads(arguments.threads)
     motions = motion_files(arguments.motion)
     device = args.computing_device(arguments.device)
-    root, most = args.data_root(arguments), arguments.max_gaussians_drawn
+    root = args.data_root(arguments)
+    most = arguments.max_gaussians_drawn
     source = open_source(arguments.source, arguments.up, arguments.capture, device, root, most)
     first = first_of(source)
     if motions and first.person is None:
-        raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")
+        raise DyngsError(
+            f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out"
+        )
     args.print_notes(first.notes)
     serving = Serving(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
@@ -81,7 +92,10 @@ def wait_for_interrupt() -> None:
     import signal
 
     ended = threading.Event()
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, lambda *_: ended.set())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         while not ended.wait(0.5):
             pass

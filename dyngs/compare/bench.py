@@ -20,7 +20,8 @@ TIMED_VIEWS, ROUNDS = 4, 3
 
 
 def require_same_comparison(bench: Bench, plan: Plan) -> None:
-    """Note what is compared in the folder, or raise DyngsError where something else is compared there."""
+    """Note what is compared in the folder, or raise DyngsError where something else is compared
+    there."""
     limit = bench.limit
     facts = {
         "capture": str(bench.capture),
@@ -51,25 +52,31 @@ def _digest(text: str) -> str:
 def compare(
     bench: Bench, plan: Plan, say: Callable[[str], None], ray_cores: int | None = None
 ) -> tuple[list[Result], dict[str, str]]:
-    """Return the results in the order of the models, and why others are left out; each is kept once it is there.
+    """Return the results in the order of the models, and why others are left out; each is kept once
+    it is there.
 
     ``say`` is told a line per model that is trained now.
 
     Raises:
         DyngsError: no model could be trained.
     """
-    measured, left_out = Measured(bench), dict(plan.left_out)
+    measured = Measured(bench)
+    left_out = dict(plan.left_out)
     known = [entry for entry in plan.entries if bench.result_path(entry.name).is_file()]
     missing = [entry for entry in plan.entries if entry not in known]
     found = {entry.name: measured(entry) for entry in known}
-    for number, (entry, result) in enumerate(done_in_turn(measured, missing, ray_cores), len(known) + 1):
+    for number, (entry, result) in enumerate(
+        done_in_turn(measured, missing, ray_cores), len(known) + 1
+    ):
         place = f"{number} of {len(plan.entries)}"
         if isinstance(result, DyngsError):
             left_out[entry.name] = str(result)
             say(f"{entry.name} ({place}): left out: {result}")
             continue
         found[entry.name] = result
-        say(f"{entry.name} ({place}): {result.psnr:.2f} dB, {result.steps:,} steps in {result.seconds:.0f} s")
+        say(
+            f"{entry.name} ({place}): {result.psnr:.2f} dB, {result.steps:,} steps in {result.seconds:.0f} s"
+        )
     if not found:
         _leave_nothing(bench, plan)
         name, problem = next(iter(left_out.items()))
@@ -79,7 +86,8 @@ def compare(
 
 
 def _leave_nothing(bench: Bench, plan: Plan) -> None:
-    """Remove what a comparison that came to nothing has noted, so that another one can begin in its folder."""
+    """Remove what a comparison that came to nothing has noted, so that another one can begin in its
+    folder."""
     for path in (bench.out / STUDY_NAME, *(bench.said_path(entry.name) for entry in plan.entries)):
         path.unlink(missing_ok=True)
     for folder in (bench.out / "said", bench.out / "runs"):
@@ -94,4 +102,6 @@ def _timed(measured: Measured, results: list[Result]) -> list[Result]:
     with kernel_threads(measured.bench.threads or num_cores()):
         shown = [measured.drawing(result.name, TIMED_VIEWS) for result in results]
         speeds = time_interleaved([drawing for drawing, _ in shown], shown[0][1], ROUNDS)
-    return [measured.write_speed(result, speed) for result, speed in zip(results, speeds, strict=True)]
+    return [
+        measured.write_speed(result, speed) for result, speed in zip(results, speeds, strict=True)
+    ]

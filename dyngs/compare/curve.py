@@ -1,4 +1,5 @@
-"""Quality over seconds: a listener that draws some held-out views while a model trains, and what it has noted."""
+"""Quality over seconds: a listener that draws some held-out views while a model trains, and what it
+has noted."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ from dyngs.training.trainer import Trainer
 
 VIEWS = 6
 MARKS = tuple((i / 12) ** 2 for i in range(1, 12))
-"""Fractions of a run after which views are drawn, and at its end: more in the beginning, when quality rises fast."""
+"""Fractions of a run after which views are drawn, and at its end: more in the beginning, when
+quality rises fast."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class CurvePoint:
 
 
 class QualityCurve:
-    """Listener that adds held-out quality to the log of a run; drawing takes none of its time, and changes nothing.
+    """Listener that adds held-out quality to the log of a run; drawing takes none of its time, and
+    changes nothing.
 
     Args:
         seconds: that the run has; None: it has its steps.
@@ -67,7 +70,8 @@ class QualityCurve:
             event.loop.tell(Evaluated(event.step, self._split, *scores, took))
 
     def _scores(self, trainer: Trainer[Any]) -> tuple[float, float]:
-        data, capture = trainer.config.data, trainer.capture
+        data = trainer.config.data
+        capture = trainer.capture
         _, background = evaluation_background(data.background, capture.has_alpha)
         if self._images is None:
             self._images = some_images(split_views(capture, self._split), data, VIEWS)
@@ -77,7 +81,8 @@ class QualityCurve:
         drawing = Drawing(scene, scene.options, background.to(trainer.device))
         found = []
         for image in self._images:
-            rendered, truth = drawing.image(image.cameras, image.time).cpu(), image.composite(background)
+            rendered = drawing.image(image.cameras, image.time).cpu()
+            truth = image.composite(background)
             found.append((psnr(rendered, truth, image.mask), ssim(rendered, truth, image.mask)))
         return fmean(x for x, _ in found), fmean(x for _, x in found)
 
@@ -89,8 +94,10 @@ def some_images(views: Sequence[View], data: Any, count: int) -> list[Image]:
 
 
 def read_curve(run_dir: Path, split: str) -> tuple[CurvePoint, ...]:
-    """Return the points of the log of a run in the order of its steps; lines that are damaged are passed over."""
-    seconds, scores = dict[int, float](), dict[int, float]()
+    """Return the points of the log of a run in the order of its steps; lines that are damaged are
+    passed over."""
+    seconds = dict[int, float]()
+    scores = dict[int, float]()
     path = run_dir / LOG_NAME
     log = read_limited(path, MOST_LOG_BYTES) if path.is_file() else b""
     for line in log.splitlines():
@@ -102,4 +109,6 @@ def read_curve(run_dir: Path, split: str) -> tuple[CurvePoint, ...]:
                 seconds[int(values["step"])] = float(values["seconds"])
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             continue
-    return tuple(CurvePoint(step, seconds[step], scores[step]) for step in sorted(scores) if step in seconds)
+    return tuple(
+        CurvePoint(step, seconds[step], scores[step]) for step in sorted(scores) if step in seconds
+    )

@@ -1,4 +1,5 @@
-"""The page of a comparison: one file with table, curves and synchronised crops, which asks no host for anything."""
+"""The page of a comparison: one file with table, curves and synchronised crops, which asks no host
+for anything."""
 
 from __future__ import annotations
 
@@ -22,19 +23,32 @@ def page_text(
     left_out: Mapping[str, str],
     parts: tuple[str, list[str], list[list[str]], str],
 ) -> str:
-    """Return the page; ``parts``: what all had the same of, head and cells of the table, and the plot as SVG or ""."""
+    """Return the page; ``parts``: what all had the same of, head and cells of the table, and the
+    plot as SVG or ""."""
     about, head, cells, svg = parts
     style, script = (_file(f"page.{suffix}") for suffix in ("css", "js"))
-    plot = "" if not svg else f'<img class="plot" alt="PSNR over seconds of training" src="{_data("svg+xml", svg)}">'
-    missing = "".join(f"<p>Left out: <b>{escape(n)}</b>: {escape(why)}</p>" for n, why in left_out.items())
-    pieces = {"style": style, "style_hash": source_hash(style), "script": script, "script_hash": source_hash(script)}
+    plot = (
+        ""
+        if not svg
+        else f'<img class="plot" alt="PSNR over seconds of training" src="{_data("svg+xml", svg)}">'
+    )
+    missing = "".join(
+        f"<p>Left out: <b>{escape(n)}</b>: {escape(why)}</p>" for n, why in left_out.items()
+    )
+    pieces = {
+        "style": style,
+        "style_hash": source_hash(style),
+        "script": script,
+        "script_hash": source_hash(script),
+    }
     pieces |= {"about": escape(about), "plot": plot, "left_out": missing}
     pieces |= {"table": html_table(head, cells), "views": script_safe(_views(bench, results))}
     return filled(_file("page.html"), pieces)
 
 
 def _views(bench: Bench, results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return the views that are shown, each with its images: the truth first, then those of the models."""
+    """Return the views that are shown, each with its images: the truth first, then those of the
+    models."""
     return [
         {
             "name": name,

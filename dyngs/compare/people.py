@@ -1,4 +1,5 @@
-"""Networks that predict people, given the same few views of people that they were not trained on."""
+"""Networks that predict people, given the same few views of people that they were not trained
+on."""
 
 from __future__ import annotations
 
@@ -46,11 +47,13 @@ class PeopleBench:
     """What is compared with what.
 
     Attributes:
-        people: a set of `dyngs data synth people` with another seed than that of training, or a folder of captures.
+        people: a set of `dyngs data synth people` with another seed than that of training, or a
+            folder of captures.
         networks: runs, files of weights, or names of published ones.
         counts: of views to predict from.
         spread: views evenly around the person; else of an arc, ``APART`` apart.
-        avatar_minutes: a `human` avatar is trained on the same images alone for so long; None: none is.
+        avatar_minutes: a `human` avatar is trained on the same images alone for so long; None: none
+            is.
         data: overrides of the section ``data``, as "longest_side=256".
     """
 
@@ -88,7 +91,8 @@ class Task:
 
 @dataclass(frozen=True)
 class Method:
-    """How a scene is made of views; ``make`` returns it, CPU seconds, and those of training on them before."""
+    """How a scene is made of views; ``make`` returns it, CPU seconds, and those of training on them
+    before."""
 
     name: str
     make: Callable[[list[int]], tuple[Renderable, float, float]]
@@ -97,7 +101,8 @@ class Method:
 def compare_people(
     bench: PeopleBench, out: Path, say: Callable[[str], None] = show
 ) -> tuple[list[str], list[list[str]]]:
-    """Write ``out`` with the scores as .csv, the table as .md, and pictures of truth, prediction and error.
+    """Write ``out`` with the scores as .csv, the table as .md, and pictures of truth, prediction
+    and error.
 
     Return head and cells of the table. What does not suit a network is told, and left out.
 
@@ -108,23 +113,36 @@ def compare_people(
     names = [network.stem for network in bench.networks]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise DyngsError(f"two networks are named {twice}; the table needs one name each: rename a run")
+        raise DyngsError(
+            f"two networks are named {twice}; the table needs one name each: rename a run"
+        )
     loaded = [(network.stem, *trained_network(network)) for network in bench.networks]
     given = DataConfig.model_validate({"root": bench.people})
     if bench.data:
         given = load_config(
-            packaged_preset("static"), [f"data.root={bench.people}", *(f"data.{x}" for x in bench.data)]
+            packaged_preset("static"),
+            [f"data.root={bench.people}", *(f"data.{x}" for x in bench.data)],
         ).data
-    changed = {word.partition("=")[0]: getattr(given, word.partition("=")[0]) for word in bench.data}
+    changed = {
+        word.partition("=")[0]: getattr(given, word.partition("=")[0]) for word in bench.data
+    }
     found: list[Score] = []
     with new_folder(out, require_empty) as folder:
         for number, person in enumerate(captures_in(given)):
             for name, config, checkpoint in loaded:
-                data = config.data.model_copy(update={"root": person.root, "test_every": 0} | changed)
-                make = partial(
-                    kind_of(config.model).predictor, config, checkpoint, data, say=say, report=report_nothing
+                data = config.data.model_copy(
+                    update={"root": person.root, "test_every": 0} | changed
                 )
-                views, methods = make().views, [*_methods(make, name, config)]
+                make = partial(
+                    kind_of(config.model).predictor,
+                    config,
+                    checkpoint,
+                    data,
+                    say=say,
+                    report=report_nothing,
+                )
+                views = make().views
+                methods = [*_methods(make, name, config)]
                 if bench.avatar_minutes is not None and name == loaded[0][0]:
                     methods.append(_avatar(data, views, 60 * bench.avatar_minutes))
                 tests = read_capture(data).splits.get("test", ())
@@ -143,11 +161,13 @@ def compare_people(
     return head, cells
 
 
-def task_of(views: tuple[View, ...], tests: tuple[View, ...], count: int, first: int, spread: bool) -> Task:
+def task_of(
+    views: tuple[View, ...], tests: tuple[View, ...], count: int, first: int, spread: bool
+) -> Task:
     """Return that for ``count`` views from the one in place ``first`` of the ring on.
 
-    They are compared with the views in the middle between neighbours, or where there is a split `test` with those of
-    its views, in an arc those between neighbours.
+    They are compared with the views in the middle between neighbours, or where there is a split
+    `test` with those of its views, in an arc those between neighbours.
     """
     moment = views[0].frame, views[0].time
     ring = around(views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment])
@@ -162,7 +182,9 @@ def task_of(views: tuple[View, ...], tests: tuple[View, ...], count: int, first:
     found = [view for view in tests if (view.frame, view.time) == moment]
     if not spread:
         gaps = [(views[a], views[b]) for a, b in pairwise(sources)]
-        found = [x for x in found if any(angle(x, a) + angle(x, b) < 1.3 * angle(a, b) for a, b in gaps)]
+        found = [
+            x for x in found if any(angle(x, a) + angle(x, b) < 1.3 * angle(a, b) for a, b in gaps)
+        ]
     return Task(sources, found)
 
 
@@ -178,11 +200,13 @@ def boxes(scene: Renderable, image: Image) -> tuple[Tensor, Tensor]:
 
 
 def _methods(trained: Callable[[], Predictor], name: str, config: Config) -> Iterator[Method]:
-    """Yield the ways of one network with one person: as it is, and after training on the images where it does that."""
+    """Yield the ways of one network with one person: as it is, and after training on the images
+    where it does that."""
     for adapts in (False, True) if config.model.kind == "human_predictor" else (False,):
 
         def make(views: list[int], adapts: bool = adapts) -> tuple[Renderable, float, float]:
-            predictor, began = trained(), time.process_time()
+            predictor = trained()
+            began = time.process_time()
             if adapts:
                 predictor.adapt(views, None, report_nothing)
             start = time.process_time()
@@ -197,10 +221,17 @@ def _avatar(data: DataConfig, views: tuple[View, ...], seconds: float) -> Method
 
     def make(chosen: list[int]) -> tuple[Renderable, float, float]:
         cameras = [[v for v in views if v.frame == views[i].frame].index(views[i]) for i in chosen]
-        words = [f"data.root={data.root}", f"data.train_cameras={cameras}", "run.threads=1", "data.test_every=0"]
+        words = [
+            f"data.root={data.root}",
+            f"data.train_cameras={cameras}",
+            "run.threads=1",
+            "data.test_every=0",
+        ]
         moment = [] if views[0].frame is None else ["data.frames=0:1"]
         config = load_config(packaged_preset("human"), words + moment)
-        config = config.model_copy(update={"data": config.data.model_copy(update={"longest_side": data.longest_side})})
+        config = config.model_copy(
+            update={"data": config.data.model_copy(update={"longest_side": data.longest_side})}
+        )
         _, setup, stepping = _trained_avatar(config, _TRIED)
         steps = max(_TRIED, round((seconds - setup) / stepping * _TRIED))
         scene, *spent = _trained_avatar(config, steps)
@@ -224,8 +255,14 @@ def _scores(method: Method, task: Task, data: DataConfig, pictures: Path) -> Ite
     if not task.targets:
         return
     scene, seconds, training = method.make(task.sources)
-    stored = sum(x.numel() * x.element_size() for x in (y.tensor for y in scene.drawing_state().values())) / 1e6
-    images, count = ImageLoader(tuple(task.targets), data), len(task.sources)
+    stored = (
+        sum(
+            x.numel() * x.element_size() for x in (y.tensor for y in scene.drawing_state().values())
+        )
+        / 1e6
+    )
+    images = ImageLoader(tuple(task.targets), data)
+    count = len(task.sources)
     boxes(scene, images[0])  # what is found out once is not part of a picture's time
     for i, target in enumerate(task.targets):
         start = time.process_time()
@@ -240,7 +277,14 @@ def _scores(method: Method, task: Task, data: DataConfig, pictures: Path) -> Ite
 
 def _table(found: Sequence[Score], counts: Sequence[int]) -> tuple[list[str], list[list[str]]]:
     """Return head and cells: means over people and views, medians of times."""
-    head = ["method", *(counted(n, "view") for n in counts), "scene, CPU s", "trained, CPU s", "ms a picture", "MB"]
+    head = [
+        "method",
+        *(counted(n, "view") for n in counts),
+        "scene, CPU s",
+        "trained, CPU s",
+        "ms a picture",
+        "MB",
+    ]
     cells = []
     for name in dict.fromkeys(score.method for score in found):
         by_count = [[s for s in found if s.method == name and s.count == n] for n in counts]
@@ -248,7 +292,12 @@ def _table(found: Sequence[Score], counts: Sequence[int]) -> tuple[list[str], li
         cells.append(
             [
                 name,
-                *(f"{fmean(s.psnr for s in x):.2f} dB, {fmean(s.ssim for s in x):.3f}" if x else "-" for x in by_count),
+                *(
+                    f"{fmean(s.psnr for s in x):.2f} dB, {fmean(s.ssim for s in x):.3f}"
+                    if x
+                    else "-"
+                    for x in by_count
+                ),
                 ", ".join(f"{median(s.seconds for s in x):.2f}" if x else "-" for x in by_count),
                 f"{median(s.training for s in own):.1f}",
                 f"{1e3 * median(s.drawing for s in own):.0f}",

@@ -1,4 +1,5 @@
-"""What a comparison trains: a configuration for each model, with the same images and the same limit; who cannot."""
+"""What a comparison trains: a configuration for each model, with the same images and the same
+limit; who cannot."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ from dyngs.training.limits import require_possible
 MOST_STEPS = 1_000_000
 """Steps that are asked for within a time: as many as fit are done, on schedules of that length."""
 _OURS = ("data.root", "run.", "train.minutes", "budget.")
-_LOOKED_AT, _LEAST_CONTRAST = 8, 2 / 255
+_LOOKED_AT = 8
+_LEAST_CONTRAST = 2 / 255
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,11 @@ class Limit:
     def overrides(self) -> list[str]:
         if self.minutes is not None:
             return [f"train.minutes={self.minutes:g}", f"train.steps={MOST_STEPS}"]
-        return [f"train.steps={self.steps}"] if self.steps is not None else [f"budget.max_mb={self.max_mb:g}"]
+        return (
+            [f"train.steps={self.steps}"]
+            if self.steps is not None
+            else [f"budget.max_mb={self.max_mb:g}"]
+        )
 
     def __str__(self) -> str:
         if self.minutes is not None:
@@ -96,20 +102,27 @@ def planned(bench: Bench, models: Sequence[str]) -> Plan:
     """Return what is trained; nothing is written.
 
     Raises:
-        DyngsError: a model that does not exist, a capture on which nothing can be compared, or one that no model takes.
+        DyngsError: a model that does not exist, a capture on which nothing can be compared, or one
+            that no model takes.
     """
     _require_ours(bench)
     files = _files_of(models)
     for file in files.values():  # a file that is wrong in itself is no model that is left out
         load_config(file, [f"data.root={bench.capture}"])
-    common = load_config(None, [f"data.root={bench.capture}", *(w for w in bench.overrides if w.startswith("data."))])
+    common = load_config(
+        None, [f"data.root={bench.capture}", *(w for w in bench.overrides if w.startswith("data."))]
+    )
     capture = comparable(common.data, bench.split)
-    entries, left_out, notes = list[Entry](), dict[str, str](), list[str]()
+    entries = list[Entry]()
+    left_out = dict[str, str]()
+    notes = list[str]()
     for name, file in files.items():
         try:
             config = load_config(file, _words(bench, name))
             require_possible(config)
-            problem = "is a network, which is trained on many people" if config.model.is_network else None
+            problem = (
+                "is a network, which is trained on many people" if config.model.is_network else None
+            )
             problem = problem or kind_of(config.model).refusal(capture)
         except DyngsError as error:
             problem = str(error)
@@ -117,9 +130,13 @@ def planned(bench: Bench, models: Sequence[str]) -> Plan:
             left_out[name] = problem
             continue
         given = config.data.model_dump(exclude_defaults=True, exclude={"root"})
-        dropped = [f"data.{key}" for key, value in given.items() if getattr(common.data, key) != value]
+        dropped = [
+            f"data.{key}" for key, value in given.items() if getattr(common.data, key) != value
+        ]
         if dropped:
-            notes.append(f"{name}: its {', '.join(dropped)} are left out, so that all have the same images")
+            notes.append(
+                f"{name}: its {', '.join(dropped)} are left out, so that all have the same images"
+            )
         entries.append(Entry(name, config.model_copy(update={"data": common.data})))
     if not entries:
         name, problem = next(iter(left_out.items()))
@@ -128,7 +145,11 @@ def planned(bench: Bench, models: Sequence[str]) -> Plan:
 
 
 def _words(bench: Bench, name: str) -> list[str]:
-    where = [f"run.dir={bench.run_dir(name)}", f"run.threads={bench.threads}", f"run.device={bench.device}"]
+    where = [
+        f"run.dir={bench.run_dir(name)}",
+        f"run.threads={bench.threads}",
+        f"run.device={bench.device}",
+    ]
     return [f"data.root={bench.capture}", *bench.overrides, *bench.limit.overrides, *where]
 
 
@@ -137,23 +158,29 @@ def _require_ours(bench: Bench) -> None:
     taken = _OURS if bench.limit.max_mb is not None else (*_OURS, "train.steps")
     for word in bench.overrides:
         if word.startswith(taken) and not word.startswith("run.seed="):
-            raise DyngsError(f"{printable(word, 80)}: the comparison sets this itself; see its options")
+            raise DyngsError(
+                f"{printable(word, 80)}: the comparison sets this itself; see its options"
+            )
 
 
 def _files_of(models: Sequence[str]) -> dict[str, Path]:
-    """Return the configuration files by the names that the models have in the comparison and its folder."""
+    """Return the configuration files by the names that the models have in the comparison and its
+    folder."""
     files: dict[str, Path] = {}
     for word in models:
         file = find_preset(Path(word))
         name = re.sub(r"[^\w.-]", "_", file.stem).lstrip(".-") or "model"
         if name in files:
-            raise DyngsError(f"--models: {printable(word, 60)} makes two models called {name}; rename one")
+            raise DyngsError(
+                f"--models: {printable(word, 60)} makes two models called {name}; rename one"
+            )
         files[name] = file
     return files
 
 
 def comparable(data: DataConfig, split: str) -> Capture:
-    """Return the capture, once it is known that models can be trained and compared on it. Raises DyngsError."""
+    """Return the capture, once it is known that models can be trained and compared on it. Raises
+    DyngsError."""
     require_folder(data.root)
     if is_unposed(data):
         raise DyngsError(
@@ -163,11 +190,15 @@ def comparable(data: DataConfig, split: str) -> Capture:
     capture = read_capture(data)
     held_out = split_views(capture, split)
     if len(capture.splits["train"]) < 2:
-        raise DyngsError(f"{data.root}: has one picture to train on, which shows nothing of what lies behind; add more")
+        raise DyngsError(
+            f"{data.root}: has one picture to train on, which shows nothing of what lies behind; add more"
+        )
     _, background = evaluation_background(data.background, capture.has_alpha)
     for views in (capture.splits["train"], held_out):
         if _is_plain(views, data, background):
-            raise DyngsError(f"{data.root}: its pictures are of one colour, so there is nothing to compare")
+            raise DyngsError(
+                f"{data.root}: its pictures are of one colour, so there is nothing to compare"
+            )
     return capture
 
 

@@ -1,4 +1,5 @@
-"""The report of a comparison: a table as .csv and .md, curves of quality over seconds, and a page with crops."""
+"""The report of a comparison: a table as .csv and .md, curves of quality over seconds, and a page
+with crops."""
 
 from __future__ import annotations
 
@@ -17,7 +18,11 @@ if TYPE_CHECKING:
 
 STEM = "comparison"
 _LABELS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".4f"), "lpips": ("LPIPS", ".4f")}
-_LABELS |= {"psnr_foreground": ("foregr.", ".2f"), "psnr_moving": ("moving", ".2f"), "fps": ("fps", ".1f")}
+_LABELS |= {
+    "psnr_foreground": ("foregr.", ".2f"),
+    "psnr_moving": ("moving", ".2f"),
+    "fps": ("fps", ".1f"),
+}
 _LABELS |= {"mb": ("MB", ".2f"), "gaussians": ("Gaussians", ",.0f"), "steps": ("steps", ",.0f")}
 _LABELS |= {"seconds": ("s", ".0f")}
 
@@ -29,7 +34,9 @@ def table_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
 
 def _row(result: Result) -> dict[str, Any]:
     fps = None if result.speed is None else 1e3 / result.speed.ms.median
-    return {"model": result.name} | {key: fps if key == "fps" else getattr(result, key) for key in _LABELS}
+    return {"model": result.name} | {
+        key: fps if key == "fps" else getattr(result, key) for key in _LABELS
+    }
 
 
 def table_cells(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
@@ -37,7 +44,10 @@ def table_cells(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list
     shown = [key for key in _LABELS if any(row[key] is not None for row in rows)]
     head = ["model", *(_LABELS[key][0] for key in shown)]
     cells = [
-        [row["model"], *("-" if row[key] is None else format(row[key], _LABELS[key][1]) for key in shown)]
+        [
+            row["model"],
+            *("-" if row[key] is None else format(row[key], _LABELS[key][1]) for key in shown),
+        ]
         for row in rows
     ]
     return head, cells
@@ -49,12 +59,16 @@ def about(bench: Bench, results: Sequence[Result]) -> str:
     return f"{bench.capture.name}: {bench.limit} each, {views}; PSNR in dB, seconds of training"
 
 
-def write_report(bench: Bench, results: Sequence[Result], left_out: Mapping[str, str]) -> list[Path]:
+def write_report(
+    bench: Bench, results: Sequence[Result], left_out: Mapping[str, str]
+) -> list[Path]:
     """Write the table, the page and, with matplotlib, the plot; return their paths."""
     rows = table_rows(results)
     out = bench.out
     head, cells = table_cells(rows)
-    missing = "".join(f"\nLeft out: {markdown_text(f'{name}: {problem}')}\n" for name, problem in left_out.items())
+    missing = "".join(
+        f"\nLeft out: {markdown_text(f'{name}: {problem}')}\n" for name, problem in left_out.items()
+    )
     figure = _curves(results) if can_plot() and any(result.curve for result in results) else None
     texts = {
         "csv": csv_text(rows),
@@ -74,7 +88,9 @@ def _curves(results: Sequence[Result]) -> Figure:
     axes = figure.subplots()
     for result in results:
         points = [point for point in result.curve if point.seconds > 0]
-        axes.plot([p.seconds for p in points], [p.psnr for p in points], "o-", ms=3, label=result.name)
+        axes.plot(
+            [p.seconds for p in points], [p.psnr for p in points], "o-", ms=3, label=result.name
+        )
     axes.set_xscale("log")
     axes.grid(color="#e4e4e4")
     axes.set_title("PSNR of some held-out views while training", loc="left", fontweight="bold")

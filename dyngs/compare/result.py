@@ -1,4 +1,5 @@
-"""What is measured of a model: it is trained, evaluated on the held-out views, and some of these are drawn."""
+"""What is measured of a model: it is trained, evaluated on the held-out views, and some of these
+are drawn."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ class Result:
 
     Attributes:
         psnr, ssim, lpips, psnr_foreground, psnr_moving: means over the views.
-        mb: 1e6 bytes: the file, with a limit on its size; else all numbers that drawing needs as float32.
+        mb: 1e6 bytes: the file, with a limit on its size; else all numbers that drawing needs as
+            float32.
         seconds: of training.
         views: names of the views that were drawn for the page, and their PSNR, dB.
         curve: quality while it was trained.
@@ -75,12 +77,14 @@ def read_result(path: Path) -> Result:
 
 @dataclass(frozen=True)
 class Measured:
-    """Trains and measures models on one bench, in this process or in one of Ray's; what it has is kept in files."""
+    """Trains and measures models on one bench, in this process or in one of Ray's; what it has is
+    kept in files."""
 
     bench: Bench
 
     def __call__(self, entry: Entry) -> Result:
-        """Return the result of a model; what was measured before is read. Raises DyngsError: it cannot be trained."""
+        """Return the result of a model; what was measured before is read. Raises DyngsError: it
+        cannot be trained."""
         path = self.bench.result_path(entry.name)
         if path.is_file():
             return read_result(path)
@@ -95,8 +99,11 @@ class Measured:
         return result
 
     def _train(self, entry: Entry) -> None:
-        limit, folder = self.bench.limit, self.bench.run_dir(entry.name)
-        curve = QualityCurve(self.bench.split, None if limit.minutes is None else 60 * limit.minutes)
+        limit = self.bench.limit
+        folder = self.bench.run_dir(entry.name)
+        curve = QualityCurve(
+            self.bench.split, None if limit.minutes is None else 60 * limit.minutes
+        )
         said_path = self.bench.said_path(entry.name)
         said_path.parent.mkdir(parents=True, exist_ok=True)
         print(f"training {entry.name}: {limit}", flush=True)
@@ -110,15 +117,21 @@ class Measured:
             )
 
     def _result(self, entry: Entry) -> Result:
-        bench, folder = self.bench, self.bench.run_dir(entry.name)
+        bench = self.bench
+        folder = self.bench.run_dir(entry.name)
         drawn = self.drawn_folder(entry.name)
         report = evaluate_run(
-            drawn, bench.split, threads=bench.threads or num_cores(), device=device_for(bench.device).type
+            drawn,
+            bench.split,
+            threads=bench.threads or num_cores(),
+            device=device_for(bench.device).type,
         )
         drawing, images = self.drawing(entry.name, bench.num_shown)
         for index, image in enumerate(images):
             rendered = drawing.image(image.cameras, image.time).cpu()
-            write_image(bench.image_path(TRUTH, index), image.composite(drawing.background).cpu().numpy())
+            write_image(
+                bench.image_path(TRUTH, index), image.composite(drawing.background).cpu().numpy()
+            )
             write_image(bench.image_path(entry.name, index), rendered.numpy())
         by_name = {score.name: score.psnr for score in report.per_view}
         trained = load_run(folder)
@@ -140,15 +153,25 @@ class Measured:
         )
 
     def drawn_folder(self, name: str) -> Path:
-        """Return the folder of the run as it is drawn: of limited size, where that is what was asked for."""
+        """Return the folder of the run as it is drawn: of limited size, where that is what was
+        asked for."""
         folder = self.bench.run_dir(name)
-        return folder / EXPORT_FOLDER if self.bench.limit.max_mb is not None and has_file(folder) else folder
+        return (
+            folder / EXPORT_FOLDER
+            if self.bench.limit.max_mb is not None and has_file(folder)
+            else folder
+        )
 
     def drawing(self, name: str, count: int) -> tuple[Drawing, list[Image]]:
-        """Return how a trained model is drawn, and at most ``count`` of the held-out images, evenly chosen."""
-        run, split, device = load_run(self.drawn_folder(name)), self.bench.split, device_for(self.bench.device)
+        """Return how a trained model is drawn, and at most ``count`` of the held-out images, evenly
+        chosen."""
+        run = load_run(self.drawn_folder(name))
+        split = self.bench.split
+        device = device_for(self.bench.device)
         capture = read_capture_of(run.config.data, run.info)
-        loader = images_of_split(capture, split_views(capture, split), self.bench.run_dir(name), run)
+        loader = images_of_split(
+            capture, split_views(capture, split), self.bench.run_dir(name), run
+        )
         loader.device = device
         _, background = evaluation_background(run.config.data.background, capture.has_alpha)
         with torch.no_grad(), kernel_threads(self.bench.threads or num_cores()):

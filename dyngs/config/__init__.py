@@ -1,10 +1,17 @@
-"""The configuration of a run: typed keys (``keys``), YAML files and overrides (``io``), keys in words (``schema``)."""
+"""The configuration of a run: typed keys (``keys``), YAML files and overrides (``io``), keys in
+words (``schema``)."""
 
 from dyngs.config.keys.colour import AutoColour, ColourSection, NetworkColour, ShColour
 from dyngs.config.keys.config import BudgetConfig, CameraConfig, Config, PruneConfig, RunConfig
 from dyngs.config.keys.data import DataConfig
 from dyngs.config.keys.start import PointsInit, RandomInit, SceneInit
-from dyngs.config.keys.strategy import DefaultStrategy, FixedStrategy, McmcStrategy, OptimConfig, Strategy
+from dyngs.config.keys.strategy import (
+    DefaultStrategy,
+    FixedStrategy,
+    McmcStrategy,
+    OptimConfig,
+    Strategy,
+)
 from dyngs.config.keys.train import TrainConfig
 from dyngs.deform.keys import (
     ControlNodesField,

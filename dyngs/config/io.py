@@ -1,7 +1,9 @@
-"""Configurations from and to YAML: presets, ``a.b=c`` overrides, and errors that say what is allowed.
+"""Configurations from and to YAML: presets, ``a.b=c`` overrides, and errors that say what is
+allowed.
 
-A preset is a short YAML file; overrides are laid over it; ``dyngs.config.Config`` checks the result and fills in the
-rest. What was resolved is saved with every run and is all that later commands read.
+A preset is a short YAML file; overrides are laid over it; ``dyngs.config.Config`` checks the result
+and fills in the rest. What was resolved is saved with every run and is all that later commands
+read.
 """
 
 from __future__ import annotations
@@ -39,8 +41,12 @@ RESOLVED_NAME = "config.yaml"
 
 MAX_WHOLE = 2**63 - 1
 """The largest whole number of a configuration."""
-REMOVED_KEYS: dict[tuple[str, ...], object] = {("model", "loose"): False, ("budget", "min_fps"): None}
-"""Keys of earlier versions that configurations of runs may still have, with the value at which they had no effect."""
+REMOVED_KEYS: dict[tuple[str, ...], object] = {
+    ("model", "loose"): False,
+    ("budget", "min_fps"): None,
+}
+"""Keys of earlier versions that configurations of runs may still have, with the value at which they
+had no effect."""
 MOST_KEYS = 40  # Of a section that are listed in one line
 _FOLLOW_LINKS = ("data", "follow_links")
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
@@ -56,15 +62,15 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
         config = dyngs.load_config("static", ["data.root=lego", "train.steps=3000"])
 
     Args:
-        preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``) where no such file
-            exists; None starts from the defaults.
-        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` replaces its whole section and
-            nothing outside it, whatever the order of the overrides.
+        preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``)
+            where no such file exists; None starts from the defaults.
+        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` replaces its
+            whole section and nothing outside it, whatever the order of the overrides.
 
     Returns:
-        the checked configuration; ``data.root`` and ``data.body`` are made absolute, so that later commands work from
-        any folder. ``model_fields_set`` of its sections has the keys of overrides, and those of a file that differ
-        from the packaged presets of its model.
+        the checked configuration; ``data.root`` and ``data.body`` are made absolute, so that later
+        commands work from any folder. ``model_fields_set`` of its sections has the keys of
+        overrides, and those of a file that differ from the packaged presets of its model.
 
     Raises:
         DyngsError: naming the file and line or the override, the key, and what is allowed.
@@ -92,7 +98,9 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
     return config.model_copy(update={"data": data})
 
 
-def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | None = None) -> Config:
+def load_resolved(
+    path: Path, overrides: Iterable[str] = (), data_root: Path | None = None
+) -> Config:
     """Return the configuration of a finished or interrupted run.
 
     Args:
@@ -113,7 +121,9 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     leaves = read_file(file)
     layers.add(x for x in leaves if x.keys not in REMOVED_KEYS or x.value != REMOVED_KEYS[x.keys])
     if not layers.tree.get("data"):
-        raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
+        raise DyngsError(
+            f"{file}: does not say which capture the run was trained on (data.root); restore the file"
+        )
     if isinstance(layers.tree["data"], dict):
         layers.tree["data"]["follow_links"] = follows_links_of_runs()
     body = layers.value_at(("data", "body"))
@@ -125,34 +135,45 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     root = data_root or config.data.root
     if data_root is None and root == Path(str(stored_root)):
         return config
-    return config.model_copy(update={"data": config.data.model_copy(update={"root": root.absolute()})})
+    return config.model_copy(
+        update={"data": config.data.model_copy(update={"root": root.absolute()})}
+    )
 
 
 def save_config(config: Config, path: Path) -> None:
-    """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the new one.
+    """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the
+    new one.
 
     A ``data.body`` next to the file is written relative to it, so that their folder may be moved.
     """
     values = config.model_dump(mode="json")
-    body, beside = config.data.body, path.parent.absolute()
+    body = config.data.body
+    beside = path.parent.absolute()
     if body is not None and body.is_relative_to(beside):
         values["data"]["body"] = body.relative_to(beside).as_posix()
     text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
     if not _ODD_LINE_BREAKS.isdisjoint(text):
-        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)  # escapes, where YAML would fold them
+        # escapes, where YAML would fold them
+        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)
     write_text(path, text, durable=True)
 
 
 def find_preset(path: Path) -> Path:
-    """Return the preset file meant by ``path``: itself if it exists, else the packaged preset of that name.
+    """Return the preset file meant by ``path``: itself if it exists, else the packaged preset of
+    that name.
 
-    Only a bare name or one below ``configs/`` is looked for in the package, so that a mistyped path of the user's own
-    is an error. In a source checkout the package's presets are those in the repository's ``configs``.
+    Only a bare name or one below ``configs/`` is looked for in the package, so that a mistyped path
+    of the user's own is an error. In a source checkout the package's presets are those in the
+    repository's ``configs``.
     """
     if path.is_file() and command_for(path) is None:
         return path
     packaged = packaged_presets()
-    if path.parent.name in ("", "configs") and path.suffix in ("", ".yaml", ".yml") and path.stem in packaged:
+    if (
+        path.parent.name in ("", "configs")
+        and path.suffix in ("", ".yaml", ".yml")
+        and path.stem in packaged
+    ):
         return packaged[path.stem]
     found = command_for(path)
     if found is not None:
@@ -161,7 +182,9 @@ def find_preset(path: Path) -> Path:
         raise DyngsError(f"{path}: not a regular file; give a YAML preset")
     close = _close_presets(path.stem, packaged)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise DyngsError(f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}")
+    raise DyngsError(
+        f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}"
+    )
 
 
 def _close_presets(name: str, packaged: Iterable[str]) -> list[str]:
@@ -170,11 +193,16 @@ def _close_presets(name: str, packaged: Iterable[str]) -> list[str]:
     usual |= {"4dgs": "dynamic", "video": "dynamic", "avatar": "human", "body": "human"}
     names = sorted(packaged)
     within = [preset for preset in names if len(name) > 2 and name.lower() in preset]
-    return [usual[name.lower()]] if name.lower() in usual else get_close_matches(name, names, n=1) or within[:1]
+    return (
+        [usual[name.lower()]]
+        if name.lower() in usual
+        else get_close_matches(name, names, n=1) or within[:1]
+    )
 
 
 def _instead(path: Path) -> str:
-    """Return what ``path`` is if it is no run, and the command for it, to be followed by more; may be empty."""
+    """Return what ``path`` is if it is no run, and the command for it, to be followed by more; may
+    be empty."""
     if path.stem in packaged_presets() and not path.is_dir():
         return f"it is a configuration, for `dyngs train {as_word(path)} data.root=FOLDER`; "
     found = command_for(path)
@@ -182,7 +210,8 @@ def _instead(path: Path) -> str:
 
 
 def packaged_preset(name: str) -> Path:
-    """Return the file of the preset ``name`` that comes with dyngs. Raises DyngsError where there is none."""
+    """Return the file of the preset ``name`` that comes with dyngs. Raises DyngsError where there
+    is none."""
     packaged = packaged_presets()
     if name not in packaged:
         raise DyngsError(f"no packaged preset {name!r}; there are {', '.join(sorted(packaged))}")
@@ -191,7 +220,9 @@ def packaged_preset(name: str) -> Path:
 
 def packaged_presets() -> dict[str, Path]:
     package = Path(__file__).resolve().parents[1]
-    folder = next((f for f in (package / "configs", package.parent / "configs") if f.is_dir()), None)
+    folder = next(
+        (f for f in (package / "configs", package.parent / "configs") if f.is_dir()), None
+    )
     return {f.stem: f for f in sorted(folder.glob("*.yaml"))} if folder else {}
 
 
@@ -211,7 +242,9 @@ class _Layers:
         """Lay overrides over what is there, and return the keys that they set."""
         leaves = [leaf for text in overrides for leaf in read_override(text)]
         # what empties a section goes first, outer sections before inner ones
-        for leaf in sorted(leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))):
+        for leaf in sorted(
+            leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))
+        ):
             if leaf.keys[-1] == "kind":
                 self._drop_other_kind(leaf.keys[:-1], leaf.value)
             self._set(leaf)
@@ -229,18 +262,23 @@ class _Layers:
 
     def _set(self, leaf: Leaf) -> None:
         require_usable(leaf)
-        keys, value, section = leaf.keys, leaf.value, self.tree
+        keys = leaf.keys
+        value = leaf.value
+        section = self.tree
         for depth, key in enumerate(keys[:-1], start=1):
             inner = section.setdefault(key, {})
             if inner is None:
                 inner = section[key] = {}
             if not isinstance(inner, dict):
-                raise DyngsError(f"{leaf.origin}: {'.'.join(keys[:depth])} is a value, it has no key {keys[depth]!r}")
+                raise DyngsError(
+                    f"{leaf.origin}: {'.'.join(keys[:depth])} is a value, it has no key {keys[depth]!r}"
+                )
             section = inner
         if isinstance(value, str) and value.startswith("~/"):
             value = os.path.expanduser(value)
         section[keys[-1]] = value
-        self.origins[keys], self.written[keys] = leaf.origin, leaf.text
+        self.origins[keys] = leaf.origin
+        self.written[keys] = leaf.text
 
     def value_at(self, keys: tuple[str, ...]) -> Any:
         """The value or section at ``keys``; None where there is none."""
@@ -250,13 +288,15 @@ class _Layers:
         return node
 
     def origin_of(self, keys: tuple[str, ...]) -> str:
-        """Where the value at ``keys``, or else the first one below it, was written; "" if nowhere."""
+        """Where the value at ``keys``, or else the first one below it, was written; "" if
+        nowhere."""
         below = (origin for k, origin in self.origins.items() if k[: len(keys)] == keys)
         return self.origins.get(keys) or next(below, "")
 
 
 def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
-    """Return the keys of a preset file to which no packaged preset of the same ``model.kind`` gives the same value.
+    """Return the keys of a preset file to which no packaged preset of the same ``model.kind`` gives
+    the same value.
 
     A copy of a packaged preset is that preset: its user has requested nothing.
     """
@@ -266,12 +306,17 @@ def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
         packaged = _Layers()
         packaged.add(read_file(file))
         if packaged.value_at(("model", "kind")) == kind:
-            own -= {keys for keys in own & packaged.origins.keys() if packaged.value_at(keys) == layers.value_at(keys)}
+            own -= {
+                keys
+                for keys in own & packaged.origins.keys()
+                if packaged.value_at(keys) == layers.value_at(keys)
+            }
     return own
 
 
 def _fill_in_kinds(section: type[BaseModel], node: dict[str, Any]) -> None:
-    """Put an empty section where one is absent, and the default ``kind`` where a section with variants has none."""
+    """Put an empty section where one is absent, and the default ``kind`` where a section with
+    variants has none."""
     for name, info in section.model_fields.items():
         if section_classes(info):
             inner = node[name] = {} if node.get(name) is None else node[name]
@@ -288,7 +333,9 @@ def _validate(layers: _Layers) -> Config:
         _require_countable(config.model_dump(), (), layers)
         return config
     except ValidationError as error:
-        problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
+        problems = sorted(
+            error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden"
+        )
     if _take_as_text(layers, problems):
         return _validate(layers)
     others = len({keys_of_location(problem["loc"]) for problem in problems}) - 1
@@ -296,7 +343,9 @@ def _validate(layers: _Layers) -> Config:
     raise DyngsError(_explain(layers, problems[0]) + more)
 
 
-def _note_requested(section: BaseModel, above: tuple[str, ...], requested: set[tuple[str, ...]]) -> None:
+def _note_requested(
+    section: BaseModel, above: tuple[str, ...], requested: set[tuple[str, ...]]
+) -> None:
     """Leave only what was ``requested`` in ``model_fields_set`` of a section and those in it."""
     for name in type(section).model_fields:
         inner = getattr(section, name)
@@ -312,12 +361,18 @@ def _require_countable(section: dict[str, Any], above: tuple[str, ...], layers: 
         keys = (*above, key)
         if isinstance(value, dict):
             _require_countable(value, keys, layers)
-        elif any(isinstance(x, int) and abs(x) > MAX_WHOLE for x in (value if isinstance(value, tuple) else (value,))):
-            raise DyngsError(f"{layers.origin_of(keys)}: {'.'.join(keys)} must be below 2^63, not {_shorten(value)}")
+        elif any(
+            isinstance(x, int) and abs(x) > MAX_WHOLE
+            for x in (value if isinstance(value, tuple) else (value,))
+        ):
+            raise DyngsError(
+                f"{layers.origin_of(keys)}: {'.'.join(keys)} must be below 2^63, not {_shorten(value)}"
+            )
 
 
 def _take_as_text(layers: _Layers, problems: list[ErrorDetails]) -> bool:
-    """Replace numbers, dates and such by what was written where the schema wants text; True if anything changed."""
+    """Replace numbers, dates and such by what was written where the schema wants text; True if
+    anything changed."""
     changed = False
     for problem in problems:
         keys = keys_of_location(problem["loc"])
@@ -331,7 +386,8 @@ def _take_as_text(layers: _Layers, problems: list[ErrorDetails]) -> bool:
 def _explain(layers: _Layers, problem: ErrorDetails) -> str:
     keys = keys_of_location(problem["loc"])
     section = section_at(layers.tree, keys)
-    what, dotted = problem["type"], ".".join(keys)
+    what = problem["type"]
+    dotted = ".".join(keys)
     origin = layers.origin_of((*keys, "kind") if what == "union_tag_invalid" else keys)
     prefix = f"{origin}: " if origin else ""
     if what == "extra_forbidden":
@@ -341,23 +397,31 @@ def _explain(layers: _Layers, problem: ErrorDetails) -> str:
         example = "data.root=FOLDER" if dotted == "data.root" else f"{dotted}=..."
         return f"{prefix}{dotted} is missing ({info.description}); give {example}"
     if what in ("model_type", "model_attributes_type", "dict_type"):
-        inside = dict.fromkeys(key for variant in section_classes(info) for key in variant.model_fields)
+        inside = dict.fromkeys(
+            key for variant in section_classes(info) for key in variant.model_fields
+        )
         shown = [*inside][:MOST_KEYS]
         rest = ", ... (docs/cli.md has all)" if len(inside) > len(shown) else ""
         return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(shown)}{rest}"
     if what == "union_tag_invalid":
-        dotted, value, choices = f"{dotted}.kind", layers.value_at((*keys, "kind")), kinds_of(info)
+        dotted = f"{dotted}.kind"
+        value = layers.value_at((*keys, "kind"))
+        choices = kinds_of(info)
         allowed = f"one of {', '.join(choices)}"
     else:
-        value, choices, allowed = layers.value_at(keys), choices_of(info.annotation), allowed_values(info)
+        value = layers.value_at(keys)
+        choices = choices_of(info.annotation)
+        allowed = allowed_values(info)
     close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"{prefix}{dotted} must be {allowed}, not {_shorten(value)}{hint}"
 
 
 def _explain_unknown(layers: _Layers, keys: tuple[str, ...]) -> str:
-    """Return a message for a key that its section does not have: which kind has it, or which keys are similar."""
-    above, dotted = keys[:-1], ".".join(keys)
+    """Return a message for a key that its section does not have: which kind has it, or which keys
+    are similar."""
+    above = keys[:-1]
+    dotted = ".".join(keys)
     holder = section_at(layers.tree, above).model_fields.get(above[-1]) if above else None
     variants = section_classes(holder) if holder is not None else []
     owners = [str(v.model_fields["kind"].default) for v in variants if keys[-1] in v.model_fields]
@@ -377,7 +441,8 @@ def _shorten(value: object) -> str:
 
 
 def _did_you_mean_key(keys: tuple[str, ...], section: type[BaseModel], inside: bool) -> str:
-    """``; did you mean ...?`` with the nearest key: of ``section`` if ``inside``, else the same last word elsewhere."""
+    """``; did you mean ...?`` with the nearest key: of ``section`` if ``inside``, else the same
+    last word elsewhere."""
     everything = list(dict.fromkeys(key.name for key in config_keys()))
     dotted = ".".join(keys)
     siblings = get_close_matches(keys[-1], list(section.model_fields), n=1)

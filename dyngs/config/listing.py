@@ -1,4 +1,5 @@
-"""A configuration as YAML in which every key stands with its value, its default and what it means."""
+"""A configuration as YAML in which every key stands with its value, its default and what it
+means."""
 
 from __future__ import annotations
 
@@ -30,15 +31,23 @@ def listing(source: Path, overrides: list[str]) -> str:
     """
     if source.is_dir():
         return _text(load_resolved(source, overrides), True, str(source))
-    leaves = [*read_file(find_preset(source)), *(leaf for text in overrides for leaf in read_override(text))]
+    leaves = [
+        *read_file(find_preset(source)),
+        *(leaf for text in overrides for leaf in read_override(text)),
+    ]
     has_root = any(leaf.keys == ("data", "root") for leaf in leaves)
     config = load_config(source, overrides if has_root else [f"data.root={_NO_ROOT}", *overrides])
     return _text(config, has_root, str(source))
 
 
 def _text(config: Config, has_root: bool, source: str) -> str:
-    head = f"# {source!r} with every key; train with it: dyngs train THIS_FILE.yaml data.root=FOLDER"
-    lines = [head.encode("unicode_escape").decode("ascii"), *_section(config, config.model_dump(mode="json"), 0)]
+    head = (
+        f"# {source!r} with every key; train with it: dyngs train THIS_FILE.yaml data.root=FOLDER"
+    )
+    lines = [
+        head.encode("unicode_escape").decode("ascii"),
+        *_section(config, config.model_dump(mode="json"), 0),
+    ]
     text = "\n".join(lines) + "\n"
     return text if has_root else re.sub(r"\n  root: .*", f"\n  # root: {_NO_ROOT}", text, count=1)
 
@@ -46,7 +55,8 @@ def _text(config: Config, has_root: bool, source: str) -> str:
 def _section(section: BaseModel, values: dict[str, Any], depth: int) -> Iterator[str]:
     space = "  " * depth
     for name, info in type(section).model_fields.items():
-        is_section, about = bool(section_classes(info)), info.description or ""
+        is_section = bool(section_classes(info))
+        about = info.description or ""
         if is_section:
             yield "" if depth == 0 else f"{space}#"
             about = f"{about}; kind is one of {', '.join(kinds_of(info))}" if kinds_of(info) else ""
@@ -57,6 +67,9 @@ def _section(section: BaseModel, values: dict[str, Any], depth: int) -> Iterator
             yield f"{space}{name}:"
             yield from _section(getattr(section, name), values[name], depth + 1)
             continue
-        dumped = yaml.safe_dump(values[name], default_flow_style=True, width=10**6, allow_unicode=False)
-        shown, default = dumped.removesuffix("...\n").strip(), default_text(info)
+        dumped = yaml.safe_dump(
+            values[name], default_flow_style=True, width=10**6, allow_unicode=False
+        )
+        shown = dumped.removesuffix("...\n").strip()
+        default = default_text(info)
         yield f"{space}{name}: {shown}  # {f'default {default}' if default else 'required'}"

@@ -1,6 +1,8 @@
-"""Descriptions of the configuration keys: allowed values, default, meaning; and look-up of sections by kind.
+"""Descriptions of the configuration keys: allowed values, default, meaning; and look-up of sections
+by kind.
 
-Error messages and the table in docs/cli.md are generated from this, so that neither can disagree with ``dyngs.config``.
+Error messages and the table in docs/cli.md are generated from this, so that neither can disagree
+with ``dyngs.config``.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ class ConfigKey:
 
     Attributes:
         name: dotted, for instance ``train.steps``.
-        kinds: the variants that have the key, outermost first, as ``("dynamic", "mlp")``; empty where all have it.
+        kinds: the variants that have the key, outermost first, as ``("dynamic", "mlp")``; empty
+            where all have it.
         allowed: what it may be, in words.
         default: as YAML, "" where the key is required.
         description: one line.
@@ -41,36 +44,54 @@ class ConfigKey:
 def config_keys() -> list[ConfigKey]:
     """Return every key of ``Config`` in declaration order.
 
-    For a section with several kinds: first its ``kind``, then the keys that all kinds share, then those of each kind.
+    For a section with several kinds: first its ``kind``, then the keys that all kinds share, then
+    those of each kind.
     """
     return list(_keys_below(Config, ""))
 
 
 def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
-    """Yield the keys of ``section``, named with ``prefix``; their kinds are those of the sections inside it."""
+    """Yield the keys of ``section``, named with ``prefix``; their kinds are those of the sections
+    inside it."""
     for key, info in section.model_fields.items():
-        name, variants = prefix + key, section_classes(info)
+        name = prefix + key
+        variants = section_classes(info)
         if not variants:
-            yield ConfigKey(name, (), allowed_values(info), default_text(info), info.description or "")
+            yield ConfigKey(
+                name, (), allowed_values(info), default_text(info), info.description or ""
+            )
         elif len(variants) == 1:
             yield from _keys_below(variants[0], f"{name}.")
         else:
             yield _kind_key(name, info, variants)
-            tables = [[k for k in _keys_below(v, f"{name}.") if k.name != f"{name}.kind"] for v in variants]
+            tables = [
+                [k for k in _keys_below(v, f"{name}.") if k.name != f"{name}.kind"]
+                for v in variants
+            ]
             shared = [k for k in tables[0] if all(k in table for table in tables)]
             yield from shared
             kinds = [str(variant.model_fields["kind"].default) for variant in variants]
             for key in dict.fromkeys(k for table in tables for k in table if k not in shared):
-                owners = " or ".join(kind for kind, table in zip(kinds, tables, strict=True) if key in table)
+                owners = " or ".join(
+                    kind for kind, table in zip(kinds, tables, strict=True) if key in table
+                )
                 yield replace(key, kinds=(owners, *key.kinds))
 
 
 def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> ConfigKey:
     """Return the key ``kind`` of the section ``name``; its description says what each kind is."""
     kinds = [variant.model_fields["kind"] for variant in variants]
-    meanings = "; ".join(f"{', '.join(choices_of(kind.annotation))}: {kind.description}" for kind in kinds)
+    meanings = "; ".join(
+        f"{', '.join(choices_of(kind.annotation))}: {kind.description}" for kind in kinds
+    )
     description = f"{info.description}. {meanings}"
-    return ConfigKey(f"{name}.kind", (), f"one of {', '.join(kinds_of(info))}", info.get_default().kind, description)
+    return ConfigKey(
+        f"{name}.kind",
+        (),
+        f"one of {', '.join(kinds_of(info))}",
+        info.get_default().kind,
+        description,
+    )
 
 
 def keys_table() -> str:
@@ -86,17 +107,24 @@ def keys_table() -> str:
 
 
 def allowed_values(info: FieldInfo, plural: bool = False) -> str:
-    """Return the allowed values of a field in words: ``an integer >= 1``, ``one of white, black``."""
+    """Return the allowed values of a field in words: ``an integer >= 1``, ``one of white,
+    black``."""
     annotation = info.annotation
     optional = NoneType in get_args(annotation)
-    plain = next((a for a in get_args(annotation) if a is not NoneType), annotation) if optional else annotation
+    plain = (
+        next((a for a in get_args(annotation) if a is not NoneType), annotation)
+        if optional
+        else annotation
+    )
     one = {bool: "true or false", int: "an integer", float: "a number", str: "text", Path: "a path"}
     many = {bool: "true or false", int: "integers", float: "numbers", str: "texts", Path: "paths"}
     choices = choices_of(plain)
     if choices:
         text = choices[0] if len(choices) == 1 else f"one of {', '.join(choices)}"
     elif len(get_args(plain)) > 1 and get_origin(plain) in (Union, UnionType):
-        text = " or ".join(allowed_values(FieldInfo.from_annotation(option)) for option in get_args(plain))
+        text = " or ".join(
+            allowed_values(FieldInfo.from_annotation(option)) for option in get_args(plain)
+        )
     elif get_origin(plain) is tuple:
         some = any(getattr(item, "min_length", None) for item in info.metadata)
         items = allowed_values(FieldInfo.from_annotation(get_args(plain)[0]), plural=True)
@@ -134,7 +162,8 @@ def default_text(info: FieldInfo) -> str:
 
 
 def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
-    """Return the section classes that a field may hold: several for a section with a ``kind``, none for a value."""
+    """Return the section classes that a field may hold: several for a section with a ``kind``, none
+    for a value."""
     options = get_args(info.annotation) or (info.annotation,)
     return [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
 
@@ -142,11 +171,16 @@ def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
 def kinds_of(info: FieldInfo) -> list[str]:
     """Return the kinds that a section may have; empty where there is only one class."""
     variants = section_classes(info)
-    return [k for v in variants for k in choices_of(v.model_fields["kind"].annotation)] if len(variants) > 1 else []
+    return (
+        [k for v in variants for k in choices_of(v.model_fields["kind"].annotation)]
+        if len(variants) > 1
+        else []
+    )
 
 
 def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
-    """Return the class of a section of this ``kind``; the default one where there is no such kind."""
+    """Return the class of a section of this ``kind``; the default one where there is no such
+    kind."""
     variants = section_classes(info)
     if len(variants) == 1:
         return variants[0]
@@ -155,7 +189,8 @@ def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
 
 
 def section_at(tree: dict[str, Any], keys: tuple[str, ...]) -> type[BaseModel]:
-    """Return the class of the section that holds the last of ``keys`` (innermost known), by the kinds in ``tree``."""
+    """Return the class of the section that holds the last of ``keys`` (innermost known), by the
+    kinds in ``tree``."""
     section: type[BaseModel] = Config
     node: Any = tree
     for key in keys[:-1]:

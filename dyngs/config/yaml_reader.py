@@ -1,7 +1,8 @@
-"""Read YAML of presets and overrides as values with their origin (file, line); every YAML error becomes a DyngsError.
+"""Read YAML of presets and overrides as values with their origin (file, line); every YAML error
+becomes a DyngsError.
 
-A scalar that looks like a number or a date but is none (``2024-02-30``, ``0x_``, 5,000 digits) is read as text; the
-schema then says what it must be.
+A scalar that looks like a number or a date but is none (``2024-02-30``, ``0x_``, 5,000 digits) is
+read as text; the schema then says what it must be.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ _EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
 
 @dataclass(frozen=True)
 class Leaf:
-    """One value of a file or an override: its keys, its value, its text, and its origin for messages."""
+    """One value of a file or an override: its keys, its value, its text, and its origin for
+    messages."""
 
     keys: tuple[str, ...]
     value: Any
@@ -55,7 +57,9 @@ def read_file(path: Path) -> list[Leaf]:
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
     if len(data) > MAX_BYTES:
-        raise DyngsError(f"{path}: is larger than {MAX_BYTES // 2**10} KiB, no configuration is; give a YAML preset")
+        raise DyngsError(
+            f"{path}: is larger than {MAX_BYTES // 2**10} KiB, no configuration is; give a YAML preset"
+        )
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -65,7 +69,8 @@ def read_file(path: Path) -> list[Leaf]:
 
 @lru_cache(maxsize=16)
 def _leaves(text: str, origin: str) -> tuple[Leaf, ...]:
-    """Read the values of the text of a file; a command asks several times for those of the same run."""
+    """Read the values of the text of a file; a command asks several times for those of the same
+    run."""
     with _loaded(text, origin) as loader:
         root = loader.get_single_node()
         if root is None:
@@ -76,19 +81,24 @@ def _leaves(text: str, origin: str) -> tuple[Leaf, ...]:
 
 
 def read_override(text: str) -> list[Leaf]:
-    """Read the values that ``section.key=value`` sets: one, or several where it sets a full section."""
+    """Read the values that ``section.key=value`` sets: one, or several where it sets a full
+    section."""
     key, equals, written = (part.strip() for part in text.partition("="))
-    keys, origin = tuple(key.split(".")), printable(text, _SHOWN)
+    keys = tuple(key.split("."))
+    origin = printable(text, _SHOWN)
     if not equals or not all(re.fullmatch(r"\w+", k) for k in keys):
         shown = printable(repr(text), _SHOWN)
-        raise DyngsError(f"{shown} is not an override; write section.key=value, for instance train.steps=2000")
+        raise DyngsError(
+            f"{shown} is not an override; write section.key=value, for instance train.steps=2000"
+        )
     if len(written) > MAX_BYTES:
         raise DyngsError(f"{origin}: has {len(written)} characters; no value is as long")
     try:
         with _loaded(written, origin) as loader:
             node = loader.get_single_node()
             if isinstance(node, yaml.MappingNode) and not node.flow_style:
-                return [Leaf(keys, written, written, origin)]  # "10:", which only looks like a mapping
+                # "10:", which only looks like a mapping
+                return [Leaf(keys, written, written, origin)]
             if isinstance(node, yaml.MappingNode) and node.value:
                 return [replace(leaf, origin=origin) for leaf in _walk(loader, node, keys, origin)]
             value = None if node is None else loader.construct_object(node, deep=True)  # type: ignore[no-untyped-call]
@@ -102,7 +112,8 @@ class _NotYaml(DyngsError):
 
 
 class _PresetLoader(yaml.SafeLoader):
-    """Safe YAML without aliases, of limited depth, and with ``1e-4`` read as the number that it is."""
+    """Safe YAML without aliases, of limited depth, and with ``1e-4`` read as the number that it
+    is."""
 
     depth = 0
 
@@ -119,12 +130,16 @@ class _PresetLoader(yaml.SafeLoader):
             self.depth -= 1
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level > MAX_DEPTH:  # before composing: thousands of brackets take the scanner seconds
-            raise ComposerError(None, None, "nested too deeply for a configuration", self.get_mark())
+        if self.flow_level > MAX_DEPTH:
+            # before composing: thousands of brackets take the scanner seconds
+            raise ComposerError(
+                None, None, "nested too deeply for a configuration", self.get_mark()
+            )
         super().fetch_flow_collection_start(TokenClass)  # type: ignore[no-untyped-call]
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """Return the value of a node; its text where it only looks like a number or date, or is too large a number."""
+        """Return the value of a node; its text where it only looks like a number or date, or is too
+        large a number."""
         if not isinstance(node, yaml.ScalarNode):
             return super().construct_object(node, deep)  # type: ignore[no-untyped-call]
         is_number = node.tag in _NUMBER_TAGS
@@ -173,7 +188,12 @@ def _problem(error: Exception, text: str) -> str:
 
 
 def _walk(
-    loader: yaml.SafeLoader, node: yaml.MappingNode, above: tuple[str, ...], origin: str, *, lines: bool = False
+    loader: yaml.SafeLoader,
+    node: yaml.MappingNode,
+    above: tuple[str, ...],
+    origin: str,
+    *,
+    lines: bool = False,
 ) -> Iterator[Leaf]:
     seen: set[str] = set()
     for key_node, value_node in node.value:
@@ -183,7 +203,9 @@ def _walk(
         key = key_node.value
         shown = printable(key, _SHOWN)
         if "." in key:
-            raise DyngsError(f"{where}: {shown!r} must be nested in YAML: {shown.replace('.', ': {', 1)}: ...}}")
+            raise DyngsError(
+                f"{where}: {shown!r} must be nested in YAML: {shown.replace('.', ': {', 1)}: ...}}"
+            )
         if key in seen:
             dotted = printable(".".join((*above, key)), _SHOWN)
             raise DyngsError(f"{where}: duplicate key {dotted}; keep one of the two")
@@ -201,4 +223,6 @@ def require_usable(leaf: Leaf) -> None:
         try:
             require_name(leaf.value)
         except DyngsError as error:
-            raise DyngsError(f"{leaf.origin}: {printable('.'.join(leaf.keys), _SHOWN)}: {error}") from None
+            raise DyngsError(
+                f"{leaf.origin}: {printable('.'.join(leaf.keys), _SHOWN)}: {error}"
+            ) from None

@@ -1,1 +1,2 @@
-"""Captures: posed images of a scene on disk, their readers, preparation, inspection and loading for training."""
+"""Captures: posed images of a scene on disk, their readers, preparation, inspection and loading for
+training."""

@@ -1,6 +1,7 @@
 """Body parameters of captured people, one row per frame: checks, changes of frame, fitted files.
 
-Local letters: F frames, J joints, B shape coefficients. Bodies are those of SMPL (Loper et al. 2015) and its heirs.
+Local letters: F frames, J joints, B shape coefficients. Bodies are those of SMPL (Loper et al.
+2015) and its heirs.
 """
 
 from __future__ import annotations
@@ -11,7 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import BODY_KINDS, BodyFrames, Capture, Split, Splits, View, all_views, each_view
+from dyngs.data.capture import (
+    BODY_KINDS,
+    BodyFrames,
+    Capture,
+    Split,
+    Splits,
+    View,
+    all_views,
+    each_view,
+)
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import staying_within
 from dyngs.files.fields import LARGEST, first_few, float_array, numbers_of
@@ -27,9 +37,11 @@ def body_frames(
     scale: object = 1.0,
     turns: object = None,
 ) -> BodyFrames:
-    """Return checked body parameters, sorted by frame; arrays may have any shape with one row per frame.
+    """Return checked body parameters, sorted by frame; arrays may have any shape with one row per
+    frame.
 
-    Raises DyngsError: counts that differ, another width, NaN, a scale that is not positive, a frame twice.
+    Raises DyngsError: counts that differ, another width, NaN, a scale that is not positive, a frame
+    twice.
 
     Args:
         frames: F distinct numbers.
@@ -47,9 +59,13 @@ def body_frames(
     rows = _rows(where, "poses", poses, frames)
     if rows.shape[1] // 3 not in BODY_KINDS or rows.shape[1] % 3:
         wanted = ", ".join(f"{3 * joints} ({kind})" for joints, kind in BODY_KINDS.items())
-        raise DyngsError(f"{where}: 'poses' has {rows.shape[1]} numbers per frame; the known bodies have {wanted}")
+        raise DyngsError(
+            f"{where}: 'poses' has {rows.shape[1]} numbers per frame; the known bodies have {wanted}"
+        )
     scale = np.asarray(scale)
-    scales = _rows(where, "scale", np.full(len(frames), scale.item()) if scale.size == 1 else scale, frames, 1)
+    scales = _rows(
+        where, "scale", np.full(len(frames), scale.item()) if scale.size == 1 else scale, frames, 1
+    )
     if not (scales > 0).all():
         raise DyngsError(f"{where}: 'scale' must be positive; export the file again")
     return BodyFrames(
@@ -65,12 +81,14 @@ def body_frames(
 def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     """Return the same bodies with ``turns`` merged into the root joint's rotation.
 
-    The pelvis keeps its place in the world, ``scale * turn(j) + trans``, where j is the rest position of the fitted
-    body's pelvis if the files say it, else ``pelvis`` (3,), that of the shaped template that is to be posed. Hence the
-    root rotates by ``turn * poses[:, 0]``, and ``trans' = trans + scale * (turn(j) - pelvis)``.
+    The pelvis keeps its place in the world, ``scale * turn(j) + trans``, where j is the rest
+    position of the fitted body's pelvis if the files say it, else ``pelvis`` (3,), that of the
+    shaped template that is to be posed. Hence the root rotates by ``turn * poses[:, 0]``, and
+    ``trans' = trans + scale * (turn(j) - pelvis)``.
     """
     fitted = pelvis if body.pelvis is None else body.pelvis
-    poses, turned = body.poses, fitted
+    poses = body.poses
+    turned = fitted
     if body.turns is not None:
         from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
 
@@ -79,23 +97,35 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
         roots = (turns * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
         poses = np.concatenate([roots[:, None], poses[:, 1:]], axis=1)
     trans = body.trans + body.scale[:, None] * (turned - pelvis)
-    return replace(body, poses=poses, trans=trans, turns=None, pelvis=np.asarray(pelvis, dtype=np.float64))
+    return replace(
+        body, poses=poses, trans=trans, turns=None, pelvis=np.asarray(pelvis, dtype=np.float64)
+    )
 
 
 def moved(body: BodyFrames, shift: np.ndarray, factor: float) -> BodyFrames:
-    """Return the bodies of a world in which a point x is ``factor * (x - shift)``, with ``shift`` (3,)."""
+    """Return the bodies of a world in which a point x is ``factor * (x - shift)``, with ``shift``
+    (3,)."""
     return replace(body, trans=factor * (body.trans - shift), scale=factor * body.scale)
 
 
 def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
-    """Return (V,) the row of ``body`` for each view, by frame number; each must have one with parameters."""
+    """Return (V,) the row of ``body`` for each view, by frame number; each must have one with
+    parameters."""
     rows = {number: row for row, number in enumerate(body.frames)}
     found = []
     for view in views:
         if view.frame is None:
-            raise DyngsError(f"{where}: {view.image_path} has no frame number; give each image its 'frame'")
+            raise DyngsError(
+                f"{where}: {view.image_path} has no frame number; give each image its 'frame'"
+            )
         found.append(rows.get(view.frame, -1))
-    lacking = sorted({view.frame for view, row in zip(views, found, strict=True) if row < 0 and view.frame is not None})
+    lacking = sorted(
+        {
+            view.frame
+            for view, row in zip(views, found, strict=True)
+            if row < 0 and view.frame is not None
+        }
+    )
     if lacking:
         raise DyngsError(
             f"{where}: no body parameters for {len(lacking)} frames that have images ({first_few(lacking)}); the "
@@ -109,14 +139,20 @@ def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
     return {"train": body, "val": body, "test": body}
 
 
-def _rows(where: Path, name: str, value: object, frames: Sequence[int], width: int = 0) -> np.ndarray:
+def _rows(
+    where: Path, name: str, value: object, frames: Sequence[int], width: int = 0
+) -> np.ndarray:
     """(F, width) float64 numbers of at most ``LARGEST``, any width where that is 0."""
     array = float_array(value)
     if array is None:
-        raise DyngsError(f"{where}: '{name}' must hold as many numbers for each frame; export the file again")
+        raise DyngsError(
+            f"{where}: '{name}' must hold as many numbers for each frame; export the file again"
+        )
     if not array.ndim or len(array) != len(frames):
         count = len(array) if array.ndim else 1
-        raise DyngsError(f"{where}: '{name}' has {count} rows for {len(frames)} frames; export the file again")
+        raise DyngsError(
+            f"{where}: '{name}' has {count} rows for {len(frames)} frames; export the file again"
+        )
     array = array.reshape(len(frames), -1)
     if width and array.shape[1] != width:
         raise DyngsError(
@@ -125,7 +161,9 @@ def _rows(where: Path, name: str, value: object, frames: Sequence[int], width: i
     bad = ~(np.abs(array) <= LARGEST).all(axis=1)
     if bad.any():
         frame = frames[int(np.argmax(bad))]
-        raise DyngsError(f"{where}: '{name}' of frame {frame} holds NaN, infinite or huge numbers; repair or remove it")
+        raise DyngsError(
+            f"{where}: '{name}' of frame {frame} holds NaN, infinite or huge numbers; repair or remove it"
+        )
     return array
 
 
@@ -139,31 +177,42 @@ def _mean_row(where: Path, name: str, value: object, frames: Sequence[int]) -> n
 
 
 def read_body_file(path: Path) -> BodyFrames:
-    """Read body parameters: poses (F, 72, 156 or 165), trans (F, 3), betas and, if there, scale and ``frames`` (F,).
+    """Read body parameters: poses (F, 72, 156 or 165), trans (F, 3), betas and, if there, scale and
+    ``frames`` (F,).
 
-    Without ``frames``, row n is for frame n. ``surface_model_type`` "anny" says that betas are of the free template's
-    shape space, ``fitted_to`` which other template dyngs fitted.
+    Without ``frames``, row n is for frame n. ``surface_model_type`` "anny" says that betas are of
+    the free template's shape space, ``fitted_to`` which other template dyngs fitted.
     """
-    found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames", "fitted_to"))
+    found = read_npz(
+        path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames", "fitted_to")
+    )
     count = len(found["poses"]) if found["poses"].ndim else 0
     numbers = found.get("frames", np.arange(count))
     if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or len(numbers) != count:
-        raise DyngsError(f"{path}: 'frames' must hold one whole number for each row of 'poses'; export it again")
+        raise DyngsError(
+            f"{path}: 'frames' must hold one whole number for each row of 'poses'; export it again"
+        )
     frames = [int(number) for number in numbers]
-    body = body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
+    body = body_frames(
+        path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0)
+    )
     if str(found.get("surface_model_type")) == "anny":
         return replace(body, shape_space="anny")
     return replace(body, fitted_to=str(found.get("fitted_to", "")))
 
 
 def with_fitted_body(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and ``body_pose.npz`` if there."""
+    """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and
+    ``body_pose.npz`` if there."""
     if not (folder / "body_train.npz").is_file():
         raise DyngsError(
             f"{folder / 'body_train.npz'}: no such file (data.body); a fit that `dyngs train human` made comes back by "
             f"training with data.root={capture.root} into another run.dir"
         )
-    with staying_within(folder, False), reading(folder, "give a folder that `dyngs data fit` wrote"):
+    with (
+        staying_within(folder, False),
+        reading(folder, "give a folder that `dyngs data fit` wrote"),
+    ):
         train = read_body_file(folder / "body_train.npz")
         body: dict[Split, BodyFrames] = {"train": train, "val": train, "test": train}
         if (folder / "body_pose.npz").is_file():
@@ -175,7 +224,8 @@ def with_fitted_body(capture: Capture, folder: Path) -> Capture:
 
 
 def numbered(splits: Splits) -> Splits:
-    """Return the views with frame numbers; if any has none, all get them by the order of their times."""
+    """Return the views with frame numbers; if any has none, all get them by the order of their
+    times."""
     views = all_views(splits)
     if all(view.frame is not None for view in views):
         return splits

@@ -1,4 +1,5 @@
-"""Captures in memory: views with cameras, sparse points and body parameters; images stay on disk."""
+"""Captures in memory: views with cameras, sparse points and body parameters; images stay on
+disk."""
 
 from __future__ import annotations
 
@@ -24,9 +25,11 @@ class Lens:
     """Lens distortion of one view; images are undistorted to a pinhole on load.
 
     Attributes:
-        model: "none", "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (OpenCV equidistant k1..k4).
+        model: "none", "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (OpenCV equidistant
+            k1..k4).
         params: the coefficients, in OpenCV's order.
-        focal_ratio: focal length of the lens over that of the pinhole, which the view's intrinsics have.
+        focal_ratio: focal length of the lens over that of the pinhole, which the view's intrinsics
+            have.
     """
 
     model: Literal["none", "opencv", "fisheye"] = "none"
@@ -47,9 +50,10 @@ class Silhouette:
     """Mask of a person in an image, in a file.
 
     Attributes:
-        path: an image of the same size, or an HDF5 file whose data set ``masks`` (F, H, W) has a row per frame.
-        person: how the person's pixels are marked: "white" (grey levels are partial coverage), "black" (the inverse of
-            "white"), or "nonzero" (labels: everything but 0).
+        path: an image of the same size, or an HDF5 file whose data set ``masks`` (F, H, W) has a
+            row per frame.
+        person: how the person's pixels are marked: "white" (grey levels are partial coverage),
+            "black" (the inverse of "white"), or "nonzero" (labels: everything but 0).
         row: row of the data set, None for an image.
     """
 
@@ -64,8 +68,10 @@ class View:
 
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
-        image_path: image file; for a frame of a ``video`` the file it is decoded to, see ``images.frame_cache``.
-        cam_from_world: (4, 4) float64, OpenCV axes, in scene coordinates (see ``Capture.world_scale``).
+        image_path: image file; for a frame of a ``video`` the file it is decoded to, see
+            ``images.frame_cache``.
+        cam_from_world: (4, 4) float64, OpenCV axes, in scene coordinates (see
+            ``Capture.world_scale``).
         intrinsics: (3, 3) float64 in pixels of the *stored* image size.
         width, height: stored image size in pixels.
         camera_id: index of the physical camera.
@@ -78,7 +84,8 @@ class View:
         depth_scale: scene units in the unit of the files, which that of the depth map may be.
         motion_mask_path: white = moves; if ``motion_mask_labels``, all but 0 does.
         flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
-        exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one capture.
+        exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one
+            capture.
         shrunk: how many times smaller the file is than the image that it is a copy of.
     """
 
@@ -117,7 +124,9 @@ def all_views(splits: Mapping[Split, tuple[View, ...]]) -> list[View]:
 def by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]:
     """Return the views of each camera in order of time, cameras by their numbers."""
     found: dict[int, list[View]] = {}
-    for view in sorted(all_views(splits), key=lambda view: (view.camera_id, view.time or 0.0, view.name)):
+    for view in sorted(
+        all_views(splits), key=lambda view: (view.camera_id, view.time or 0.0, view.name)
+    ):
         found.setdefault(view.camera_id, []).append(view)
     return found
 
@@ -137,11 +146,12 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class BodyFrames:
-    """Body parameters of the frames of one clip, float64, in the world and the unit of the clip's cameras.
+    """Body parameters of the frames of one clip, float64, in the world and the unit of the clip's
+    cameras.
 
-    A point x of the shaped template at rest is mapped to ``scale * turn(LBS(x; poses)) + trans``. LBS rotates the whole
-    body by ``poses[:, 0]`` about the pelvis (joint 0), ``turn`` about the template's origin; ``about_pelvis`` merges
-    the two.
+    A point x of the shaped template at rest is mapped to ``scale * turn(LBS(x; poses)) + trans``.
+    LBS rotates the whole body by ``poses[:, 0]`` about the pelvis (joint 0), ``turn`` about the
+    template's origin; ``about_pelvis`` merges the two.
 
     Attributes:
         frames: (F,) ascending frame numbers, as in ``View.frame``.
@@ -150,9 +160,11 @@ class BodyFrames:
         betas: (B,) shape coefficients, in the shape space ``shape_space``.
         scale: (F,) world units per metre of the template, positive.
         turns: (F, 3) axis-angle, radians, rotation about the template's origin; None for none.
-        pelvis: (3,) rest position of the pelvis of the fitted body, None where the files do not say.
+        pelvis: (3,) rest position of the pelvis of the fitted body, None where the files do not
+            say.
         shape_space: that of ``betas``: of SMPL's family, or of the free template.
-        fitted_to: ``fingerprint`` of the template that dyngs fitted; empty for the free one and parameters of others.
+        fitted_to: ``fingerprint`` of the template that dyngs fitted; empty for the free one and
+            parameters of others.
     """
 
     frames: tuple[int, ...]
@@ -180,10 +192,13 @@ class Capture:
         format: as ``data.format`` has it.
         splits: split name to views, each tuple sorted by name; train is never empty.
         points: sparse points or None.
-        points_file: the .ply that the points are from, which is not known to fit the cameras; None for other points.
-        world_scale: power of two, length of a scene unit in the unit of the files. A point x in scene coordinates is
-            ``world_scale * x + world_offset`` in the files. See ``scene_space.normalise_capture``.
-        world_offset: (3,) float64 in the unit of the files; zero unless the scene lies far from its origin.
+        points_file: the .ply that the points are from, which is not known to fit the cameras; None
+            for other points.
+        world_scale: power of two, length of a scene unit in the unit of the files. A point x in
+            scene coordinates is ``world_scale * x + world_offset`` in the files. See
+            ``scene_space.normalise_capture``.
+        world_offset: (3,) float64 in the unit of the files; zero unless the scene lies far from its
+            origin.
         has_alpha: images carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people.
         fps: frames per second of the recording.
@@ -223,7 +238,8 @@ class CaptureFormat:
         files: the files by which it is recognised, for messages.
         recognise: whether a folder holds these files; opens none of them.
         read: reads the folder; ``dyngs.data.read`` then finishes splits and times.
-        extends: name of the format of which this one is a special case: its folders are recognised as that one, too.
+        extends: name of the format of which this one is a special case: its folders are recognised
+            as that one, too.
     """
 
     name: str

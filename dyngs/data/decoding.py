@@ -17,7 +17,8 @@ from dyngs.ops.device import Upload
 
 @dataclass(frozen=True)
 class Decoded:
-    """Pixels (H, W, 3 or 4) uint8, straight alpha, mask (H, W) bool, and maps as those of ``Image``."""
+    """Pixels (H, W, 3 or 4) uint8, straight alpha, mask (H, W) bool, and maps as those of
+    ``Image``."""
 
     pixels: Tensor
     mask: Tensor | None
@@ -44,7 +45,8 @@ Item = TypeVar("Item")
 
 
 class Ahead(Generic[Item]):
-    """Results that ``threads`` work on in the background, 0: none; none of them depends on when that is done."""
+    """Results that ``threads`` work on in the background, 0: none; none of them depends on when
+    that is done."""
 
     def __init__(self, work: Callable[[int], Item], threads: int) -> None:
         self._work, self._threads = work, threads
@@ -71,18 +73,24 @@ class Ahead(Generic[Item]):
         for index in expected:
             if index not in self._pending:
                 if self._pool is None:
-                    self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="dyngs-images")
+                    self._pool = ThreadPoolExecutor(
+                        self._threads, thread_name_prefix="dyngs-images"
+                    )
                 # the context holds which files may be opened, and how large images may be
                 self._pending[index] = self._pool.submit(copy_context().run, self._work, index)
 
     def rest(self) -> None:
-        """End the threads, and drop what they have done; they begin anew when something is expected."""
-        pool, self._pool, self._pending = self._pool, None, {}
+        """End the threads, and drop what they have done; they begin anew when something is
+        expected."""
+        pool = self._pool
+        self._pool = None
+        self._pending = {}
         if pool is not None and self._process == os.getpid():
             pool.shutdown(wait=True, cancel_futures=True)
 
     def take(self, index: int) -> Item | None:
-        """Return the item of ``index`` when it is ready, or raise what the work raised; None where not expected."""
+        """Return the item of ``index`` when it is ready, or raise what the work raised; None where
+        not expected."""
         found = self._pending.pop(index, None)
         return None if found is None or self._process != os.getpid() else found.result()
 

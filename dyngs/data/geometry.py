@@ -1,4 +1,5 @@
-"""Camera geometry: checks and changes of poses, pinhole matrices, projection, the point that cameras look at."""
+"""Camera geometry: checks and changes of poses, pinhole matrices, projection, the point that
+cameras look at."""
 
 from __future__ import annotations
 
@@ -17,19 +18,28 @@ ROTATION_TOLERANCE = 1e-3
 
 
 def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
-    """Return the rigid (4, 4) float64 transform nearest to ``matrix`` (4, 4) or (3, 4), in any convention.
+    """Return the rigid (4, 4) float64 transform nearest to ``matrix`` (4, 4) or (3, 4), in any
+    convention.
 
-    And by how much that was not rigid: the largest entry of ``|R^T R - I|``. Raises DyngsError: not finite, not a pose,
-    mirrored, scaled, or further than ``ROTATION_TOLERANCE`` from a rotation.
+    And by how much that was not rigid: the largest entry of ``|R^T R - I|``. Raises DyngsError: not
+    finite, not a pose, mirrored, scaled, or further than ``ROTATION_TOLERANCE`` from a rotation.
     """
     if matrix.shape not in ((4, 4), (3, 4)):
-        raise DyngsError(f"{where}: the pose must be a 4x4 matrix, got shape {matrix.shape}; export it again")
+        raise DyngsError(
+            f"{where}: the pose must be a 4x4 matrix, got shape {matrix.shape}; export it again"
+        )
     if not np.isfinite(matrix).all():
-        raise DyngsError(f"{where}: the pose holds NaN or infinite numbers; remove or repair this frame")
+        raise DyngsError(
+            f"{where}: the pose holds NaN or infinite numbers; remove or repair this frame"
+        )
     if np.abs(matrix).max() > LARGEST:
-        raise DyngsError(f"{where}: the pose holds numbers beyond {LARGEST:g}; use another unit or repair this frame")
+        raise DyngsError(
+            f"{where}: the pose holds numbers beyond {LARGEST:g}; use another unit or repair this frame"
+        )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise DyngsError(f"{where}: the last row of the pose must be 0 0 0 1; is the matrix transposed?")
+        raise DyngsError(
+            f"{where}: the last row of the pose must be 0 0 0 1; is the matrix transposed?"
+        )
     rotation = matrix[:3, :3].astype(np.float64)
     determinant = np.linalg.det(rotation)
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
@@ -43,7 +53,8 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
 
 
 def matrix_fault(matrix: np.ndarray, where: str) -> str | None:
-    """Return one line, beginning with ``where``, on why ``matrix`` is no rigid pose; None where it is."""
+    """Return one line, beginning with ``where``, on why ``matrix`` is no rigid pose; None where it
+    is."""
     try:
         checked_pose(matrix, where)
     except DyngsError as error:
@@ -57,7 +68,8 @@ def pose_fault(view: View) -> str | None:
 
 
 def cam_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
-    """Return the OpenCV ``cam_from_world`` of a rigid (4, 4) OpenGL camera-to-world pose: y up, z backward."""
+    """Return the OpenCV ``cam_from_world`` of a rigid (4, 4) OpenGL camera-to-world pose: y up, z
+    backward."""
     return inverse_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
 
 
@@ -80,12 +92,15 @@ def camera_center(cam_from_world: np.ndarray) -> np.ndarray:
 
 
 def repair_warning(errors: dict[str, float]) -> list[str]:
-    """Return one line about the rotations that were not orthonormal, by origin, as ``checked_pose`` says; or none."""
+    """Return one line about the rotations that were not orthonormal, by origin, as ``checked_pose``
+    says; or none."""
     off = {where: error for where, error in errors.items() if error > 1e-5}
     if not off:
         return []
     worst = max(off, key=lambda where: off[where])
-    return [f"{len(off)} rotations were not orthonormal and were repaired, the worst by {off[worst]:.1e} ({worst})"]
+    return [
+        f"{len(off)} rotations were not orthonormal and were repaired, the worst by {off[worst]:.1e} ({worst})"
+    ]
 
 
 def _rotation_fault(rotation: np.ndarray, determinant: float, error: float) -> str:
@@ -102,7 +117,8 @@ def _rotation_fault(rotation: np.ndarray, determinant: float, error: float) -> s
 MAX_SIDE = 2**20
 """Largest side of an image in pixels; more is taken for a mistake."""
 FOCAL_RANGE = (1e-4, 1e6)
-"""Plausible focal lengths, in units of the image's longer side: fields of view from 0.00006 to 179.99 degrees."""
+"""Plausible focal lengths, in units of the image's longer side: fields of view from 0.00006 to
+179.99 degrees."""
 
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
@@ -111,24 +127,28 @@ def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 
 
 def scaled_intrinsics(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray:
-    """Return the (3, 3) matrix for the image scaled by the two factors; exact, as pixel centres are at (0.5, 0.5)."""
+    """Return the (3, 3) matrix for the image scaled by the two factors; exact, as pixel centres are
+    at (0.5, 0.5)."""
     return np.diag([scale_x, scale_y, 1.0]) @ intrinsics
 
 
 def match_size(
     intrinsics: np.ndarray, described: tuple[int, int], stored: tuple[int, int] | None, where: str
 ) -> tuple[np.ndarray, tuple[int, int], bool]:
-    """Return the intrinsics for the stored image, its (width, height), and whether they were rescaled.
+    """Return the intrinsics for the stored image, its (width, height), and whether they were
+    rescaled.
 
-    From those of an image of ``described`` size; ``stored`` is that of the file, None where it could not be opened.
-    Raises DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal
-    point.
+    From those of an image of ``described`` size; ``stored`` is that of the file, None where it
+    could not be opened. Raises DyngsError: another aspect ratio, so that no rescaling is right; an
+    implausible focal length or principal point.
     """
     _check_plausible(intrinsics, described, where)
     if stored is None or stored == described:
         return intrinsics, described, False
-    scale_x, scale_y = stored[0] / described[0], stored[1] / described[1]
-    # Each side of a shrunk image was rounded to whole pixels: half a pixel either way is the same aspect.
+    scale_x = stored[0] / described[0]
+    scale_y = stored[1] / described[1]
+    # Each side of a shrunk image was rounded to whole pixels: half a pixel either way is the same
+    # aspect.
     slack = max(0.5 / stored[0], 0.5 / stored[1]) + 1e-9
     if abs(scale_x / scale_y - 1) > 2 * slack:
         rotated = " (rotated by its EXIF tag?)" if stored == described[::-1] else ""
@@ -141,7 +161,8 @@ def match_size(
 
 def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: str) -> None:
     side = max(described)
-    low, high = FOCAL_RANGE[0] * side, FOCAL_RANGE[1] * side
+    low = FOCAL_RANGE[0] * side
+    high = FOCAL_RANGE[1] * side
     fx, fy, *center = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if not (low <= fx <= high and low <= fy <= high):
         raise DyngsError(
@@ -149,14 +170,18 @@ def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: 
             "correct it, or the field of view that it follows from"
         )
     if not all(abs(x) <= high for x in center):
-        raise DyngsError(f"{where}: the principal point ({center[0]:g}, {center[1]:g}) px lies too far out; correct it")
+        raise DyngsError(
+            f"{where}: the principal point ({center[0]:g}, {center[1]:g}) px lies too far out; correct it"
+        )
 
 
 def rescale_warning(where: list[str]) -> list[str]:
     """Return one line about the images whose intrinsics were rescaled, none if there are none."""
     if not where:
         return []
-    return [f"{len(where)} images have another size than their intrinsics, which were rescaled; first {where[0]}"]
+    return [
+        f"{len(where)} images have another size than their intrinsics, which were rescaled; first {where[0]}"
+    ]
 
 
 NEAREST = 1e-9
@@ -164,13 +189,15 @@ NEAREST = 1e-9
 
 
 def projected(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of points (P, 3) in an image: (P, 2) in [0, 1] across and down, and (P,) if they lie in it.
+    """Return the positions of points (P, 3) in an image: (P, 2) in [0, 1] across and down, and (P,)
+    if they lie in it.
 
     As a pinhole camera sees them; positions of points that are not in the image mean nothing.
     """
     local = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
     in_front = local[:, 2] > NEAREST
-    k, depth = view.intrinsics, np.where(in_front, local[:, 2], 1.0)
+    k = view.intrinsics
+    depth = np.where(in_front, local[:, 2], 1.0)
     across = (k[0, 0] * local[:, 0] / depth + k[0, 2]) / view.width
     down = (k[1, 1] * local[:, 1] / depth + k[1, 2]) / view.height
     positions = np.stack([across, down], axis=1)
@@ -186,11 +213,13 @@ def times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
 
 
 def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
-    """Return the (3,) point nearest to all optical axes (least squares), None where they are nearly parallel.
+    """Return the (3,) point nearest to all optical axes (least squares), None where they are nearly
+    parallel.
 
     Of (V, 4, 4) rigid OpenCV poses; it may lie behind the cameras, see ``fraction_in_front``.
     """
-    centers, axes = world_from_cam[:, :3, 3], world_from_cam[:, :3, 2]
+    centers = world_from_cam[:, :3, 3]
+    axes = world_from_cam[:, :3, 2]
     middle = centers.mean(axis=0)
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal_matrix = projectors.mean(axis=0)
@@ -201,6 +230,7 @@ def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
 
 
 def fraction_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
-    """Return the fraction in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of them."""
+    """Return the fraction in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of
+    them."""
     depth = np.einsum("vi,vi->v", point - world_from_cam[:, :3, 3], world_from_cam[:, :3, 2])
     return float((depth > 0).mean())

@@ -1,4 +1,5 @@
-"""Images for training: decoded on demand, undistorted, downscaled, and cached within a memory limit."""
+"""Images for training: decoded on demand, undistorted, downscaled, and cached within a memory
+limit."""
 
 from __future__ import annotations
 
@@ -32,18 +33,22 @@ from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
 from dyngs.ops.device import CPU, gpu_memory, sent
 
-FULLY_KEPT = 1 - 1e-4  # mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
+# mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
+FULLY_KEPT = 1 - 1e-4
 
 GPU_FRACTION = 0.25
-"""Fraction of the free memory of a GPU that images may take: the rest is for the scene and what is drawn."""
+"""Fraction of the free memory of a GPU that images may take: the rest is for the scene and what is
+drawn."""
 
 _SMALL_BYTES = 4
-"""Bytes of a shrunk image, whose values are float32, per byte of the whole one and fraction of its pixels."""
+"""Bytes of a shrunk image, whose values are float32, per byte of the whole one and fraction of its
+pixels."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """The image of the view ``name`` with its camera, as a training target; what a view does not have is None.
+    """The image of the view ``name`` with its camera, as a training target; what a view does not
+    have is None.
 
     Attributes:
         cameras: one pinhole camera (V = 1) of this image's size, float32.
@@ -53,9 +58,11 @@ class Image:
         time: in [0, 1].
         frame: the view's frame number.
         moves: (H, W) float32, the fraction of each pixel that moves, by the motion mask.
-        labels: (H, W) int64, which thing moves there, 0 for none; of a motion mask that tells them apart.
+        labels: (H, W) int64, which thing moves there, 0 for none; of a motion mask that tells them
+            apart.
         depth: (H, W) float32 depth in the unit of its map, 0 where unknown.
-        flow: (H, W, 2) float32 displacement in pixels of this image up to the view ``flow_to``, NaN where unknown.
+        flow: (H, W, 2) float32 displacement in pixels of this image up to the view ``flow_to``, NaN
+            where unknown.
     """
 
     name: str
@@ -74,7 +81,9 @@ class Image:
         """Return the (H, W, 3) image over the colour ``background`` (3,)."""
         if self.alpha is None:
             return self.rgb_premultiplied
-        return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background.to(self.alpha.device)
+        return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background.to(
+            self.alpha.device
+        )
 
     def to(self, device: torch.device | str) -> Image:
         """Return the same image, with its camera, on another device."""
@@ -89,11 +98,13 @@ class Image:
         return {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
 
     def shrunk(self, factor: int) -> Image:
-        """Return the image with both sides divided by ``factor``, averaged over pixel areas, and its camera."""
+        """Return the image with both sides divided by ``factor``, averaged over pixel areas, and
+        its camera."""
         if factor == 1:
             return self
         old = self.cameras
-        width, height = max(1, round(old.width / factor)), max(1, round(old.height / factor))
+        width = max(1, round(old.width / factor))
+        height = max(1, round(old.height / factor))
         scale = old.intrinsics.new_tensor([width / old.width, height / old.height, 1.0])
         alpha, mask, moves = (
             None if x is None else area_downscale(x[..., None], width, height)[..., 0]
@@ -113,20 +124,26 @@ class Image:
 
     @staticmethod
     def _nearest(values: Tensor | None, width: int, height: int) -> Tensor | None:
-        return None if values is None else _nearest(values, image_maps.nearest_positions(width, height))
+        return (
+            None
+            if values is None
+            else _nearest(values, image_maps.nearest_positions(width, height))
+        )
 
 
 class ImageLoader:
-    """A sequence of images, decoded on demand or ahead of it; the first ones are cached up to ``options.cache_mb``.
+    """A sequence of images, decoded on demand or ahead of it; the first ones are cached up to
+    ``options.cache_mb``.
 
-    Once the cache is full, what is in it stays: where every image is requested once per epoch, in a new order each
-    time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
-    ahead or not. Safe to use from several threads. Images are decoded on the CPU. Those given out on a GPU are kept
-    there as far as a quarter of its free memory goes; the others are copied next to its work.
+    Once the cache is full, what is in it stays: where every image is requested once per epoch, in a
+    new order each time, the one used last is the one needed last. The same index always gives the
+    same bytes, cached or not, decoded ahead or not. Safe to use from several threads. Images are
+    decoded on the CPU. Those given out on a GPU are kept there as far as a quarter of its free
+    memory goes; the others are copied next to its work.
 
     Attributes:
-        corrected: returns the camera of an image, given the index of its view and its camera by the capture; None: the
-            latter.
+        corrected: returns the camera of an image, given the index of its view and its camera by the
+            capture; None: the latter.
     """
 
     def __init__(
@@ -137,13 +154,16 @@ class ImageLoader:
         with_maps: bool = False,
         decoding_threads: int = 0,
     ) -> None:
-        """Check every file (not every pixel) at once, so that a bad capture fails before training starts.
+        """Check every file (not every pixel) at once, so that a bad capture fails before training
+        starts.
 
         Args:
             views: one split of a capture.
-            options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count; None: the defaults.
+            options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count;
+                None: the defaults.
             with_maps: read depth maps and flow, too.
-            decoding_threads: decode what is to be expected in so many threads; none if ``cache_mb`` is 0.
+            decoding_threads: decode what is to be expected in so many threads; none if ``cache_mb``
+                is 0.
         """
         self._views = tuple(views)
         self._times = tuple(view.time for view in self._views)
@@ -180,8 +200,12 @@ class ImageLoader:
         self.rest()
         memory = gpu_memory(device)
         with self._lock:
-            self._on_gpu, self._gpu_bytes, self._small, self._small_bytes = {}, 0, {}, 0
-            self._device, self._gpu_room = device, math.inf if memory is None else GPU_FRACTION * memory[0]
+            self._on_gpu = {}
+            self._gpu_bytes = 0
+            self._small = {}
+            self._small_bytes = 0
+            self._device = device
+            self._gpu_room = math.inf if memory is None else GPU_FRACTION * memory[0]
             self._cameras_there = {}
 
     @property
@@ -241,15 +265,24 @@ class ImageLoader:
 
     def cameras(self) -> list[Cameras]:
         """Return the cameras of all images as they are by now, one each; no image is read."""
-        stored = [_camera_of(view, *size) for view, size in zip(self._views, self.sizes, strict=True)]
-        found = stored if self.corrected is None else [self.corrected(i, x) for i, x in enumerate(stored)]
+        stored = [
+            _camera_of(view, *size) for view, size in zip(self._views, self.sizes, strict=True)
+        ]
+        found = (
+            stored
+            if self.corrected is None
+            else [self.corrected(i, x) for i, x in enumerate(stored)]
+        )
         return [x.to(device=self.device) for x in found]
 
     def shrunk(self, index: int, factor: int) -> Image:
-        """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is left."""
+        """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is
+        left."""
         with self._lock:
             if factor != self._small_by:
-                self._small, self._small_by, self._small_bytes = {}, factor, 0
+                self._small = {}
+                self._small_by = factor
+                self._small_bytes = 0
         if factor == 1:
             return self[index]
         index %= len(self._views)
@@ -265,9 +298,14 @@ class ImageLoader:
         return self._with_camera(index, image)
 
     def expect(self, indices: Sequence[int]) -> None:
-        """Begin to decode the images that are requested next, in this order, as far as they are not cached."""
+        """Begin to decode the images that are requested next, in this order, as far as they are not
+        cached."""
         with self._lock:
-            missing = [i for i in indices if i not in self._kept and not (self._small_by > 1 and i in self._small)]
+            missing = [
+                i
+                for i in indices
+                if i not in self._kept and not (self._small_by > 1 and i in self._small)
+            ]
         self._ahead.expect(missing)
 
     def rest(self) -> None:
@@ -279,7 +317,9 @@ class ImageLoader:
         if all(view.motion_mask_path is None for view in self._views):
             return self
         views = [replace(view, motion_mask_path=None) for view in self._views]
-        return ImageLoader(views, self._options, with_maps=self._with_maps, decoding_threads=self._threads)
+        return ImageLoader(
+            views, self._options, with_maps=self._with_maps, decoding_threads=self._threads
+        )
 
     @property
     def decoded_ahead(self) -> int:
@@ -303,7 +343,8 @@ class ImageLoader:
 
     @property
     def bytes_to_come(self) -> int:
-        """Bytes that images will take, in the cache or decoded ahead, next to those that they take now."""
+        """Bytes that images will take, in the cache or decoded ahead, next to those that they take
+        now."""
         every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._options.cache_mb * 1e6))
         return max(every - self.cached_bytes, 0)
 
@@ -313,9 +354,12 @@ class ImageLoader:
         return 0 if self._device == CPU else int(min(self._bytes_of_all(), self._gpu_room))
 
     def _bytes_of_all(self) -> int:
-        """Return the bytes of all images once decoded; whether a file has alpha is not known, and taken as no."""
+        """Return the bytes of all images once decoded; whether a file has alpha is not known, and
+        taken as no."""
         sizes = zip(self._views, self.sizes, strict=True)
-        return sum(width * height * (3 + (view.mask_path is not None)) for view, (width, height) in sizes)
+        return sum(
+            width * height * (3 + (view.mask_path is not None)) for view, (width, height) in sizes
+        )
 
     @property
     def cached_bytes(self) -> int:
@@ -346,7 +390,8 @@ class ImageLoader:
         return there
 
     def _made_ready(self, index: int) -> tuple[Decoded, Callable[[], Decoded] | None]:
-        """Return the decoded image ``index``, and its copy that is on its way to a GPU, if there is one."""
+        """Return the decoded image ``index``, and its copy that is on its way to a GPU, if there is
+        one."""
         with self._lock:
             decoded = self._cache.get(index)
         if decoded is None:
@@ -355,7 +400,8 @@ class ImageLoader:
         return decoded, None if self._device == CPU else decoded.upload(self._device)
 
     def _keep(self, index: int, decoded: Decoded, there: Decoded) -> None:
-        """Keep an image where it is given out, if there is room; else, if that is a GPU, on the CPU."""
+        """Keep an image where it is given out, if there is room; else, if that is a GPU, on the
+        CPU."""
         if index not in self._kept and self._has_room(there.num_bytes):
             self._kept[index] = there
             if self._device == CPU:
@@ -373,10 +419,14 @@ class ImageLoader:
     def _has_room(self, size: int) -> bool:
         """Return whether an image of ``size`` bytes is to be kept where it is given out.
 
-        While images are shrunk, only where small and large ones fit together: the small ones are what is requested.
+        While images are shrunk, only where small and large ones fit together: the small ones are
+        what is requested.
         """
         left = len(self._views) - len(self._kept) - 1
-        if self._small_by > 1 and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > self._room:
+        if (
+            self._small_by > 1
+            and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > self._room
+        ):
             return False
         waiting = min(self._ahead.most, left) * size
         return self._taken + size + waiting <= self._room
@@ -397,15 +447,19 @@ class ImageLoader:
             small = area_downscale_uint8(pixels, *size)
         else:
             lens_map = self._lens_map(view)
-            small = straight_uint8(area_downscale(undistort(premultiplied(pixels), lens_map), *size))
+            small = straight_uint8(
+                area_downscale(undistort(premultiplied(pixels), lens_map), *size)
+            )
             mask = _undistorted_mask(mask, lens_map)
         if mask is not None:
-            # A pixel counts only if all that it covers is kept: otherwise masked colours would bleed in.
+            # A pixel counts only if all that it covers is kept: otherwise masked colours would
+            # bleed in.
             mask = area_downscale(mask.float()[..., None], *size)[..., 0] > FULLY_KEPT
         return Decoded(small, mask, **maps)
 
     def _maps(self, view: View, size: tuple[int, int]) -> dict[str, Tensor]:
-        """Return motion mask, depth and flow of a view, as far as it has them, for the image of ``size``."""
+        """Return motion mask, depth and flow of a view, as far as it has them, for the image of
+        ``size``."""
         maps: dict[str, Tensor] = {}
         lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
         if view.motion_mask_path is not None:
@@ -413,17 +467,25 @@ class ImageLoader:
             found = read(view.motion_mask_path)
             _require_size(view, view.motion_mask_path, found.shape, "motion mask")
             if view.motion_mask_labels:
-                positions = image_maps.nearest_positions(*size, None if lens_map is None else lens_map.grid)
+                positions = image_maps.nearest_positions(
+                    *size, None if lens_map is None else lens_map.grid
+                )
                 maps["labels"] = _nearest(found, positions)
             moves = (found != 0).float()
             if lens_map is not None:
                 moves = undistort(moves[..., None], lens_map)[..., 0]
             maps["moves"] = area_downscale(moves[..., None], *size)[..., 0]
         if self._with_maps and view.depth_path is not None:
-            positions = image_maps.nearest_positions(*size, None if lens_map is None else lens_map.grid)
-            maps["depth"] = view.depth_scale * _nearest(image_maps.read_depth(view.depth_path), positions)
+            positions = image_maps.nearest_positions(
+                *size, None if lens_map is None else lens_map.grid
+            )
+            maps["depth"] = view.depth_scale * _nearest(
+                image_maps.read_depth(view.depth_path), positions
+            )
             if lens_map is not None:
-                maps["depth"] *= _nearest(lens_map.valid.float(), image_maps.nearest_positions(*size))
+                maps["depth"] *= _nearest(
+                    lens_map.valid.float(), image_maps.nearest_positions(*size)
+                )
         if self._with_maps and view.flow_path is not None:
             flow = image_maps.read_flow(view.flow_path)
             _require_size(view, view.flow_path, flow.shape, "flow field")
@@ -431,7 +493,8 @@ class ImageLoader:
         return maps
 
     def _lens_map(self, view: View) -> LensMap:
-        """Return the undistortion map; only the last is cached: most captures have one camera, and maps are large."""
+        """Return the undistortion map; only the last is cached: most captures have one camera, and
+        maps are large."""
         key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
         last = self._last_map
         if last is None or last[0] != key:
@@ -444,15 +507,19 @@ def _camera_of(view: View, width: int, height: int) -> Cameras:
     """Return the camera of a view as an image of this size, by the capture."""
     intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
     pose, intrinsics = (
-        torch.as_tensor(x, dtype=torch.float32, device="cpu")[None] for x in (view.cam_from_world, intrinsics)
+        torch.as_tensor(x, dtype=torch.float32, device="cpu")[None]
+        for x in (view.cam_from_world, intrinsics)
     )
     return Cameras(pose, intrinsics, width, height)
 
 
 def check_files(views: Sequence[View]) -> None:
-    """Check that all images and masks of ``views`` exist, look complete and have the size of their view."""
+    """Check that all images and masks of ``views`` exist, look complete and have the size of their
+    view."""
     silhouettes = [view.silhouette.path for view in views if view.silhouette]
-    paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + silhouettes
+    paths = [
+        path for view in views for path in (view.image_path, view.mask_path) if path is not None
+    ] + silhouettes
     missing = next((path for path in paths if not path.is_file()), None)
     if missing is not None:
         is_image = any(view.image_path == missing for view in views)
@@ -484,7 +551,8 @@ def _nearest(values: Tensor, positions: Tensor) -> Tensor:
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:
-    """(H, W) bool mask of pixels inside the stored image with a kept neighbourhood; None if all are."""
+    """(H, W) bool mask of pixels inside the stored image with a kept neighbourhood; None if all
+    are."""
     keep = lens_map.valid
     if mask is not None:
         keep = keep & (undistort(mask.float()[..., None], lens_map)[..., 0] > 0.999)

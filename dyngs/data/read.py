@@ -11,7 +11,16 @@ import numpy as np
 from dyngs.config import DataConfig
 from dyngs.data import times
 from dyngs.data.body_frames import with_fitted_body
-from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View, all_views, each_view
+from dyngs.data.capture import (
+    Capture,
+    CaptureFormat,
+    Lens,
+    PointCloud,
+    Splits,
+    View,
+    all_views,
+    each_view,
+)
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
@@ -33,10 +42,16 @@ from dyngs.files.archive import is_archive, unpacked
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
 
-FARTHEST = 1e18  # points with larger coordinates are dropped as mistakes; their squares would not fit into float32
+# points with larger coordinates are dropped as mistakes; their squares would not fit into float32
+FARTHEST = 1e18
 
-_PRIORS = {"depth_path": "depth maps", "motion_mask_path": "motion masks", "flow_path": "flow fields"}
-"""Files of priors that a capture may name, none of them required: fields of views, and what they are called."""
+_PRIORS = {
+    "depth_path": "depth maps",
+    "motion_mask_path": "motion masks",
+    "flow_path": "flow fields",
+}
+"""Files of priors that a capture may name, none of them required: fields of views, and what they
+are called."""
 
 FORMATS: tuple[CaptureFormat, ...] = (
     blender.BODY_FORMAT,
@@ -55,16 +70,18 @@ FORMATS: tuple[CaptureFormat, ...] = (
     camera_folders.FORMAT,
     camera_folders.LLFF_FORMAT,
 )
-"""All formats, in the order in which a folder is tried: of several that are recognised the first one is read."""
+"""All formats, in the order in which a folder is tried: of several that are recognised the first
+one is read."""
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
     """Read the capture in a folder or a .zip; images are not decoded, only their headers are read.
 
-    Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and ``pose_frames`` those
-    of a person that become the split pose. Where the format names no test views, every ``test_every``-th image is
-    one. Times are scaled to [0, 1] over all splits. Poses, points and bodies are in scene coordinates, see
-    ``scene_space.normalise_capture``. The splits train, val and test are always present, val and test possibly empty.
+    Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and
+    ``pose_frames`` those of a person that become the split pose. Where the format names no test
+    views, every ``test_every``-th image is one. Times are scaled to [0, 1] over all splits. Poses,
+    points and bodies are in scene coordinates, see ``scene_space.normalise_capture``. The splits
+    train, val and test are always present, val and test possibly empty.
 
     Example::
 
@@ -76,12 +93,14 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         image.cameras, image.rgb_premultiplied  # what to render from, and what should come out
 
     Args:
-        source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and options such as ``frames``.
-        decode_videos: write the chosen frames of videos as image files, see ``images.frame_cache``; otherwise views
-            may name files that do not exist yet.
+        source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and options
+            such as ``frames``.
+        decode_videos: write the chosen frames of videos as image files, see ``images.frame_cache``;
+            otherwise views may name files that do not exist yet.
 
     Raises:
-        DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names the file.
+        DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names
+            the file.
     """
     options = source if isinstance(source, DataConfig) else DataConfig(root=Path(source))
     require_folder(options.root)
@@ -93,7 +112,10 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     with (
         staying_within(root, options.follow_links),
         images_up_to(options.max_megapixels),
-        reading(root, "one of its files is not as it should be (`dyngs --debug` shows where); export it again"),
+        reading(
+            root,
+            "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
+        ),
     ):
         capture = _finished(chosen.read(root), options, decode_videos)
     others = [other for other in found if other is not chosen and other.name != chosen.extends]
@@ -106,7 +128,11 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
 def require_folder(root: Path) -> None:
     """Check that the folder or the archive of a capture exists. Raises NoCaptureError."""
     if not root.is_dir() and not is_archive(root):
-        problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
+        problem = (
+            "is a file; give the folder that holds it"
+            if root.is_file()
+            else "no such folder; check data.root"
+        )
         raise NoCaptureError(f"{root}: {problem}")
 
 
@@ -138,7 +164,8 @@ def _is_recognised(folder: Path) -> bool:
 
 
 def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFormat:
-    """The format that ``options.format`` names, with "auto" the first one that was ``found`` in the folder."""
+    """The format that ``options.format`` names, with "auto" the first one that was ``found`` in the
+    folder."""
     if options.format == "auto":
         if not found:
             known = command_for(options.root, captures=False)
@@ -150,7 +177,9 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
     chosen = next(format for format in FORMATS if format.name == options.format)
     if chosen not in found:
         also = f"; but there is a {found[0].name} capture" if found else ""
-        raise DyngsError(f"{options.root}: no {chosen.name} capture, which would have {chosen.files}{also}")
+        raise DyngsError(
+            f"{options.root}: no {chosen.name} capture, which would have {chosen.files}{also}"
+        )
     return chosen
 
 
@@ -164,7 +193,9 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         _check_places(view)
     splits, tracks, absent = _present_priors(splits, capture.tracks_path)
     if decode_videos:
-        frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
+        frames = {
+            view.image_path: view.video for view in all_views(splits) if view.video is not None
+        }
         decode_frames(capture.root, frames, options.frame_cache_mb)
     lacking = _missing(splits)
     has_alpha, layers = _first_image(splits["train"])
@@ -179,7 +210,9 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         has_alpha=has_alpha,
         warnings=(*warnings, *lacking, *layers, *notes, *copies, *more, *absent),
     )
-    return normalise_capture(capture if options.body is None else with_fitted_body(capture, options.body))
+    return normalise_capture(
+        capture if options.body is None else with_fitted_body(capture, options.body)
+    )
 
 
 def _is_missing(view: View) -> bool:
@@ -190,7 +223,11 @@ def _missing(splits: Splits) -> list[str]:
     """Return a line on the images that are not there, none if all are."""
     views = all_views(splits)
     missing = [view.image_path for view in views if _is_missing(view)]
-    return [f"{len(missing)} of {len(views)} images are missing, first {missing[0]}"] if missing else []
+    return (
+        [f"{len(missing)} of {len(views)} images are missing, first {missing[0]}"]
+        if missing
+        else []
+    )
 
 
 def _without_missing(capture: Capture) -> Capture:
@@ -205,23 +242,32 @@ def _without_missing(capture: Capture) -> Capture:
 def require_images(capture: Capture) -> Capture:
     """Return the capture. Raises DyngsError with their number: images are missing."""
     for line in _missing(capture.splits):
-        raise DyngsError(f"{line}; restore them, or train on the others with data.skip_missing=true")
+        raise DyngsError(
+            f"{line}; restore them, or train on the others with data.skip_missing=true"
+        )
     return capture
 
 
 def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[str]]:
     """Return the capture with final splits and times, and lines about these."""
-    splits: Splits = {name: tuple(sorted(views, key=lambda view: view.name)) for name, views in capture.splits.items()}
+    splits: Splits = {
+        name: tuple(sorted(views, key=lambda view: view.name))
+        for name, views in capture.splits.items()
+    }
     if not splits.get("train"):
-        raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed images")
-    if capture.body is not None:  # people are drawn in the poses of their frames, which are found by their times
+        raise DyngsError(
+            f"{capture.root}: the {capture.format} capture has no training views; add posed images"
+        )
+    if capture.body is not None:
+        # people are drawn in the poses of their frames, which are found by their times
         splits = times.times_of_frames(splits)
     new_poses = splits.pop("pose", None)
     by_name: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
         splits, line = times.times_by_name(capture.root, splits, rate)
-        by_name, capture = [line], replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
+        by_name = [line]
+        capture = replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
             f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
@@ -239,15 +285,24 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
     splits, constant = times.still_if_constant(splits)
     notes += [*constant, *times.sequence_warnings(splits)]
     if options.pose_frames is not None:
-        capture, splits, new_poses = _with_poses_held_out(capture, splits, new_poses, options.pose_frames)
+        capture, splits, new_poses = _with_poses_held_out(
+            capture, splits, new_poses, options.pose_frames
+        )
     span = times.span_in_files(written, splits)
-    seconds = span[1] - span[0] if capture.in_seconds and span else times.clip_seconds(splits, capture.fps)
+    seconds = (
+        span[1] - span[0]
+        if capture.in_seconds and span
+        else times.clip_seconds(splits, capture.fps)
+    )
     if "test" not in splits:
-        views, every = splits["train"], options.test_every
+        views = splits["train"]
+        every = options.test_every
         splits["test"] = views[::every] if every else ()
         splits["train"] = tuple(view for i, view in enumerate(views) if not every or i % every)
         if not splits["train"]:
-            raise DyngsError(f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it")
+            raise DyngsError(
+                f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it"
+            )
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
@@ -270,9 +325,12 @@ def _wide(splits: Splits) -> Splits:
 def _with_poses_held_out(
     capture: Capture, splits: Splits, new_poses: tuple[View, ...] | None, frames: str
 ) -> tuple[Capture, Splits, tuple[View, ...]]:
-    """Return the capture and its splits without the times that ``frames`` selects, and the views of split pose."""
+    """Return the capture and its splits without the times that ``frames`` selects, and the views of
+    split pose."""
     if capture.body is None:
-        raise DyngsError(f"{capture.root}: data.pose_frames={frames} is for people; here are no body parameters")
+        raise DyngsError(
+            f"{capture.root}: data.pose_frames={frames} is for people; here are no body parameters"
+        )
     if new_poses is not None:
         raise DyngsError(
             f"{capture.root}: has a clip of new poses of its own; remove data.pose_frames={frames}, or the files of it"
@@ -299,7 +357,9 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
             )
     train = {view.image_path for view in splits["train"]}
     leaked = [view.name for view in splits["test"] if view.image_path in train]
-    return [f"{len(leaked)} test images are also training images, first {leaked[0]}"] if leaked else []
+    return (
+        [f"{len(leaked)} test images are also training images, first {leaked[0]}"] if leaked else []
+    )
 
 
 def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
@@ -311,7 +371,9 @@ def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
             header = read_header(view.image_path)
         except DyngsError:
             continue
-        return header.has_alpha, [f"the layer {header.layer} of EXR images is read"] if header.layer else []
+        return header.has_alpha, [
+            f"the layer {header.layer} of EXR images is read"
+        ] if header.layer else []
     return False, []
 
 
@@ -320,22 +382,30 @@ def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[s
         return None, []
     keep = (np.abs(points.xyz) < FARTHEST).all(axis=1)
     lost = int((~keep).sum())
-    notes = [f"{lost} points hold NaN, infinite or far too large numbers and are ignored"] if lost else []
+    notes = (
+        [f"{lost} points hold NaN, infinite or far too large numbers and are ignored"]
+        if lost
+        else []
+    )
     points = PointCloud(points.xyz[keep], points.rgb[keep])
     return (points if len(points.xyz) else None), notes
 
 
 def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path | None, list[str]]:
-    """Return the splits and the tracks without priors whose files are missing, and a line for each kind of those."""
+    """Return the splits and the tracks without priors whose files are missing, and a line for each
+    kind of those."""
     notes: list[str] = []
     for field, kind in _PRIORS.items():
         paths = [path for view in all_views(splits) if (path := getattr(view, field)) is not None]
         missing = {path for path in paths if not path.is_file()}
         if not missing:
             continue
-        notes.append(f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}")
+        notes.append(
+            f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}"
+        )
         splits = each_view(
-            splits, lambda v, at=field, no=missing: replace(v, **{at: None}) if getattr(v, at) in no else v
+            splits,
+            lambda v, at=field, no=missing: replace(v, **{at: None}) if getattr(v, at) in no else v,
         )
     if tracks is not None and not inside(tracks).is_file():
         return splits, None, [*notes, f"the tracks {tracks} are missing and are not used"]

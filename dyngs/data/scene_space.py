@@ -1,4 +1,5 @@
-"""Where a scene lies: the space that its cameras see, and moving it to the origin if that is far away."""
+"""Where a scene lies: the space that its cameras see, and moving it to the origin if that is far
+away."""
 
 from __future__ import annotations
 
@@ -10,27 +11,37 @@ import numpy as np
 
 from dyngs.data.body_frames import moved
 from dyngs.data.capture import Capture, PointCloud, View, all_views, each_view
-from dyngs.data.geometry import camera_center, focus_point, fraction_in_front, inverse_rigid, times_seen
+from dyngs.data.geometry import (
+    camera_center,
+    focus_point,
+    fraction_in_front,
+    inverse_rigid,
+    times_seen,
+)
 from dyngs.data.times import evenly_spaced
 from dyngs.section import Length
 
 NEAR_PER_FOCUS = 0.25  # nearest depth, in distances from the cameras to what they look at
 FAR_PER_BASELINE = 38.0
-"""Farthest depth, in the largest distance between cameras: from there it is seen under 1.5 degrees, COLMAP's least."""
+"""Farthest depth, in the largest distance between cameras: from there it is seen under 1.5 degrees,
+COLMAP's least."""
 MIN_VIEWS = 3
 """Images that see a random point, where there are as many."""
 COUNTED_VIEWS = 60  # views, evenly spaced, in which points are counted
-CUBE_PER_EXTENT = 0.25  # 3DGS: 1.3 units in NeRF-synthetic scenes, whose cameras have an extent of 5.2
+# 3DGS: 1.3 units in NeRF-synthetic scenes, whose cameras have an extent of 5.2
+CUBE_PER_EXTENT = 0.25
 MIN_CUBE_SEEN = 0.5  # fraction of a cube that two cameras must see for the scene to lie in it
 
 
 def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
-    """Return the nearest and the farthest depth, in world units, at which the cameras can tell depth.
+    """Return the nearest and the farthest depth, in world units, at which the cameras can tell
+    depth.
 
-    The nearest is ``NEAR_PER_FOCUS`` times the median distance of the cameras to the point that they look at; where the
-    axes are parallel or part, times the largest distance between cameras. The farthest is ``FAR_PER_BASELINE`` times
-    that distance, and at least twice the distance to the point. With all cameras at one place nothing can be told, and
-    the bounds are those of cameras a unit apart.
+    The nearest is ``NEAR_PER_FOCUS`` times the median distance of the cameras to the point that
+    they look at; where the axes are parallel or part, times the largest distance between cameras.
+    The farthest is ``FAR_PER_BASELINE`` times that distance, and at least twice the distance to the
+    point. With all cameras at one place nothing can be told, and the bounds are those of cameras a
+    unit apart.
     """
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
@@ -43,17 +54,20 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
 
 
 def points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return candidates (P, 3) for random points, and in how many of up to ``COUNTED_VIEWS`` views each lies.
+    """Return candidates (P, 3) for random points, and in how many of up to ``COUNTED_VIEWS`` views
+    each lies.
 
-    Each lies anywhere in the image of a random view; its inverse depth is uniform between ``depth_bounds``. ``unit``
-    (P, 4) float64, uniform in [0, 1), says the view, the position across and down, the depth.
+    Each lies anywhere in the image of a random view; its inverse depth is uniform between
+    ``depth_bounds``. ``unit`` (P, 4) float64, uniform in [0, 1), says the view, the position across
+    and down, the depth.
     """
     near, far = depth_bounds(views)
     depth = 1 / (1 / far + unit[:, 3] * (1 / near - 1 / far))
     chosen = np.minimum((unit[:, 0] * len(views)).astype(int), len(views) - 1)
     points = np.empty((len(unit), 3))
     for i in np.unique(chosen):
-        rows, view = chosen == i, views[i]
+        rows = chosen == i
+        view = views[i]
         pixels = unit[rows, 1:3] * (view.width, view.height)
         rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(view.intrinsics).T
         rotation = view.cam_from_world[:3, :3]
@@ -70,17 +84,24 @@ def cube_half_side(half_extent: Length, views: Sequence[View], world_scale: floa
 
 
 def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
-    """Return why the scene cannot lie in the cube around the origin, in a few words; None where it may.
+    """Return why the scene cannot lie in the cube around the origin, in a few words; None where it
+    may.
 
-    It does not where the point that the cameras look at is outside, or where two cameras (one, if there is one) see
-    less than ``MIN_CUBE_SEEN`` of the cube. Half its side is ``half_extent``.
+    It does not where the point that the cameras look at is outside, or where two cameras (one, if
+    there is one) see less than ``MIN_CUBE_SEEN`` of the cube. Half its side is ``half_extent``.
     """
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     focus = focus_point(poses)
-    if focus is not None and fraction_in_front(poses, focus) > 0.5 and np.abs(focus).max() > half_extent:
+    if (
+        focus is not None
+        and fraction_in_front(poses, focus) > 0.5
+        and np.abs(focus).max() > half_extent
+    ):
         return f"the cameras look at ({', '.join(f'{x:.3g}' for x in focus)})"
     steps = (np.arange(8) + 0.5) / 4 - 1
-    grid = half_extent * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = half_extent * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
     seen = (times_seen(grid, views) >= min(2, len(views))).mean()
     if seen < MIN_CUBE_SEEN:
         return f"the cameras see {seen:.0%} of the cube of half side {half_extent:g} around it"
@@ -89,32 +110,35 @@ def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
 
 EXTENT_MARGIN = 1.1
 SMALLEST_EXTENT = 3.25
-"""Normalised scenes have an extent from this to twice as much: those of NeRF-synthetic scenes (5.2) and of many COLMAP
-models lie between, so that these keep their own unit."""
+"""Normalised scenes have an extent from this to twice as much: those of NeRF-synthetic scenes (5.2)
+and of many COLMAP models lie between, so that these keep their own unit."""
 TYPICAL_EXTENT = 4.6  # Middle of that range
 MAX_DISTANCE = 100.0
-"""Distance from the origin, in extents, from which a scene is moved there: float32 is 0.01 px coarse at a focal length
-of 1,000 px."""
+"""Distance from the origin, in extents, from which a scene is moved there: float32 is 0.01 px
+coarse at a focal length of 1,000 px."""
 DEPTH_PER_EXTENT = 20.0  # Median depth of the points, in extents, beyond which the depth decides
 ROUNDING = 1e-8  # Relative error of a position written with eight digits
-NEGLIGIBLE = 1e-3  # Extent, in median depths of the points, below which the cameras tell nothing about lengths
+# Extent, in median depths of the points, below which the cameras tell nothing about lengths
+NEGLIGIBLE = 1e-3
 
 
 def extent_of(centers: np.ndarray) -> float:
-    """Return 1.1 x the largest distance of a camera centre, of (V, 3), to their mean; 0 where that is rounding."""
+    """Return 1.1 x the largest distance of a camera centre, of (V, 3), to their mean; 0 where that
+    is rounding."""
     offsets = centers - centers.mean(axis=0)
     largest = float(np.linalg.norm(offsets, axis=1).max())
     return EXTENT_MARGIN * largest if largest > ROUNDING * float(np.abs(centers).max()) else 0.0
 
 
 def normalise_capture(capture: Capture) -> Capture:
-    """Return the capture in scene coordinates: near the origin, and in a unit in which thresholds are meaningful.
+    """Return the capture in scene coordinates: near the origin, and in a unit in which thresholds
+    are meaningful.
 
-    The unit is the power of two of the files' unit in which the extent of all cameras is at least ``SMALLEST_EXTENT``
-    and less than twice that; for a person it is about a metre. A power of two changes no digit of a coordinate. Where
-    the median camera is farther than ``MAX_DISTANCE`` extents from the origin, the point that the cameras look at
-    becomes the origin, or the median camera where they look at none. See ``Capture.world_scale`` and
-    ``Capture.world_offset``.
+    The unit is the power of two of the files' unit in which the extent of all cameras is at least
+    ``SMALLEST_EXTENT`` and less than twice that; for a person it is about a metre. A power of two
+    changes no digit of a coordinate. Where the median camera is farther than ``MAX_DISTANCE``
+    extents from the origin, the point that the cameras look at becomes the origin, or the median
+    camera where they look at none. See ``Capture.world_scale`` and ``Capture.world_offset``.
     """
     poses = np.array([inverse_rigid(view.cam_from_world) for view in all_views(capture.splits)])
     centers = poses[:, :3, 3]
@@ -122,10 +146,17 @@ def normalise_capture(capture: Capture) -> Capture:
     length = _length(capture, centers)
     distance = float(np.linalg.norm(median))
     if distance > MAX_DISTANCE * (length or distance):
-        focus, origin = focus_point(poses), median
-        if focus is not None and fraction_in_front(poses, focus) > 0.5 and np.linalg.norm(focus - median) < length:
+        focus = focus_point(poses)
+        origin = median
+        if (
+            focus is not None
+            and fraction_in_front(poses, focus) > 0.5
+            and np.linalg.norm(focus - median) < length
+        ):
             origin = focus
-        capture = change_coordinates(capture, capture.world_scale, origin * capture.world_scale + capture.world_offset)
+        capture = change_coordinates(
+            capture, capture.world_scale, origin * capture.world_scale + capture.world_offset
+        )
     if not length:
         return capture
     scale = 2.0 ** math.floor(math.log2(length / SMALLEST_EXTENT))
@@ -133,7 +164,8 @@ def normalise_capture(capture: Capture) -> Capture:
 
 
 def _length(capture: Capture, centers: np.ndarray) -> float:
-    """Return the length that is to become ``SMALLEST_EXTENT`` or up to twice as much; 0 where nothing tells one.
+    """Return the length that is to become ``SMALLEST_EXTENT`` or up to twice as much; 0 where
+    nothing tells one.
 
     ``centers`` (V, 3) of all cameras.
     """
@@ -147,8 +179,11 @@ def _length(capture: Capture, centers: np.ndarray) -> float:
     return depth if extent < NEGLIGIBLE * depth else max(extent, depth / DEPTH_PER_EXTENT)
 
 
-def change_coordinates(capture: Capture, scale: float, offset: Sequence[float] | np.ndarray) -> Capture:
-    """Return the capture in other scene coordinates, with this ``world_scale`` and ``world_offset`` (3,)."""
+def change_coordinates(
+    capture: Capture, scale: float, offset: Sequence[float] | np.ndarray
+) -> Capture:
+    """Return the capture in other scene coordinates, with this ``world_scale`` and ``world_offset``
+    (3,)."""
     offset = np.asarray(offset, np.float64)
     if scale == capture.world_scale and (offset == capture.world_offset).all():
         return capture
@@ -164,7 +199,9 @@ def change_coordinates(capture: Capture, scale: float, offset: Sequence[float] |
         pose[:3, 3] = factor * translation
         return replace(view, cam_from_world=pose, depth_scale=factor * view.depth_scale)
 
-    points = capture.points and PointCloud(factor * (capture.points.xyz - shift), capture.points.rgb)
+    points = capture.points and PointCloud(
+        factor * (capture.points.xyz - shift), capture.points.rgb
+    )
     body = capture.body and {name: moved(x, shift, factor) for name, x in capture.body.items()}
     return replace(
         capture,

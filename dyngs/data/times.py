@@ -1,6 +1,8 @@
-"""Times of views: where they are from, their scale of [0, 1], which are selected, and who sees what when.
+"""Times of views: where they are from, their scale of [0, 1], which are selected, and who sees what
+when.
 
-Times are from the fields of a capture, ``times.json``, frame numbers, or names. Their order in files does not matter.
+Times are from the fields of a capture, ``times.json``, frame numbers, or names. Their order in
+files does not matter.
 """
 
 from __future__ import annotations
@@ -27,19 +29,23 @@ SECONDS_FILE = "times.json"
 SAME_TIME = 1e-6
 """Times closer than this are the same time: files of one capture are often rounded differently."""
 SAME_POSE = 1e-5
-"""Entries of rotations, and positions in distances of the farthest camera from the mean one, up to which poses of a
-camera that does not move differ by rounding: 0.01 px at a focal length of 1,000 px."""
+"""Entries of rotations, and positions in distances of the farthest camera from the mean one, up to
+which poses of a camera that does not move differ by rounding: 0.01 px at a focal length of 1,000
+px."""
 MENTIONED_CHANGE = 0.05
-"""Times that are scaled by less than this are not mentioned: the last of n times is often written as (n - 1) / n."""
+"""Times that are scaled by less than this are not mentioned: the last of n times is often written
+as (n - 1) / n."""
 SCATTERED = 0.5
-"""Distance between cameras that follow each other in time, in medians of the distance of any two, from which time and
-viewpoint have nothing to do with each other."""
+"""Distance between cameras that follow each other in time, in medians of the distance of any two,
+from which time and viewpoint have nothing to do with each other."""
 MOST_STEPS, MOST_IMAGES, FEWEST_STEPS = 300, 4000, 2
-"""Time steps of several videos (those of the usual clips of ten seconds) and images of all together, at most, unless a
-number is given; and time steps at least."""
-SAME_STEP = 0.2  # frames within this fraction of a frame's duration of a time step count as taken at it
+"""Time steps of several videos (those of the usual clips of ten seconds) and images of all
+together, at most, unless a number is given; and time steps at least."""
+# frames within this fraction of a frame's duration of a time step count as taken at it
+SAME_STEP = 0.2
 _MAX_NAMED = 5
-_EVEN = 1.1  # longest over shortest gap of evenly spaced times, with allowance for rounding in the files
+# longest over shortest gap of evenly spaced times, with allowance for rounding in the files
+_EVEN = 1.1
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -61,31 +67,43 @@ def read_seconds(root: Path) -> dict[str, float]:
         return {}
     seconds = read_json_object(path).get("seconds")
     if not isinstance(seconds, dict):
-        raise DyngsError(f"{path}: needs an object 'seconds' of image names and seconds; see docs/formats.md")
+        raise DyngsError(
+            f"{path}: needs an object 'seconds' of image names and seconds; see docs/formats.md"
+        )
     for name, second in seconds.items():
         if not is_number(second):
-            raise DyngsError(f"{path}: the second of {name:.60} must be a number, got {second!r:.40}")
+            raise DyngsError(
+                f"{path}: the second of {name:.60} must be a number, got {second!r:.40}"
+            )
     return {str(name): float(second) for name, second in seconds.items()}
 
 
-def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
+def times_by_name(
+    root: Path, splits: Splits, per_second: float | None = None
+) -> tuple[Splits, str]:
     """Return the views with times by their names, and a line that says how.
 
-    Where the name of every image ends in a number, and no two of a folder in the same, that number is the time: frames
-    that are missing leave gaps. Otherwise times are positions in the order of the names, numbers in them read as
-    numbers. Each folder is a camera; the same numbers, or positions, in another one are the same times. With
-    ``per_second``, so many of them are a second. Raises DyngsError: fewer than two images, or folders with different
-    numbers of images and names without numbers.
+    Where the name of every image ends in a number, and no two of a folder in the same, that number
+    is the time: frames that are missing leave gaps. Otherwise times are positions in the order of
+    the names, numbers in them read as numbers. Each folder is a camera; the same numbers, or
+    positions, in another one are the same times. With ``per_second``, so many of them are a second.
+    Raises DyngsError: fewer than two images, or folders with different numbers of images and names
+    without numbers.
     """
     views = all_views(splits)
     if len(views) < 2:
-        raise DyngsError(f"{root}: data.times=order needs two images or more, there is {len(views)}")
+        raise DyngsError(
+            f"{root}: data.times=order needs two images or more, there is {len(views)}"
+        )
     folders: dict[Path, list[View]] = defaultdict(list)
     for view in views:
         folders[view.image_path.parent].append(view)
     numbers = {view.name: re.search(r"\d{1,15}$", view.image_path.stem) for view in views}
     known = {name: float(found[0]) for name, found in numbers.items() if found}
-    if all(len({known.get(view.name) for view in seen} - {None}) == len(seen) for seen in folders.values()):
+    if all(
+        len({known.get(view.name) for view in seen} - {None}) == len(seen)
+        for seen in folders.values()
+    ):
         times = known
         line = f"times are the numbers in the names of the images, from {min(times.values()):g} to "
         line += f"{max(times.values()):g} (data.times=order"
@@ -96,24 +114,37 @@ def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -
             raise DyngsError(
                 f"{root}: data.times=order: folders hold {counts} images; end the names in the numbers of the frames"
             )
-        orders = [sorted(seen, key=lambda view: natural_order(view.image_path.name)) for seen in folders.values()]
-        times = {view.name: float(position) for order in orders for position, view in enumerate(order)}
+        orders = [
+            sorted(seen, key=lambda view: natural_order(view.image_path.name))
+            for seen in folders.values()
+        ]
+        times = {
+            view.name: float(position) for order in orders for position, view in enumerate(order)
+        }
         line = f"times are the order of the names, {orders[0][0].name} first (data.times=order"
     if per_second is not None:
         length = (max(times.values()) - min(times.values())) / per_second
         line += f" at {per_second:g} per second: {length:.4g} s"
-    return each_view(splits, lambda view: replace(view, time=times[view.name] / (per_second or 1.0))), line + ")"
+    return each_view(
+        splits, lambda view: replace(view, time=times[view.name] / (per_second or 1.0))
+    ), line + ")"
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
     """Return a key by which 9 sorts before 10."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in _DIGITS.split(name) if part]
+    return [
+        (0, int(part), "") if part.isdecimal() else (1, 0, part)
+        for part in _DIGITS.split(name)
+        if part
+    ]
 
 
 def times_of_frames(splits: Splits) -> Splits:
-    """Return the splits with times by frame number where no view has a time and all have a frame, of several.
+    """Return the splits with times by frame number where no view has a time and all have a frame,
+    of several.
 
-    The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its own.
+    The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its
+    own.
     """
     timed: Splits = {}
     for is_pose in (False, True):
@@ -121,40 +152,55 @@ def times_of_frames(splits: Splits) -> Splits:
         views = all_views(own)
         frames = {view.frame for view in views if view.frame is not None}
         if len(frames) > 1 and all(view.frame is not None and view.time is None for view in views):
-            first, span = min(frames), max(frames) - min(frames)
-            own = each_view(own, lambda v, at=first, of=span: replace(v, time=((v.frame or 0) - at) / of))
+            first = min(frames)
+            span = max(frames) - min(frames)
+            own = each_view(
+                own, lambda v, at=first, of=span: replace(v, time=((v.frame or 0) - at) / of)
+            )
         timed |= own
     return timed
 
 
 def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
-    """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for all splits.
+    """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for
+    all splits.
 
-    Times that are all equal are left as they are, see ``still_if_constant``; without ``stretch`` all within [0, 1] are.
-    Raises DyngsError: a time that is no finite number, or some views with and some without a time; names the view.
+    Times that are all equal are left as they are, see ``still_if_constant``; without ``stretch``
+    all within [0, 1] are. Raises DyngsError: a time that is no finite number, or some views with
+    and some without a time; names the view.
     """
     views = all_views(splits)
     for view in views:
         if view.time is not None and not (is_number(view.time) and math.isfinite(view.time)):
-            raise DyngsError(f"{root}: the time of {view.name} must be a finite number, got {view.time!r:.40}")
+            raise DyngsError(
+                f"{root}: the time of {view.name} must be a finite number, got {view.time!r:.40}"
+            )
     timed = [view.time for view in views if view.time is not None]
     if not timed:
         return splits, []
     if len(timed) < len(views):
         untimed = next(view.name for view in views if view.time is None)
-        raise DyngsError(f"{root}: {untimed} has no time although other images have; give time for all or none")
-    first, last = min(timed), max(timed)
+        raise DyngsError(
+            f"{root}: {untimed} has no time although other images have; give time for all or none"
+        )
+    first = min(timed)
+    last = max(timed)
     within = first >= 0 and last <= 1
-    if first == last or (within and (not stretch or (first, last) == (0, 1) or last - first <= SAME_TIME)):
+    if first == last or (
+        within and (not stretch or (first, last) == (0, 1) or last - first <= SAME_TIME)
+    ):
         return splits, []
-    scaled = each_view(splits, lambda view: replace(view, time=((view.time or 0.0) - first) / (last - first)))
+    scaled = each_view(
+        splits, lambda view: replace(view, time=((view.time or 0.0) - first) / (last - first))
+    )
     if within and max(first, 1 - last) < MENTIONED_CHANGE:
         return scaled, []
     return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
 
 
 def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the splits without times, and a warning, if all of several images have the same time."""
+    """Return the splits without times, and a warning, if all of several images have the same
+    time."""
     views = all_views(splits)
     times = {view.time for view in views}
     if len(times) != 1 or times == {None}:
@@ -167,16 +213,21 @@ def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
 
 
 def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
-    """Return the first and the last time of the ``kept`` views as ``written`` in the files; None without times."""
+    """Return the first and the last time of the ``kept`` views as ``written`` in the files; None
+    without times."""
     names = {view.name for view in all_views(kept) if view.time is not None}
-    times = [view.time for view in all_views(written) if view.time is not None and view.name in names]
+    times = [
+        view.time for view in all_views(written) if view.time is not None and view.name in names
+    ]
     return (min(times), max(times)) if times else None
 
 
 def clip_seconds(splits: Splits, fps: float | None) -> float | None:
-    """Return the seconds from time 0 to time 1 at ``fps`` frames per second, None where they are not known.
+    """Return the seconds from time 0 to time 1 at ``fps`` frames per second, None where they are
+    not known.
 
-    From the frame numbers where all views have one, else from the number of times where these are evenly spaced.
+    From the frame numbers where all views have one, else from the number of times where these are
+    evenly spaced.
     """
     views = all_views(splits)
     times = sorted(set(distinct_times(views).values()))
@@ -204,10 +255,15 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
 
 
 def parse_frames(text: str, key: str = "data.frames") -> slice:
-    """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at ``key``."""
+    """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at
+    ``key``."""
     shown = printable(repr(text), 60)
-    if not re.fullmatch(r"\s*([-+]?\d+)?\s*:\s*([-+]?\d+)?\s*(:\s*([-+]?\d+)?\s*)?", text, re.ASCII):
-        raise DyngsError(f"{key}={shown}: write start:stop or start:stop:step in whole numbers, such as 0:100:2")
+    if not re.fullmatch(
+        r"\s*([-+]?\d+)?\s*:\s*([-+]?\d+)?\s*(:\s*([-+]?\d+)?\s*)?", text, re.ASCII
+    ):
+        raise DyngsError(
+            f"{key}={shown}: write start:stop or start:stop:step in whole numbers, such as 0:100:2"
+        )
     numbers = [int(part) if part.strip() else None for part in text.split(":")]
     if len(numbers) == 3 and numbers[2] == 0:
         raise DyngsError(f"{key}={shown}: the step must not be 0")
@@ -215,10 +271,11 @@ def parse_frames(text: str, key: str = "data.frames") -> slice:
 
 
 def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
-    """Return the views at the times that the slice ``frames`` selects from the sorted distinct times of all splits.
+    """Return the views at the times that the slice ``frames`` selects from the sorted distinct
+    times of all splits.
 
-    The first selected time becomes 0 and the last one 1; a single one becomes 0. Raises DyngsError: a bad slice, one
-    that selects no time or no training view, or views without times.
+    The first selected time becomes 0 and the last one 1; a single one becomes 0. Raises DyngsError:
+    a bad slice, one that selects no time or no training view, or views without times.
     """
     distinct, picked = _picked_times(root, splits, frames, "data.frames")
     selected = _at_times(splits, distinct, picked)
@@ -231,16 +288,19 @@ def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
 
 
 def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tuple[View, ...]]:
-    """Return the splits without the times that the slice ``frames`` selects, and the views at these times.
+    """Return the splits without the times that the slice ``frames`` selects, and the views at these
+    times.
 
-    Where some cameras only have test views, the second are those of these cameras; otherwise those of all splits. Times
-    of both parts are scaled to [0, 1], as two clips. Raises DyngsError: a bad slice, one that selects no time or all
-    times with training views, or views without times.
+    Where some cameras only have test views, the second are those of these cameras; otherwise those
+    of all splits. Times of both parts are scaled to [0, 1], as two clips. Raises DyngsError: a bad
+    slice, one that selects no time or all times with training views, or views without times.
     """
     distinct, picked = _picked_times(root, splits, frames, "data.pose_frames")
     kept = _at_times(splits, distinct, sorted(set(distinct.values()) - set(picked)))
     if not kept["train"]:
-        raise DyngsError(f"{root}: data.pose_frames={frames} leaves no training views; hold out fewer frames")
+        raise DyngsError(
+            f"{root}: data.pose_frames={frames} leaves no training views; hold out fewer frames"
+        )
     trained = {view.camera_id for view in splits["train"]}
     others = {view.camera_id for view in splits.get("test", ())} - trained
     held = all_views(_at_times(splits, distinct, picked))
@@ -248,7 +308,8 @@ def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tu
 
 
 def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Splits:
-    """Return the views of the splits anew: those of ``cameras`` for training, those of all others for testing."""
+    """Return the views of the splits anew: those of ``cameras`` for training, those of all others
+    for testing."""
     views = all_views(splits)
     known = sorted({view.camera_id for view in views})
     unknown = sorted(set(cameras) - set(known))
@@ -259,18 +320,24 @@ def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Split
             f"{known[-1]}"
         )
     if set(known) == set(cameras):
-        raise DyngsError(f"{root}: data.train_cameras=[{shown}] are all cameras of the capture; leave one for testing")
+        raise DyngsError(
+            f"{root}: data.train_cameras=[{shown}] are all cameras of the capture; leave one for testing"
+        )
     return {
         "train": tuple(view for view in views if view.camera_id in cameras),
         "test": tuple(view for view in views if view.camera_id not in cameras),
     }
 
 
-def _picked_times(root: Path, splits: Splits, frames: str, key: str) -> tuple[dict[float, float], list[float]]:
+def _picked_times(
+    root: Path, splits: Splits, frames: str, key: str
+) -> tuple[dict[float, float], list[float]]:
     part = parse_frames(frames, key)
     views = all_views(splits)
     if any(view.time is None for view in views):
-        raise DyngsError(f"{root}: {key}={frames} picks times, but the capture has none; remove {key}")
+        raise DyngsError(
+            f"{root}: {key}={frames} picks times, but the capture has none; remove {key}"
+        )
     distinct = distinct_times(views)
     times = sorted(set(distinct.values()))
     picked = sorted(times[part])
@@ -280,15 +347,20 @@ def _picked_times(root: Path, splits: Splits, frames: str, key: str) -> tuple[di
 
 
 def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[float]) -> Splits:
-    """Return the views at the ``picked`` times, ascending, of which the first becomes 0 and the last one 1."""
+    """Return the views at the ``picked`` times, ascending, of which the first becomes 0 and the
+    last one 1."""
     span = picked[-1] - picked[0] if picked else 0.0
     new = {time: (time - picked[0]) / span if span else 0.0 for time in picked}
     unit = {written: new[time] for written, time in distinct.items() if time in new}
-    return {name: tuple(replace(v, time=unit[v.time]) for v in kept if v.time in unit) for name, kept in splits.items()}
+    return {
+        name: tuple(replace(v, time=unit[v.time]) for v in kept if v.time in unit)
+        for name, kept in splits.items()
+    }
 
 
 def number_cameras(splits: Splits) -> Splits:
-    """Return the views with a number for each camera, where they share one although they are of several cameras.
+    """Return the views with a number for each camera, where they share one although they are of
+    several cameras.
 
     These are cameras that do not move: each pose repeats at another time, up to rounding, and some
     times are seen from several poses. The views of a camera get exactly one pose.
@@ -306,13 +378,16 @@ def number_cameras(splits: Splits) -> Splits:
 
     def numbered(view: View) -> View:
         first = firsts[view.name]
-        return replace(view, camera_id=cameras.index(first), cam_from_world=views[first].cam_from_world)
+        return replace(
+            view, camera_id=cameras.index(first), cam_from_world=views[first].cam_from_world
+        )
 
     return each_view(splits, numbered)
 
 
 def _first_of_pose(views: Sequence[View]) -> list[int]:
-    """Return for each view the index of the first one with its pose; only up to a pose for every two views."""
+    """Return for each view the index of the first one with its pose; only up to a pose for every
+    two views."""
     poses = np.stack([inverse_rigid(view.cam_from_world)[:3] for view in views])
     centers = poses[:, :, 3] - poses[:, :, 3].mean(axis=0)
     poses[:, :, 3] = centers / (np.linalg.norm(centers, axis=1).max() or 1.0)
@@ -329,14 +404,18 @@ def _first_of_pose(views: Sequence[View]) -> list[int]:
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
-    """Return indices of views, in order of time, for each static camera with images at several times.
+    """Return indices of views, in order of time, for each static camera with images at several
+    times.
 
-    A camera is a pose, intrinsics, a lens and a size; of several views of one time the first is taken.
+    A camera is a pose, intrinsics, a lens and a size; of several views of one time the first is
+    taken.
     """
     cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
     for i, view in enumerate(views):
         if view.time is not None:
-            pose, intrinsics = (x.round(9).tobytes() for x in (view.cam_from_world, view.intrinsics))
+            pose, intrinsics = (
+                x.round(9).tobytes() for x in (view.cam_from_world, view.intrinsics)
+            )
             cameras[pose, intrinsics, view.lens, view.width, view.height].setdefault(view.time, i)
     return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]
 
@@ -350,7 +429,8 @@ def are_scattered(views: Sequence[View]) -> bool:
 
 
 def videos(views: Sequence[View]) -> list[list[int]]:
-    """Return indices of views, in order of time, for each video: of a fixed camera, or of the one that moves.
+    """Return indices of views, in order of time, for each video: of a fixed camera, or of the one
+    that moves.
 
     No video where views without a common camera jump about in time.
     """
@@ -359,12 +439,17 @@ def videos(views: Sequence[View]) -> list[list[int]]:
         return fixed
     times = [view.time for view in views if view.time is not None]
     order = sorted(range(len(views)), key=lambda i: views[i].time or 0.0)
-    is_one = len(views) > 2 and len(set(times)) == len(views) and not are_scattered([views[i] for i in order])
+    is_one = (
+        len(views) > 2
+        and len(set(times)) == len(views)
+        and not are_scattered([views[i] for i in order])
+    )
     return [order] if is_one else []
 
 
 def sequence_warnings(splits: Splits) -> list[str]:
-    """Return warnings of images with one camera, pose and time, and of cameras with different numbers of frames."""
+    """Return warnings of images with one camera, pose and time, and of cameras with different
+    numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
     return [*_repeated(views), *_frame_counts(views)]
 
@@ -372,7 +457,9 @@ def sequence_warnings(splits: Splits) -> list[str]:
 def _repeated(views: list[View]) -> list[str]:
     images: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
     for view in views:
-        images[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(view.image_path, view)
+        images[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(
+            view.image_path, view
+        )
     doubled = [list(same.values()) for same in images.values() if len(same) > 1]
     if not doubled:
         return []
@@ -400,7 +487,9 @@ def _frame_counts(views: list[View]) -> list[str]:
 
 def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
     """Name cameras for messages: by the folder if a camera has one of its own, else by number."""
-    folders = {camera: {view.name.rpartition("/")[0] for view in seen} for camera, seen in cameras.items()}
+    folders = {
+        camera: {view.name.rpartition("/")[0] for view in seen} for camera, seen in cameras.items()
+    }
     firsts = {camera: min(names) for camera, names in folders.items()}
     own = Counter(firsts.values())
     return {
@@ -413,7 +502,8 @@ def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
 
 @dataclass(frozen=True)
 class Taken:
-    """Frames taken of one video: their ``numbers`` (K,), ascending, and ``seconds`` (K,) in the clock of all videos."""
+    """Frames taken of one video: their ``numbers`` (K,), ascending, and ``seconds`` (K,) in the
+    clock of all videos."""
 
     numbers: np.ndarray
     seconds: np.ndarray
@@ -422,16 +512,21 @@ class Taken:
 def taken_frames(
     where: Path, clocks: Sequence[np.ndarray], rates: Sequence[float], most: int | None = None
 ) -> tuple[list[Taken], str]:
-    """Return the frames of each video at the time steps that all of them show, and a line on how many.
+    """Return the frames of each video at the time steps that all of them show, and a line on how
+    many.
 
-    Time steps are frames of the video with the fewest per second. Of the others the nearest frame is taken, at its own
-    time if that differs. Raises DyngsError: no two time steps that all videos show.
+    Time steps are frames of the video with the fewest per second. Of the others the nearest frame
+    is taken, at its own time if that differs. Raises DyngsError: no two time steps that all videos
+    show.
 
     Args:
-        clocks: of each video the seconds (F,) of its frames, in one clock; ``rates``: frames per second.
-        most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many cameras.
+        clocks: of each video the seconds (F,) of its frames, in one clock; ``rates``: frames per
+            second.
+        most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many
+            cameras.
     """
-    first, last = max(clock[0] for clock in clocks), min(clock[-1] for clock in clocks)
+    first = max(clock[0] for clock in clocks)
+    last = min(clock[-1] for clock in clocks)
     slowest = min(range(len(clocks)), key=lambda i: (rates[i], i))
     slack = 0.5 / rates[slowest]
     steps = clocks[slowest][(clocks[slowest] >= first - slack) & (clocks[slowest] <= last + slack)]
@@ -442,7 +537,9 @@ def taken_frames(
         )
     limit = max(min(MOST_STEPS, MOST_IMAGES // len(clocks)), FEWEST_STEPS) if most is None else most
     chosen = steps[evenly_spaced(len(steps), limit)]
-    taken = [_nearest(clock, chosen, SAME_STEP / rate) for clock, rate in zip(clocks, rates, strict=True)]
+    taken = [
+        _nearest(clock, chosen, SAME_STEP / rate) for clock, rate in zip(clocks, rates, strict=True)
+    ]
     line = f"{len(chosen)} time steps of {chosen[-1] - chosen[0]:.2f} s that all {len(clocks)} cameras show"
     if len(chosen) < len(steps):
         line += f", of {len(steps)} (--frames of `dyngs data sfm` chooses)"

@@ -23,7 +23,8 @@ class ImageTracks:
 
     Attributes:
         names: (F,) names of views, or their ``file_path`` as the capture's files have it.
-        xy: (F, P, 2) float32 in pixels of the stored images; the centre of the first pixel is (0.5, 0.5).
+        xy: (F, P, 2) float32 in pixels of the stored images; the centre of the first pixel is (0.5,
+            0.5).
         visible: (F, P) bool; where a point is not seen, ``xy`` means nothing.
     """
 
@@ -34,34 +35,59 @@ class ImageTracks:
     def rows_of(self, views: Sequence[View]) -> dict[str, int]:
         """Return the row of each view that the tracks name, by the view's name."""
         rows = {_plain(name): row for row, name in enumerate(self.names)}
-        shorter = {name.rpartition(".")[0]: row for name, row in rows.items() if "." in name.rpartition("/")[2]}
+        shorter = {
+            name.rpartition(".")[0]: row
+            for name, row in rows.items()
+            if "." in name.rpartition("/")[2]
+        }
         found = {view.name: rows.get(view.name, shorter.get(view.name)) for view in views}
         return {name: row for name, row in found.items() if row is not None}
 
 
 def read_tracks(path: Path) -> ImageTracks:
-    """Read tracks from a ``.npz`` with the arrays of ``ImageTracks``; positions that are not finite are not visible."""
+    """Read tracks from a ``.npz`` with the arrays of ``ImageTracks``; positions that are not finite
+    are not visible."""
     if not path.is_file():
         raise DyngsError(f"{path}: no such tracks; restore them or remove tracks_file_path")
     arrays = read_npz(path, ("xy", "visible", "names"))
-    xy, visible, names = arrays["xy"], arrays["visible"], arrays["names"]
-    fits = xy.ndim == 3 and xy.shape[2] == 2 and visible.shape == xy.shape[:2] and names.shape == xy.shape[:1]
-    if not fits or xy.dtype.kind not in "fiu" or visible.dtype.kind not in "biuf" or names.dtype.kind not in "US":
+    xy = arrays["xy"]
+    visible = arrays["visible"]
+    names = arrays["names"]
+    fits = (
+        xy.ndim == 3
+        and xy.shape[2] == 2
+        and visible.shape == xy.shape[:2]
+        and names.shape == xy.shape[:1]
+    )
+    if (
+        not fits
+        or xy.dtype.kind not in "fiu"
+        or visible.dtype.kind not in "biuf"
+        or names.dtype.kind not in "US"
+    ):
         raise DyngsError(
             f"{path}: must hold xy (F, P, 2), visible (F, P) and names (F,) of text, got {xy.shape}, {visible.shape} "
             f"and {names.shape} of {names.dtype}; export it again"
         )
-    listed = tuple(x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in names.tolist())
+    listed = tuple(
+        x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in names.tolist()
+    )
     if len(set(listed)) < len(listed):
         raise DyngsError(f"{path}: names holds one name more than once; give one row per image")
     xy = xy.astype(np.float64)
     good = np.all(np.abs(xy) < _LARGEST, axis=-1)  # phrased so that NaN fails it
-    return ImageTracks(listed, np.where(good[..., None], xy, 0.0).astype(np.float32), (visible > 0) & good)
+    return ImageTracks(
+        listed, np.where(good[..., None], xy, 0.0).astype(np.float32), (visible > 0) & good
+    )
 
 
 def _plain(name: str) -> str:
     """Return a name as ``View.name`` would have it, but with its extension."""
-    return "/".join(part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/"))
+    return "/".join(
+        part
+        for part in PurePosixPath(name.replace("\\", "/")).parts
+        if part not in (".", "..", "/")
+    )
 
 
 TRACKS_FILE = "true_tracks.npz"
@@ -72,7 +98,8 @@ class TrueTracks:
     """Tracks of P material points at T times; fields are named as the arrays of the file.
 
     Attributes:
-        points: (T, P, 3) world units, in the coordinates of the capture's files; NaN where a point does not exist.
+        points: (T, P, 3) world units, in the coordinates of the capture's files; NaN where a point
+            does not exist.
         times: (T,) ascending, as the capture's files have them.
         views: (V,) names of the views of all splits, as ``View.name``.
         moments: (V,) row of ``times`` at which each view was taken.
@@ -87,7 +114,8 @@ class TrueTracks:
 
 
 def write_true_tracks(root: Path, tracks: TrueTracks, name: str = TRACKS_FILE) -> Path:
-    """Write the tracks of a capture to the file ``name``, atomically; returns the path. Raises DyngsError."""
+    """Write the tracks of a capture to the file ``name``, atomically; returns the path. Raises
+    DyngsError."""
     path = root / name
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **asdict(tracks))
@@ -95,14 +123,19 @@ def write_true_tracks(root: Path, tracks: TrueTracks, name: str = TRACKS_FILE) -
 
 
 def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | None:
-    """Return the tracks of a capture in scene coordinates (see ``Capture.world_scale``); None without any."""
+    """Return the tracks of a capture in scene coordinates (see ``Capture.world_scale``); None
+    without any."""
     path = capture.root / name
     if not inside(path).is_file():
         return None
     found = read_npz(path, ("points", "times", "views", "moments", "visible"))
     points, times, views, moments, visible = found.values()
     kinds = "".join(x.dtype.kind for x in found.values())
-    fits = visible.ndim == 2 and times.ndim == 1 and points.shape == (*times.shape, *visible.shape[1:], 3)
+    fits = (
+        visible.ndim == 2
+        and times.ndim == 1
+        and points.shape == (*times.shape, *visible.shape[1:], 3)
+    )
     if kinds != "ffUib" or not fits or not views.shape == moments.shape == visible.shape[:1]:
         shapes = ", ".join(f"{name} {x.shape} of {x.dtype}" for name, x in found.items())
         raise DyngsError(
@@ -110,6 +143,8 @@ def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | 
             f"(V, P) bool, got {shapes}; write it again, or remove it to do without"
         )
     if len(moments) and not (moments.min() >= 0 and moments.max() < len(times)):
-        raise DyngsError(f"{path}: moments must be rows of times; write it again, or remove it to do without")
+        raise DyngsError(
+            f"{path}: moments must be rows of times; write it again, or remove it to do without"
+        )
     points = (points - capture.world_offset) / capture.world_scale
     return TrueTracks(points, times, views, moments, visible)

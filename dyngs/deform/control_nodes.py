@@ -1,9 +1,12 @@
-"""Control nodes that move along cubic splines: no network, and a cost that hardly grows with the Gaussians.
+"""Control nodes that move along cubic splines: no network, and a cost that hardly grows with the
+Gaussians.
 
-After SC-GS (Huang et al. 2024) and Dynamic 3D Gaussians (Luiten et al. 2024): nodes carry rigid motions, neighbours
-move alike, and a motion that leaves the times seen so far goes on at constant velocity.
+After SC-GS (Huang et al. 2024) and Dynamic 3D Gaussians (Luiten et al. 2024): nodes carry rigid
+motions, neighbours move alike, and a motion that leaves the times seen so far goes on at constant
+velocity.
 
-Every image moves four neighbouring control points of each spline: poses that few images show are shared by many.
+Every image moves four neighbouring control points of each spline: poses that few images show are
+shared by many.
 
 Local letters: S nodes, P control points.
 """
@@ -35,43 +38,58 @@ LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3
 """Learning rates of the nodes' attributes other than positions."""
 LR_DECAY = 0.2  # Ratio of the last to the first learning rate
 PIECES_PER_TIME = 0.3
-"""Pieces of the splines per training time. With more, poses follow single images; with fewer, they lag behind."""
+"""Pieces of the splines per training time. With more, poses follow single images; with fewer, they
+lag behind."""
 SMOOTHNESS = 0.01  # Weight of the nodes' squared acceleration, in node spacings
 
 
 class ControlNodes(DeformationField):
-    """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that follow them.
+    """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that
+    follow them.
 
-    Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that nothing follows are
-    dropped and new ones start, with the motion found there, where Gaussians are farthest from any.
+    Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that
+    nothing follows are dropped and new ones start, with the motion found there, where Gaussians are
+    farthest from any.
     """
 
-    def __init__(self, options: ControlNodesField, setup: FieldSetup, generator: torch.Generator) -> None:
+    def __init__(
+        self, options: ControlNodesField, setup: FieldSetup, generator: torch.Generator
+    ) -> None:
         self.options, self.setup = options, setup
-        self.num_pieces = options.pieces or min(max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES)
+        self.num_pieces = options.pieces or min(
+            max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES
+        )
         self.buffers = {"positions": NOTHING}
         self.parameters = self._untrained(0)
 
     def restored(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
         buffers = part_of(tensors, "buffers")
-        count, moving = len(buffers["positions"]), self.setup.num_moving
+        count = len(buffers["positions"])
+        moving = self.setup.num_moving
         require_tensor("positions", buffers["positions"], (count, 3))
         learned = part_of(tensors, "learned")
         field = copy.copy(self)
-        field.parameters = field._untrained(0).restored(learned, dict.fromkeys(head_sizes(self.options), count))
-        if count and ("radii" in buffers or "followed" in buffers):  # both are found where nodes are first needed
+        field.parameters = field._untrained(0).restored(
+            learned, dict.fromkeys(head_sizes(self.options), count)
+        )
+        if count and ("radii" in buffers or "followed" in buffers):
+            # both are found where nodes are first needed
             require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
         for name, length in (("followed", moving), ("neighbours", count)):
             if name in buffers:
                 require_indices(name, buffers[name], (length, None), count)
         if "followed" in buffers and not 1 <= buffers["followed"].shape[1] <= FOLLOWED:
-            raise ValueError(f"'followed' names {buffers['followed'].shape[1]} nodes for each Gaussian")
+            raise ValueError(
+                f"'followed' names {buffers['followed'].shape[1]} nodes for each Gaussian"
+            )
         field.buffers = buffers
         return field
 
     def state(self) -> State:
         own = {"followed": Role.PER_MOVING, "neighbours": Role.TRAINING}
-        buffers = {name: StateTensor(x, own.get(name, Role.SHARED)) for name, x in self.buffers.items()}
+        buffers = {
+            name: StateTensor(x, own.get(name, Role.SHARED)) for name, x in self.buffers.items()
+        }
         return super().state() | prefixed("buffers", buffers)
 
     @property
@@ -80,7 +98,9 @@ class ControlNodes(DeformationField):
 
     def edited(self, edit: TopologyEdit) -> ControlNodes:
         field = copy.copy(self)
-        field.buffers = {n: edit.apply(x) if n == "followed" else x for n, x in self.buffers.items()}
+        field.buffers = {
+            n: edit.apply(x) if n == "followed" else x for n, x in self.buffers.items()
+        }
         return field
 
     def regroup(self) -> None:
@@ -93,13 +113,16 @@ class ControlNodes(DeformationField):
 
     @torch.no_grad()
     def reduced(self, nodes: int, pieces: int, means: Tensor) -> ControlNodes:
-        """Return a field of at most ``nodes`` of these nodes with ``pieces`` pieces each, for all of ``means`` (M, 3).
+        """Return a field of at most ``nodes`` of these nodes with ``pieces`` pieces each, for all
+        of ``means`` (M, 3).
 
-        Splines are fitted to the present ones. The nodes that stay are the farthest from each other in the root mean
-        square of their distances over time: what moves alike keeps fewer. With other pieces Adam's moments begin anew.
+        Splines are fitted to the present ones. The nodes that stay are the farthest from each other
+        in the root mean square of their distances over time: what moves alike keeps fewer. With
+        other pieces Adam's moments begin anew.
         """
         self.nodes_for(means)
-        old, times = self.buffers["positions"], torch.linspace(0, 1, COMPARED_TIMES, device="cpu").tolist()
+        old = self.buffers["positions"]
+        times = torch.linspace(0, 1, COMPARED_TIMES, device="cpu").tolist()
         paths = torch.cat([old + self.at(time).means.detach() for time in times], dim=1)
         kept = (
             spread_out(paths, nodes, paths[:0]).sort().values
@@ -141,47 +164,66 @@ class ControlNodes(DeformationField):
         self.nodes_for(means)
         return spline_motion(self._heads(), time)
 
-    def _follow(self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor) -> Offsets:
+    def _follow(
+        self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor
+    ) -> Offsets:
         nodes = self.nodes_for(means)
         if rows is not None:
-            nodes, means = nodes.followed_by(rows), means.index_select(0, rows)
+            nodes = nodes.followed_by(rows)
+            means = means.index_select(0, rows)
         return follow(nodes, means, motion, values, head_sizes(self.options))
 
     def _penalties(self, motion: Tensor) -> dict[str, Tensor]:
-        """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in squared spacings."""
+        """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in
+        squared spacings."""
         if len(self.buffers["positions"]) < 2:
             return {}
         places, radii, near = (self.buffers[name] for name in ("positions", "radii", "neighbours"))
-        acceleration, strain = node_penalties(places, radii, near, motion, self.parameters["means"]).unbind()
+        acceleration, strain = node_penalties(
+            places, radii, near, motion, self.parameters["means"]
+        ).unbind()
         penalties = {"node acceleration": SMOOTHNESS * acceleration}
-        return penalties | ({"node rigidity": self.options.rigidity * strain} if self.options.rigidity else {})
+        return penalties | (
+            {"node rigidity": self.options.rigidity * strain} if self.options.rigidity else {}
+        )
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         """Go on at constant velocity, that of the last two intervals.
 
-        The outermost point that a time in ``seen`` depends on counts as not seen, unless no time lies beyond: its share
-        is too small.
+        The outermost point that a time in ``seen`` depends on counts as not seen, unless no time
+        lies beyond: its share is too small.
         """
         last = self.num_points - 1
         low = 0 if seen[0] <= 0 else math.floor(seen[0] * self.num_pieces) + 1
         high = last if seen[1] >= 1 else math.ceil(seen[1] * self.num_pieces) + SPAN - 3
         if low == 0 and high == last:  # nothing lies beyond
             return
-        reach, device = min(2, high - low), self.setup.center.device
+        reach = min(2, high - low)
+        device = self.setup.center.device
         after = torch.arange(1, last - high + 1, device=device)[:, None]
         before = torch.arange(low, 0, -1, device=device)[:, None]
         for x in (points.data for points in self._splines().values()):
-            x[:, high + 1 :] = x[:, high, None] + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
-            x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
+            x[:, high + 1 :] = (
+                x[:, high, None]
+                + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
+            )
+            x[:, :low] = (
+                x[:, low, None]
+                + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
+            )
 
     def at(self, time: float) -> Offsets:
         motion, values = spline_motion(self._heads(), time)
         return offsets_of(motion[:, :3], values, head_sizes(self.options))
 
     def _untrained(self, count: int) -> Parameters:
-        sizes, device = head_sizes(self.options), self.setup.center.device
-        tensors = {name: torch.zeros(count, self.num_points, size, device=device) for name, size in sizes.items()}
+        sizes = head_sizes(self.options)
+        device = self.setup.center.device
+        tensors = {
+            name: torch.zeros(count, self.num_points, size, device=device)
+            for name, size in sizes.items()
+        }
         rates = {"means": self.options.lr_means * self.setup.extent} | LR
         return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
@@ -199,7 +241,8 @@ class ControlNodes(DeformationField):
 
     @torch.no_grad()
     def _place(self, means: Tensor) -> None:
-        """Drop nodes that nothing follows, add some where they are missing, and let ``means`` (M, 3) follow."""
+        """Drop nodes that nothing follows, add some where they are missing, and let ``means`` (M,
+        3) follow."""
         old = self.buffers["positions"]
         kept = torch.zeros(0, dtype=torch.long, device=means.device)
         if len(old):
@@ -208,25 +251,35 @@ class ControlNodes(DeformationField):
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
         is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(means[added])
-        values = {name: torch.cat([x.detach()[kept], started[name]]) for name, x in self._splines().items()}
+        values = {
+            name: torch.cat([x.detach()[kept], started[name]])
+            for name, x in self._splines().items()
+        }
         self.parameters = self.parameters.rearranged(values, source, is_new)
         self._assign(torch.cat([old[kept], means[added]]), means)
 
     def _assign(self, positions: Tensor, means: Tensor) -> None:
-        nodes, around = nodes_at(positions, means), nodes_at(positions, positions).followed[:, 1:]
+        nodes = nodes_at(positions, means)
+        around = nodes_at(positions, positions).followed[:, 1:]
         found = {"radii": nodes.radii, "followed": nodes.followed, "neighbours": around}
         self.buffers = {"positions": positions} | found
 
     def _motion_at(self, points: Tensor) -> dict[str, Tensor]:
-        """Return the control points (S', P, size), by head, that the present nodes give to ``points`` (S', 3)."""
+        """Return the control points (S', P, size), by head, that the present nodes give to
+        ``points`` (S', 3)."""
         splines = {name: x.detach() for name, x in self._splines().items()}
         if not len(self.buffers["positions"]) or not len(points):
             return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in splines.items()}
         nodes = nodes_at(self.buffers["positions"], points)
         weights = nodes.weights(points)
-        started = {name: torch.einsum("mb,mbpd->mpd", weights, x[nodes.followed]) for name, x in splines.items()}
+        started = {
+            name: torch.einsum("mb,mbpd->mpd", weights, x[nodes.followed])
+            for name, x in splines.items()
+        }
         if "quats" in splines:
-            arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(-1, -1, self.num_points, -1)
+            arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(
+                -1, -1, self.num_points, -1
+            )
             swing = turned(splines["quats"][nodes.followed], arms) - arms
             started["means"] = started["means"] + torch.einsum("mb,mbpd->mpd", weights, swing)
         return started

@@ -1,4 +1,5 @@
-"""The small network at the end of a field: features in, one number per degree of freedom out, zero before training."""
+"""The small network at the end of a field: features in, one number per degree of freedom out, zero
+before training."""
 
 from __future__ import annotations
 
@@ -15,10 +16,16 @@ from dyngs.ops.perceptron import Layer, perceptron
 
 
 class Decoder:
-    """A multilayer perceptron whose last layer starts at zero; layer ``skip`` sees the features once more."""
+    """A multilayer perceptron whose last layer starts at zero; layer ``skip`` sees the features
+    once more."""
 
     def __init__(
-        self, num_inputs: int, hidden: Sequence[int], options: FieldSection, *, skip: int | None = None
+        self,
+        num_inputs: int,
+        hidden: Sequence[int],
+        options: FieldSection,
+        *,
+        skip: int | None = None,
     ) -> None:
         self.widths = [num_inputs, *hidden, sum(head_sizes(options).values())]
         self.skip = skip
@@ -36,7 +43,10 @@ class Decoder:
         return values
 
     def __call__(self, features: Tensor, parameters: Parameters) -> Tensor:
-        layers = [Layer(parameters[f"weight{i}"], parameters[f"bias{i}"]) for i in range(len(self.widths) - 1)]
+        layers = [
+            Layer(parameters[f"weight{i}"], parameters[f"bias{i}"])
+            for i in range(len(self.widths) - 1)
+        ]
         return perceptron(features, layers, skip=self.skip)
 
 
@@ -58,7 +68,8 @@ def split_heads(outputs: Tensor, options: FieldSection) -> Offsets:
 
 
 def offsets_of(means: Tensor, values: Tensor, heads: Mapping[str, int]) -> Offsets:
-    """Return offsets with ``means`` (M, 3), and the ``values`` (M, D) of all other ``heads`` by name."""
+    """Return offsets with ``means`` (M, 3), and the ``values`` (M, D) of all other ``heads`` by
+    name."""
     sizes = {name: size for name, size in heads.items() if name != "means"}
     parts = dict(zip(sizes, values.split(list(sizes.values()), dim=1), strict=True))
     if "logit_opacities" in parts:

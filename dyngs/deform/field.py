@@ -23,7 +23,8 @@ from dyngs.state import State, moved_to, part_of, prefixed
 F = TypeVar("F", bound="DeformationField")
 Outer = TypeVar("Outer", bound="OuterField")
 
-MAX_KEY_TIMES = 256  # Limit on the default number of key times; longer clips may set more, which takes memory
+# Limit on the default number of key times; longer clips may set more, which takes memory
+MAX_KEY_TIMES = 256
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Offsets:
     quats: Tensor | None = None
     log_scales: Tensor | None = None  # (M, 3)
     logit_opacities: Tensor | None = None  # (M,)
-    colors: Tensor | None = None  # (M, 3) of the base colour, in units of the constant SH coefficient
+    # (M, 3) of the base colour, in units of the constant SH coefficient
+    colors: Tensor | None = None
 
     def select(self, index: Tensor | slice) -> Offsets:
         others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
@@ -65,7 +67,8 @@ class DeformationField:
     parameters: Parameters
     """All that is optimised."""
     momentary = False
-    """Moving Gaussians are there for a while each, and stay as they are in steps that do not show them."""
+    """Moving Gaussians are there for a while each, and stay as they are in steps that do not show
+    them."""
     fades = False
     """Moving Gaussians may be there for a part of the clip only."""
 
@@ -84,14 +87,16 @@ class DeformationField:
         return self.parameters.step(step, progress)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """Return the offsets at ``time`` in [0, 1] of the moving Gaussians with canonical ``means`` (M, 3), in order.
+        """Return the offsets at ``time`` in [0, 1] of the moving Gaussians with canonical ``means``
+        (M, 3), in order.
 
         Only ``rows`` (A,) of them are requested, in this order, and cost anything; None: all.
         """
         raise NotImplementedError
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        """Return differentiable regularizers of the field itself, weighted, by name; some look at ``time`` only."""
+        """Return differentiable regularizers of the field itself, weighted, by name; some look at
+        ``time`` only."""
         return {}
 
     def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
@@ -99,33 +104,41 @@ class DeformationField:
         return self.offsets(means, time), self.penalties(time)
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
+        """Continue what was learned for the times in ``seen`` to those in ``soon``, which are
+        trained on next."""
 
-    def shaded(self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float) -> Gaussians:
+    def shaded(
+        self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float
+    ) -> Gaussians:
         """Return the Gaussians drawn at ``time`` in the light that what moves leaves to them.
 
-        Of those that move, ``which`` (None: all) are drawn, at ``rows`` (None: in order, and nothing else is).
+        Of those that move, ``which`` (None: all) are drawn, at ``rows`` (None: in order, and
+        nothing else is).
         """
         return gaussians
 
     def rest_outside_(self, window: tuple[float, float]) -> None:
-        """Drop the gradients of what times in ``window`` hardly show: Adam would take them for as much as any."""
+        """Drop the gradients of what times in ``window`` hardly show: Adam would take them for as
+        much as any."""
 
     def edited(self: F, edit: TopologyEdit) -> F:
         """Return the field after an edit of the moving Gaussians."""
         return self
 
     def regroup(self) -> None:
-        """Drop what was derived from the set of Gaussians; it is computed again when next needed."""
+        """Drop what was derived from the set of Gaussians; it is computed again when next
+        needed."""
 
     def state(self) -> State:
         """Return the state that ``restored`` needs, without the setup."""
         return prefixed("learned", self.parameters.state())
 
     def restored(self: F, tensors: Mapping[str, Tensor]) -> F:
-        """Return the field of a state that ``state`` returned, with the options and the setup of this one.
+        """Return the field of a state that ``state`` returned, with the options and the setup of
+        this one.
 
-        Raises KeyError or ValueError: a tensor is missing, or is not as a field of these options has it.
+        Raises KeyError or ValueError: a tensor is missing, or is not as a field of these options
+        has it.
         """
         return self.with_parameters(self.parameters.restored(part_of(tensors, "learned")))
 
@@ -144,10 +157,12 @@ class OuterField(DeformationField):
     """A field that changes the offsets of another one, ``others``, of the same Gaussians."""
 
     def __init__(self, others: DeformationField) -> None:
-        self.setup, self.others = others.setup, others
+        self.setup = others.setup
+        self.others = others
 
     def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
-        """Return the offsets ``found`` by the other field with the changes; arguments as of ``offsets``."""
+        """Return the offsets ``found`` by the other field with the changes; arguments as of
+        ``offsets``."""
         raise NotImplementedError
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
@@ -174,7 +189,9 @@ class OuterField(DeformationField):
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         self.others.extend(seen, soon)
 
-    def shaded(self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float) -> Gaussians:
+    def shaded(
+        self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float
+    ) -> Gaussians:
         return self.others.shaded(gaussians, rows, which, time)
 
     def rest_outside_(self, window: tuple[float, float]) -> None:
@@ -205,22 +222,31 @@ def innermost(field: DeformationField) -> DeformationField:
 
 def with_innermost(field: DeformationField, inner: DeformationField) -> DeformationField:
     """Return ``field`` with ``inner`` within all others that change its offsets."""
-    return field.around(with_innermost(field.others, inner)) if isinstance(field, OuterField) else inner
+    return (
+        field.around(with_innermost(field.others, inner))
+        if isinstance(field, OuterField)
+        else inner
+    )
 
 
 def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
-    """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order); differentiable.
+    """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order);
+    differentiable.
 
     No row may occur twice.
     """
-    tensors, dtype = gaussians.tensors(), gaussians.means.dtype
+    tensors = gaussians.tensors()
+    dtype = gaussians.means.dtype
     changes = [None if x is None else x.to(dtype) for x in vars(offsets).values()]
     moved = _AddOffsets.apply(rows, *tensors.values(), *changes)
-    return Gaussians(**{n: x if m is None else m for (n, x), m in zip(tensors.items(), moved, strict=True)})
+    return Gaussians(
+        **{n: x if m is None else m for (n, x), m in zip(tensors.items(), moved, strict=True)}
+    )
 
 
 class _AddOffsets(torch.autograd.Function):
-    """Gaussians with offsets, None for what stays as it is; the gradient fills and copies no arrays of all of them."""
+    """Gaussians with offsets, None for what stays as it is; the gradient fills and copies no arrays
+    of all of them."""
 
     @staticmethod
     def forward(
@@ -234,7 +260,9 @@ class _AddOffsets(torch.autograd.Function):
         *offsets: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
         own = means, quats, log_scales, logit_opacities, sh
-        copies = [x if by is None else x.contiguous().clone() for x, by in zip(own, offsets, strict=True)]
+        copies = [
+            x if by is None else x.contiguous().clone() for x, by in zip(own, offsets, strict=True)
+        ]
         add_offsets_(copies, rows, offsets)
         turned = () if offsets[1] is None else (quats, offsets[1])
         ctx.save_for_backward(*([] if rows is None else [rows]), *turned)

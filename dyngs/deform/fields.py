@@ -20,7 +20,9 @@ from dyngs.state import Role, State, part_of, with_role
 from dyngs.tensor_checks import require_positive, require_tensor
 
 
-def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generator) -> DeformationField:
+def new_field(
+    options: DeformField, setup: FieldSetup, generator: torch.Generator
+) -> DeformationField:
     """Return an untrained field of the kind asked for: every Gaussian stays where it is."""
     match options:
         case HexplaneField():
@@ -38,15 +40,23 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
 def field_state(field: DeformationField) -> State:
     """Return the state that ``restored_field`` needs, by name."""
     box = torch.stack([field.setup.center, field.setup.half_size])
-    numbers = torch.tensor([field.setup.num_times, field.setup.extent], dtype=torch.float64, device="cpu")
+    numbers = torch.tensor(
+        [field.setup.num_times, field.setup.extent], dtype=torch.float64, device="cpu"
+    )
     return field.state() | with_role({"box": box, "numbers": numbers}, Role.SHARED)
 
 
-def restored_field(options: DeformField, tensors: Mapping[str, Tensor], num_moving: int) -> DeformationField:
+def restored_field(
+    options: DeformField, tensors: Mapping[str, Tensor], num_moving: int
+) -> DeformationField:
     """Return the field of a checkpoint for M moving Gaussians."""
-    num_times, extent = require_positive("numbers", require_tensor("numbers", tensors["numbers"], (2,), None)).tolist()
+    num_times, extent = require_positive(
+        "numbers", require_tensor("numbers", tensors["numbers"], (2,), None)
+    ).tolist()
     center, half_size = require_tensor("box", tensors["box"], (2, 3))
-    setup = FieldSetup(center, require_positive("box", half_size), int(num_times), num_moving, extent)
+    setup = FieldSetup(
+        center, require_positive("box", half_size), int(num_times), num_moving, extent
+    )
     field = new_field(options, setup, torch.Generator()).restored(tensors)
     bodies = part_of(tensors, "bodies")
     field = BodyField.stored(field, bodies) if bodies else field

@@ -1,8 +1,10 @@
-"""Free primitives: each moving Gaussian has its own moment, span and velocity, and is not there before and after.
+"""Free primitives: each moving Gaussian has its own moment, span and velocity, and is not there
+before and after.
 
-After FreeTimeGS (Wang et al. 2025), with windows that are added to the logit of the opacity, so that what is opaque is
-equally so for most of its span. Nothing ties one time to another: what comes and goes, changes shape or travels by more
-than its own size is learned from the views of its times alone, which should be several.
+After FreeTimeGS (Wang et al. 2025), with windows that are added to the logit of the opacity, so
+that what is opaque is equally so for most of its span. Nothing ties one time to another: what comes
+and goes, changes shape or travels by more than its own size is learned from the views of its times
+alone, which should be several.
 """
 
 from __future__ import annotations
@@ -30,15 +32,16 @@ LR_DECAY = 0.1  # Ratio of the last to the first learning rate
 FIRST_SPAN = 0.6  # Of a Gaussian at a single time, in gaps: at 1.3 of them it is half as opaque
 OTHERS_SPAN = 0.25  # Of Gaussians that may belong to any time, in units of the clip
 FAINT = -2.2
-"""Logit of the opacity, 0.1, at which copies of static Gaussians begin where there are moments: most are ghosts."""
+"""Logit of the opacity, 0.1, at which copies of static Gaussians begin where there are moments:
+most are ghosts."""
 NAMES = "centers", "origins", "log_spans", "velocities"
 
 
 class FreePrimitives(DeformationField):
     """x(t) = x + v (t - o) and logit(t) = logit - (t - c)^2 / (2 d^2) for each of M Gaussians.
 
-    c is the centre of its window, d the span, v the velocity; o, the time at which it is at its canonical place, is not
-    learned: a window may shift without its path.
+    c is the centre of its window, d the span, v the velocity; o, the time at which it is at its
+    canonical place, is not learned: a window may shift without its path.
     """
 
     momentary = fades = True
@@ -53,21 +56,27 @@ class FreePrimitives(DeformationField):
 
     def started(self, start: FreeStart) -> FreePrimitives:
         """Return an untrained field with the windows and velocities of ``start``."""
-        return self.with_parameters(self._untrained(start.centers[:, None], start.spans[:, None], start.velocities))
+        return self.with_parameters(
+            self._untrained(start.centers[:, None], start.spans[:, None], start.velocities)
+        )
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        centers, origins, log_spans, velocities = (chosen(self.parameters[name], rows) for name in NAMES)
+        centers, origins, log_spans, velocities = (
+            chosen(self.parameters[name], rows) for name in NAMES
+        )
         shift = velocities * (time - origins.detach())
         spans = log_spans.exp() + SHORTEST * self.gap
         window = -0.5 * ((time - centers) / spans).square()
         return Offsets(shift, logit_opacities=window[:, 0])
 
     def edited(self, edit: TopologyEdit) -> FreePrimitives:
-        """Return the field after an edit; new rows are earlier and later in turn than those they descend from."""
+        """Return the field after an edit; new rows are earlier and later in turn than those they
+        descend from."""
         parameters = self.parameters.edited(Role.PER_MOVING, edit)
         new = torch.nonzero(edit.is_new)[:, 0]
         if len(new):
-            ordered = new[edit.source[new].sort(stable=True).indices]  # two of one source get both signs
+            # two of one source get both signs
+            ordered = new[edit.source[new].sort(stable=True).indices]
             signs = torch.ones(len(new), 1, device=new.device)
             signs[::2] = -1
             spans = parameters["log_spans"].data[ordered].exp() + SHORTEST * self.gap
@@ -77,7 +86,12 @@ class FreePrimitives(DeformationField):
 
     def _untrained(self, centers: Tensor, spans: Tensor, velocities: Tensor) -> Parameters:
         log_spans = (spans - SHORTEST * self.gap).clamp_min(1e-3 * self.gap).log()
-        tensors = {"centers": centers, "origins": centers.clone(), "log_spans": log_spans, "velocities": velocities}
+        tensors = {
+            "centers": centers,
+            "origins": centers.clone(),
+            "log_spans": log_spans,
+            "velocities": velocities,
+        }
         rates = {
             "centers": LR_CENTERS * self.gap,
             "origins": 0.0,
@@ -89,7 +103,8 @@ class FreePrimitives(DeformationField):
 
 @dataclass(frozen=True)
 class FreeStart:
-    """Gaussians to add when motion begins, and windows of all M that move: those of the static model come first."""
+    """Gaussians to add when motion begins, and windows of all M that move: those of the static
+    model come first."""
 
     logits: Tensor  # (M0,) opacities of those that the static model has, from now on
     added: tuple[Gaussians, ...]
@@ -98,14 +113,19 @@ class FreeStart:
     velocities: Tensor  # (M, 3) world units per clip
 
 
-def free_start(still: Gaussians, moments: Sequence[Moment], others: Gaussians, num_times: int) -> FreeStart:
-    """Return copies of the M ``still`` Gaussians that move, the Gaussians of ``moments``, and ``others``.
+def free_start(
+    still: Gaussians, moments: Sequence[Moment], others: Gaussians, num_times: int
+) -> FreeStart:
+    """Return copies of the M ``still`` Gaussians that move, the Gaussians of ``moments``, and
+    ``others``.
 
-    Of the first there are so many that each is there for a part of the clip only; those of moments are there for about
-    a gap between times, ``others`` for a quarter of the clip, somewhere.
+    Of the first there are so many that each is there for a part of the clip only; those of moments
+    are there for about a gap between times, ``others`` for a quarter of the clip, somewhere.
     """
     copies = min(num_times, max(COPIES_OF_MOVING // max(len(still), 1), 1))
-    faint = still.replace(logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf))
+    faint = still.replace(
+        logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf)
+    )
     parts = [Moment((i + 0.5) / copies, faint, torch.zeros(3, device="cpu")) for i in range(copies)]
     rest = torch.linspace(0, 1, len(others), device="cpu")
     groups = [*parts, *moments]
@@ -115,7 +135,17 @@ def free_start(still: Gaussians, moments: Sequence[Moment], others: Gaussians, n
     return FreeStart(
         faint.logit_opacities,
         (*(one.gaussians for one in groups[1:]), others),
-        torch.cat([torch.tensor([one.time for one in groups], device="cpu").repeat_interleave(sizes), rest]),
-        torch.cat([torch.tensor(spans, device="cpu").repeat_interleave(sizes), torch.full_like(rest, OTHERS_SPAN)]),
+        torch.cat(
+            [
+                torch.tensor([one.time for one in groups], device="cpu").repeat_interleave(sizes),
+                rest,
+            ]
+        ),
+        torch.cat(
+            [
+                torch.tensor(spans, device="cpu").repeat_interleave(sizes),
+                torch.full_like(rest, OTHERS_SPAN),
+            ]
+        ),
         torch.cat([velocities, torch.zeros(len(others), 3, device="cpu")]),
     )

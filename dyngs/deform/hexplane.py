@@ -14,21 +14,25 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
 WEIGHTS = (1e-4, 0.01, 1e-4)
-"""Of the smoothness of space planes, of that along time, and of the sparsity of planes with time (Wu et al.)."""
+"""Of the smoothness of space planes, of that along time, and of the sparsity of planes with time
+(Wu et al.)."""
 LR_DECAY = 0.01  # Ratio of the last to the first learning rate
 SPACE_RANGE = (0.1, 0.5)
-"""Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
+"""Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not
+depend on time."""
 
 
 class Hexplane(DeformationField):
     """Features from six planes per level, decoded into offsets.
 
-    Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the field starts as the
-    identity. Each head has as many hidden units as the trunk; the last layer may mix them (in Wu et al. it is
-    block-diagonal).
+    Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the
+    field starts as the identity. Each head has as many hidden units as the trunk; the last layer
+    may mix them (in Wu et al. it is block-diagonal).
     """
 
-    def __init__(self, options: HexplaneField, setup: FieldSetup, generator: torch.Generator) -> None:
+    def __init__(
+        self, options: HexplaneField, setup: FieldSetup, generator: torch.Generator
+    ) -> None:
         self.options, self.setup = options, setup
         tensors: dict[str, Tensor] = {}
         rows = time_rows(options, setup.num_times)
@@ -36,7 +40,9 @@ class Hexplane(DeformationField):
             side = options.resolution * multiplier
             low, high = SPACE_RANGE
             space = (
-                torch.rand((3, side, side, options.channels), generator=generator, device="cpu") * (high - low) + low
+                torch.rand((3, side, side, options.channels), generator=generator, device="cpu")
+                * (high - low)
+                + low
             )
             tensors[f"space{level}"] = space
             tensors[f"time{level}"] = torch.ones(3, rows, side, options.channels, device="cpu")
@@ -50,7 +56,9 @@ class Hexplane(DeformationField):
     @property
     def levels(self) -> list[PlaneLevel]:
         indices = range(len(self.options.levels))
-        return [PlaneLevel(self.parameters[f"space{i}"], self.parameters[f"time{i}"]) for i in indices]
+        return [
+            PlaneLevel(self.parameters[f"space{i}"], self.parameters[f"time{i}"]) for i in indices
+        ]
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         coords = self.setup.normalized(chosen(means.detach(), rows))
@@ -64,12 +72,15 @@ class Hexplane(DeformationField):
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         """Copy the outermost rows of time that have been trained to those that will be next."""
         for level in self.levels:
-            planes, last = level.time.data, level.time.shape[1] - 1
-            low, high = max(math.floor(seen[0] * last), 0), min(math.ceil(seen[1] * last), last)
+            planes = level.time.data
+            last = level.time.shape[1] - 1
+            low = max(math.floor(seen[0] * last), 0)
+            high = min(math.ceil(seen[1] * last), last)
             planes[:, max(math.floor(soon[0] * last), 0) : low] = planes[:, low, None]
             planes[:, high + 1 : math.ceil(soon[1] * last) + 1] = planes[:, high, None]
 
 
 def time_rows(options: HexplaneField, num_times: int) -> int:
-    """Return the number of rows of the planes with time: as configured, or half as many as times, 2 at least."""
+    """Return the number of rows of the planes with time: as configured, or half as many as times, 2
+    at least."""
     return options.time_resolution or min(max(2, (num_times + 1) // 2), MAX_KEY_TIMES)

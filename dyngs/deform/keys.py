@@ -13,7 +13,8 @@ COPIES_OF_MOVING = 12_000
 
 
 class FieldSection(Section):
-    """Keys that all deformation fields share: which attributes change over time besides positions."""
+    """Keys that all deformation fields share: which attributes change over time besides
+    positions."""
 
     move_rotations: bool = Field(default=True, description="rotations change over time")
     move_scales: bool = Field(default=True, description="scales change over time")
@@ -27,27 +28,39 @@ class HexplaneField(FieldSection):
     """Planes over pairs of space and time axes and a small decoder (4DGS, Wu et al. 2024)."""
 
     kind: Literal["hexplane"] = Field(
-        default="hexplane", description="feature planes over pairs of x, y, z, t and a small decoder (4DGS)"
+        default="hexplane",
+        description="feature planes over pairs of x, y, z, t and a small decoder (4DGS)",
     )
     channels: int = Field(default=32, ge=1, description="features per plane and level")
-    resolution: int = Field(default=64, ge=2, description="cells of the first level's planes along x, y and z")
+    resolution: int = Field(
+        default=64, ge=2, description="cells of the first level's planes along x, y and z"
+    )
     levels: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        default=(1, 2), min_length=1, description="one set of planes for each, with so many times that resolution"
+        default=(1, 2),
+        min_length=1,
+        description="one set of planes for each, with so many times that resolution",
     )
     time_resolution: int = Field(
-        default=0, ge=0, description="cells of the planes along t; 0: half the number of training times"
+        default=0,
+        ge=0,
+        description="cells of the planes along t; 0: half the number of training times",
     )
     width: int = Field(default=64, ge=1, description="neurons per hidden layer of the decoder")
     depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")
-    lr_planes: Positive = Field(default=1.6e-3, description="learning rate of the planes, times the scene extent")
-    lr_decoder: Positive = Field(default=1.6e-4, description="learning rate of the decoder, times the scene extent")
+    lr_planes: Positive = Field(
+        default=1.6e-3, description="learning rate of the planes, times the scene extent"
+    )
+    lr_decoder: Positive = Field(
+        default=1.6e-4, description="learning rate of the decoder, times the scene extent"
+    )
 
 
 class MlpField(FieldSection):
     """A multilayer perceptron on encoded position and time (Deformable-3DGS, Yang et al. 2024)."""
 
     kind: Literal["mlp"] = Field(
-        default="mlp", description="a perceptron on encoded position and time (Deformable-3DGS); slow on a CPU"
+        default="mlp",
+        description="a perceptron on encoded position and time (Deformable-3DGS); slow on a CPU",
     )
     depth: int = Field(default=8, ge=2, description="hidden layers")
     width: int = Field(default=256, ge=1, description="neurons per hidden layer")
@@ -55,7 +68,8 @@ class MlpField(FieldSection):
 
 
 class ControlNodesField(FieldSection):
-    """Control nodes that move along splines, which Gaussians around them follow (after SC-GS, Huang et al. 2024)."""
+    """Control nodes that move along splines, which Gaussians around them follow (after SC-GS, Huang
+    et al. 2024)."""
 
     kind: Literal["control_nodes"] = Field(
         default="control_nodes",
@@ -63,9 +77,13 @@ class ControlNodesField(FieldSection):
     )
     nodes: int = Field(default=512, ge=1, description="number of control nodes")
     pieces: int = Field(
-        default=0, ge=0, description="polynomial pieces of each spline; 0: 0.3 times the number of training times"
+        default=0,
+        ge=0,
+        description="polynomial pieces of each spline; 0: 0.3 times the number of training times",
     )
-    lr_means: Positive = Field(default=6e-4, description="learning rate of the nodes' places, times the scene extent")
+    lr_means: Positive = Field(
+        default=6e-4, description="learning rate of the nodes' places, times the scene extent"
+    )
     rigidity: float = Field(
         default=0.5,
         ge=0,
@@ -75,7 +93,8 @@ class ControlNodesField(FieldSection):
 
 
 class FreeField(Section):
-    """Gaussians that each have a moment, a span and a velocity of their own (after FreeTimeGS, Wang et al. 2025)."""
+    """Gaussians that each have a moment, a span and a velocity of their own (after FreeTimeGS, Wang
+    et al. 2025)."""
 
     kind: Literal["free"] = Field(
         default="free",
@@ -94,10 +113,12 @@ class DynamicModel(SceneModel):
     may_move: ClassVar[bool] = True
 
     kind: Literal["dynamic"] = Field(
-        default="dynamic", description="canonical Gaussians and a deformation field over time (docs/dynamic.md)"
+        default="dynamic",
+        description="canonical Gaussians and a deformation field over time (docs/dynamic.md)",
     )
     deform: Annotated[
-        DeformField, Field(discriminator="kind", description="how the canonical Gaussians are moved over time")
+        DeformField,
+        Field(discriminator="kind", description="how the canonical Gaussians are moved over time"),
     ] = HexplaneField()
     choose: bool = Field(
         default=False,
@@ -138,7 +159,9 @@ class DynamicModel(SceneModel):
         description="Gaussians that move by less than this many px in the nearest training view are frozen; 0: none",
     )
     motion_sparsity: float = Field(
-        default=0.01, ge=0, description="weight of the mean displacement of the moving Gaussians, in scene extents"
+        default=0.01,
+        ge=0,
+        description="weight of the mean displacement of the moving Gaussians, in scene extents",
     )
 
     @property

@@ -11,7 +11,13 @@ from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
-from dyngs.deform.still_error import StillErrors, cameras_in_place, moving_fractions, still_errors, views_to_compare
+from dyngs.deform.still_error import (
+    StillErrors,
+    cameras_in_place,
+    moving_fractions,
+    still_errors,
+    views_to_compare,
+)
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.training import ColourTraining
@@ -28,7 +34,8 @@ from dyngs.static.training import start as start_static
 
 MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
-STEPS_PER_SHOT = 50  # Steps of the run for each: those take ten times as long as the search in one image
+# Steps of the run for each: those take ten times as long as the search in one image
+STEPS_PER_SHOT = 50
 SECONDS_PER_SHOT = 3.0  # Of train.minutes for each, where that is given, likewise
 
 
@@ -43,7 +50,8 @@ def refusal(capture: Capture) -> str | None:
 
 
 def start(run: RunStart) -> GaussianModel:
-    """Return the model of a moving scene before its first step: a static one where there are no times to move in."""
+    """Return the model of a moving scene before its first step: a static one where there are no
+    times to move in."""
     model = run.config.model
     if not isinstance(model, DynamicModel) or len(set(training_times(run.capture))) < 2:
         return start_static(run)
@@ -57,16 +65,21 @@ def start(run: RunStart) -> GaussianModel:
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     """Return the scene of a checkpoint."""
-    scene = DynamicScene.restored(model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
+    scene = DynamicScene.restored(
+        model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
+    )
     return drawn_as_trained(scene, model, checkpoint)
 
 
 def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
-    config, capture, images = run.config, run.capture, run.images
+    config = run.config
+    capture = run.capture
+    images = run.images
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
-    looked_at, options = views_to_compare(views), training_options(run)
+    looked_at = views_to_compare(views)
+    options = training_options(run)
 
     def shader(time: float) -> Shader | None:
         return None if colours.network is None else colours.network.shader(time)
@@ -74,17 +87,22 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
         shown = [images.shrunk(i, divisor) for i in looked_at]
         if any(image.moves is not None for image in shown):
-            return moving_fractions(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
+            return moving_fractions(
+                gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold
+            )
         return still_errors(gaussians_at, shown, options, background, shader)
 
     in_place = cameras_in_place(views)
 
     def standing() -> list[Footage]:
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
-        return [footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used]
+        return [
+            footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used
+        ]
 
     def shots(still: Gaussians) -> Shots | None:
-        order, limit = one_camera(views), min(MAX_SHOTS, rates_of(config).steps // STEPS_PER_SHOT)
+        order = one_camera(views)
+        limit = min(MAX_SHOTS, rates_of(config).steps // STEPS_PER_SHOT)
         if config.train.minutes is not None:
             limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_SHOT))
         if order is None or limit == 0 or len(set(images.sizes)) > 1:

@@ -12,14 +12,15 @@ from dyngs.gaussians.parameters import Parameters
 
 SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # Octaves of the positional encodings
 LR_DECAY = 0.002  # Ratio of the last to the first learning rate
-SKIP_LAYER = 5  # The input is fed once more into this layer (counted from 0), where there are that many hidden ones
+# The input is fed once more into this layer (counted from 0), where there are that many hidden ones
+SKIP_LAYER = 5
 
 
 class Mlp(DeformationField):
     """Offsets by a deep network; starts as the identity, because its last layer starts at zero.
 
-    Differs from Deformable-3DGS in two small ways: time is encoded like position instead of by a network of its own,
-    and scales change in the logarithm, so that they stay positive.
+    Differs from Deformable-3DGS in two small ways: time is encoded like position instead of by a
+    network of its own, and scales change in the logarithm, so that they stay positive.
     """
 
     def __init__(self, options: MlpField, setup: FieldSetup, generator: torch.Generator) -> None:
@@ -38,7 +39,8 @@ class Mlp(DeformationField):
 
 
 def encoded(x: Tensor, num_frequencies: int) -> Tensor:
-    """Return (M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF: Mildenhall et al. 2020)."""
+    """Return (M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF:
+    Mildenhall et al. 2020)."""
     octaves = 2.0 ** torch.arange(num_frequencies, dtype=x.dtype, device=x.device)
     angles = (x[:, None, :] * octaves[:, None]).flatten(1)
     return torch.cat([x, angles.sin(), angles.cos()], dim=1)

@@ -1,4 +1,5 @@
-"""Sparse control nodes and how Gaussians follow them: linear blend skinning (SC-GS: Huang et al. 2024).
+"""Sparse control nodes and how Gaussians follow them: linear blend skinning (SC-GS: Huang et al.
+2024).
 
 Local letters: S nodes, B nodes that one Gaussian follows.
 """
@@ -35,26 +36,44 @@ class Nodes:
         return replace(self, followed=self.followed.index_select(0, rows))
 
     def weights(self, means: Tensor) -> Tensor:
-        """Return (M, B) weights of the followed nodes: Gaussians of the distance, normalised; constant in ``means``."""
+        """Return (M, B) weights of the followed nodes: Gaussians of the distance, normalised;
+        constant in ``means``."""
         apart = (means.detach()[:, None] - self.positions[self.followed]).square().sum(-1)
         return torch.softmax(-0.5 * apart / self.radii[self.followed].square(), dim=1)
 
 
 def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
-    """Return the nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M, 3)."""
-    tree, places, points = _tree(positions), positions.double().cpu().numpy(), means.detach().double().cpu().numpy()
+    """Return the nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M,
+    3)."""
+    tree = _tree(positions)
+    places = positions.double().cpu().numpy()
+    points = means.detach().double().cpu().numpy()
     count = min(FOLLOWED, len(positions))
-    gaps = torch.from_numpy(tree.query(places, k=count)[0]).to(positions.device).reshape(len(positions), -1)
-    radii = gaps[:, 1:].mean(1) if count > 1 else torch.ones(len(positions), dtype=torch.float64, device=gaps.device)
-    followed = torch.from_numpy(tree.query(points, k=count)[1]).to(positions.device).reshape(len(points), -1)
+    gaps = (
+        torch.from_numpy(tree.query(places, k=count)[0])
+        .to(positions.device)
+        .reshape(len(positions), -1)
+    )
+    radii = (
+        gaps[:, 1:].mean(1)
+        if count > 1
+        else torch.ones(len(positions), dtype=torch.float64, device=gaps.device)
+    )
+    followed = (
+        torch.from_numpy(tree.query(points, k=count)[1])
+        .to(positions.device)
+        .reshape(len(points), -1)
+    )
     floor = max(1e-6 * float(radii.max()), 1e-12)
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
 
 def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
-    """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it and from ``taken``.
+    """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it
+    and from ``taken``.
 
-    None coincides with another or with one of ``taken`` (S, 3). Without those, the first is nearest to the mean.
+    None coincides with another or with one of ``taken`` (S, 3). Without those, the first is nearest
+    to the mean.
     """
     points = points.detach().double()
     chosen: list[int] = []
@@ -75,18 +94,25 @@ def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
     return torch.tensor(chosen, dtype=torch.long, device=points.device)
 
 
-def follow(nodes: Nodes, means: Tensor, motion: Tensor, values: Tensor, heads: Mapping[str, int]) -> Offsets:
-    """Return offsets of the points ``means`` (M, 3) from the nodes' ``motion`` (S, 7) and ``values`` (S, D).
+def follow(
+    nodes: Nodes, means: Tensor, motion: Tensor, values: Tensor, heads: Mapping[str, int]
+) -> Offsets:
+    """Return offsets of the points ``means`` (M, 3) from the nodes' ``motion`` (S, 7) and
+    ``values`` (S, D).
 
-    A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b); differentiable in x,
-    the weights taken as constant. The values of all other ``heads``, names and sizes in order, are blended alike.
+    A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b);
+    differentiable in x, the weights taken as constant. The values of all other ``heads``, names and
+    sizes in order, are blended alike.
     """
-    moved, blended = blend_skinning(means, nodes.positions, nodes.radii, nodes.followed, motion, values)
+    moved, blended = blend_skinning(
+        means, nodes.positions, nodes.radii, nodes.followed, motion, values
+    )
     return offsets_of(moved, blended, heads)
 
 
 def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
-    """Return (..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any length."""
+    """Return (..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any
+    length."""
     return rotate(offsets + identity_quat(offsets), vectors)
 
 

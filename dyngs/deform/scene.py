@@ -32,17 +32,27 @@ class DynamicScene(GaussianScene):
     filter_std: Tensor | None = None
 
     @staticmethod
-    def restored(options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
+    def restored(
+        options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]
+    ) -> DynamicScene:
         count = len(gaussians)
         own = part_of(tensors, "field")
-        std, times = stored_filter(tensors, count), stored_times(tensors)
+        std = stored_filter(tensors, count)
+        times = stored_times(tensors)
         if not own:
             return DynamicScene(gaussians=gaussians, seen_at=times, filter_std=std)
         masks = VisibilityMasks.restored(part_of(tensors, "masks"), count)
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
         field = restored_field(options.deform, own, len(rows))
-        return DynamicScene(gaussians=gaussians, seen_at=times, field=field, moving=rows, masks=masks, filter_std=std)
+        return DynamicScene(
+            gaussians=gaussians,
+            seen_at=times,
+            field=field,
+            moving=rows,
+            masks=masks,
+            filter_std=std,
+        )
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -65,7 +75,8 @@ class DynamicScene(GaussianScene):
         return 0 if self.field is None or self.is_static else self.field.num_values
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
-        """Return all N Gaussians at ``time``, or with masks only those that are seen around then, in their order.
+        """Return all N Gaussians at ``time``, or with masks only those that are seen around then,
+        in their order.
 
         What does not move is not computed anew.
         """
@@ -76,8 +87,11 @@ class DynamicScene(GaussianScene):
         offsets = self.field.offsets(part.moving_means, now, part.asked)
         return GaussianTimeStep(part.moved(offsets, self.field, now), now)
 
-    def in_training(self, time: float, *, detach: bool) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
-        """Return the Gaussians drawn at ``time``, the offsets of those of them that move, and the field's penalties.
+    def in_training(
+        self, time: float, *, detach: bool
+    ) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
+        """Return the Gaussians drawn at ``time``, the offsets of those of them that move, and the
+        field's penalties.
 
         With ``detach`` gradients reach the field alone, not the canonical Gaussians.
         """
@@ -88,7 +102,8 @@ class DynamicScene(GaussianScene):
         if part.asked is None:
             offsets, penalties = self.field.in_training(part.moving_means, time)
         else:
-            offsets, penalties = self.field.offsets(part.moving_means, time, part.asked), self.field.penalties(time)
+            offsets = self.field.offsets(part.moving_means, time, part.asked)
+            penalties = self.field.penalties(time)
         return part.moved(offsets, self.field, time), offsets, penalties
 
     def edited(self, edit: TopologyEdit) -> DynamicScene:
@@ -116,7 +131,8 @@ class DynamicScene(GaussianScene):
         return state if self.masks is None else state | prefixed("masks", self.masks.state())
 
     def _drawn_around(self, time: float) -> _Part:
-        """Return the Gaussians drawn around ``time``; without gradients, those of the last mask interval are kept."""
+        """Return the Gaussians drawn around ``time``; without gradients, those of the last mask
+        interval are kept."""
         interval = 0 if self.masks is None else self.masks.interval(time)
         if torch.is_grad_enabled():
             return self._selected(self.gaussians, interval)

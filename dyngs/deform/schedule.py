@@ -7,15 +7,19 @@ from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians.schedule import Rates
 
 MIN_COARSE_STEPS = 1000
-"""Steps that a static model needs to show where it fails; short runs spend at most a third on it."""
+"""Steps that a static model needs to show where it fails; short runs spend at most a third on
+it."""
 SPLITS = (0.1, 0.3, 0.5)
-"""Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all times."""
+"""Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all
+times."""
 
 
 def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
-    """Return the phases of a dynamic model in a run with ``rates``; ``freeze_below_px`` 0 freezes nothing.
+    """Return the phases of a dynamic model in a run with ``rates``; ``freeze_below_px`` 0 freezes
+    nothing.
 
-    While new times come in, the field learns at its first rate: what has slowed down follows nothing.
+    While new times come in, the field learns at its first rate: what has slowed down follows
+    nothing.
     """
     steps = rates.steps
     fine = min(max(1, round(model.motion_from * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
@@ -23,7 +27,9 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     full = max(opens, round(model.time_window_full_at * steps))
     decays = full if model.time_window < 1 else fine
     splits = (
-        sorted({full + round(fraction * (steps - full)) for fraction in SPLITS}) if model.freeze_below_px > 0 else []
+        sorted({full + round(fraction * (steps - full)) for fraction in SPLITS})
+        if model.freeze_below_px > 0
+        else []
     )
     splits = tuple(step for step in splits if step > full)
     return DeformSchedule(fine, opens, full, decays, splits, rates)
@@ -31,4 +37,8 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
 
 def motion_begins_after(config: Config, steps: int) -> int | None:
     """Return the last step without motion in a run of ``steps``; None where nothing will move."""
-    return deform_schedule(config.model, Rates(steps)).fine if isinstance(config.model, DynamicModel) else None
+    return (
+        deform_schedule(config.model, Rates(steps)).fine
+        if isinstance(config.model, DynamicModel)
+        else None
+    )

@@ -12,11 +12,13 @@ from torch import Tensor
 
 from dyngs.ops.nodes import SPAN, cubic_fractions
 
-_SAMPLES_PER_PIECE = 8  # Places per piece at which two splines are compared; a cubic is determined by four
+# Places per piece at which two splines are compared; a cubic is determined by four
+_SAMPLES_PER_PIECE = 8
 
 
 def spline_basis(places: Tensor, pieces: int) -> Tensor:
-    """Return (K, pieces + 3) float64 weights of the control points of a uniform cubic B-spline at ``places`` (K,).
+    """Return (K, pieces + 3) float64 weights of the control points of a uniform cubic B-spline at
+    ``places`` (K,).
 
     Places lie in [0, 1], which the pieces share evenly.
     """
@@ -28,10 +30,12 @@ def spline_basis(places: Tensor, pieces: int) -> Tensor:
 
 
 def refitted(points: Tensor, pieces: int) -> Tensor:
-    """Return (S, pieces + 3, D) control points of the splines nearest to those of ``points`` (S, P, D).
+    """Return (S, pieces + 3, D) control points of the splines nearest to those of ``points`` (S, P,
+    D).
 
-    Nearest in the mean square over time, sampled evenly: A' x' = A x by least squares in float64 with the bases A' and
-    A. Exact where the splines have such pieces; always if every piece is divided into equal ones.
+    Nearest in the mean square over time, sampled evenly: A' x' = A x by least squares in float64
+    with the bases A' and A. Exact where the splines have such pieces; always if every piece is
+    divided into equal ones.
     """
     old = points.shape[1] - SPAN + 1
     if pieces == old:

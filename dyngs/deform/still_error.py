@@ -1,4 +1,5 @@
-"""What may move: errors of a static model in the images, or motion masks that the capture has in place of these."""
+"""What may move: errors of a static model in the images, or motion masks that the capture has in
+place of these."""
 
 from __future__ import annotations
 
@@ -18,12 +19,16 @@ from dyngs.deform.fixed_cameras.changes import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
-DIFFERS = 0.06  # Difference from the median image, mean over channels, from which a pixel shows something else
+# Difference from the median image, mean over channels, from which a pixel shows something else
+DIFFERS = 0.06
 MIN_SAME = 3  # Fewest images of one camera whose median shows what is still
-USUAL = 0.7  # What moves differs from the median in three of ten images or more; what is hidden at times, in fewer
+# What moves differs from the median in three of ten images or more; what is hidden at times, in
+# fewer
+USUAL = 0.7
 MOMENTS = 8  # Images of one camera that are compared
 SHOWS = 1e-3  # Sum of weights, in pixels, from which a Gaussian counts as visible in an image
-SURE_FRACTION = 0.5  # Fraction of a Gaussian in motion masks, where it is seen, from which it surely moves
+# Fraction of a Gaussian in motion masks, where it is seen, from which it surely moves
+SURE_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
@@ -43,31 +48,39 @@ def still_errors(
 ) -> StillErrors:
     """Return the errors of a static scene in the images, where each Gaussian is seen.
 
-    e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each image v, a mean over channels.
-    Errors of one view are summed with their sign over what a Gaussian covers: detail that is not yet resolved cancels,
-    a thing that has come or gone does not. Both sums come from passes back through the blending of a constant colour.
-    Masked pixels do not count; a Gaussian that shows nowhere has 0.
+    e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each image v, a mean
+    over channels. Errors of one view are summed with their sign over what a Gaussian covers: detail
+    that is not yet resolved cancels, a thing that has come or gone does not. Both sums come from
+    passes back through the blending of a constant colour. Masked pixels do not count; a Gaussian
+    that shows nowhere has 0.
 
-    Where cameras stay in place, what is expected of one with ``MIN_SAME`` images or more is their median, which holds
-    whatever is still exactly as it is; ``most`` is the largest, ``usual`` the ``USUAL`` quantile of e_vi over images
-    in which a Gaussian shows. Else the rendering is expected, and both are the mean, weighted by sum_p w_vip: a still
-    model that is not yet right errs too.
+    Where cameras stay in place, what is expected of one with ``MIN_SAME`` images or more is their
+    median, which holds whatever is still exactly as it is; ``most`` is the largest, ``usual`` the
+    ``USUAL`` quantile of e_vi over images in which a Gaussian shows. Else the rendering is
+    expected, and both are the mean, weighted by sum_p w_vip: a still model that is not yet right
+    errs too.
     """
     expected = _median_images(images, background)
     looked_at = [p for p in images if _camera_key(p) in expected] if expected else images
     found: list[tuple[Tensor, Tensor]] = []
     for image in looked_at:
-        gaussians, shown = gaussians_at(image.time or 0.0).detach(), expected.get(_camera_key(image))
+        gaussians = gaussians_at(image.time or 0.0).detach()
+        shown = expected.get(_camera_key(image))
         if shown is None:
             with torch.no_grad():
                 shader = shader_at(image.time or 0.0)
-                shown = render(gaussians, image.cameras, options, background=background, shader=shader).rgb[0]
-        counts = torch.ones(shown.shape[:2], device=shown.device) if image.mask is None else image.mask
+                shown = render(
+                    gaussians, image.cameras, options, background=background, shader=shader
+                ).rgb[0]
+        counts = (
+            torch.ones(shown.shape[:2], device=shown.device) if image.mask is None else image.mask
+        )
         error = (shown - image.composite(background)) * counts[..., None]
         weights = counts[..., None].expand_as(error).contiguous()
         signed, weight = weighted_sums(gaussians, image.cameras, options, [error, weights])
         found.append((signed.abs().mean(1), weight[:, 0]))
-    errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
+    errors = torch.stack([x for x, _ in found])
+    weights = torch.stack([x for _, x in found])
     if not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
         return StillErrors(mean, mean)
@@ -76,14 +89,20 @@ def still_errors(
 
 
 def moving_fractions(
-    gaussians_at: Callable[[float], Gaussians], images: Sequence[Image], options: RenderOptions, sure: float
+    gaussians_at: Callable[[float], Gaussians],
+    images: Sequence[Image],
+    options: RenderOptions,
+    sure: float,
 ) -> StillErrors:
-    """Return the fraction of each Gaussian that lies in motion masks where it is seen, scaled as ``still_errors``.
+    """Return the fraction of each Gaussian that lies in motion masks where it is seen, scaled as
+    ``still_errors``.
 
-    s_vi = sum_p w_vip m_vp / sum_p w_vip with w = alpha T and m the mask of image v. What stands behind is covered in
-    fewer images. Those without a mask do not count; ``sure`` is the error that ``SURE_FRACTION`` stands for.
+    s_vi = sum_p w_vip m_vp / sum_p w_vip with w = alpha T and m the mask of image v. What stands
+    behind is covered in fewer images. Those without a mask do not count; ``sure`` is the error that
+    ``SURE_FRACTION`` stands for.
     """
-    sums, weights = [], []
+    sums = []
+    weights = []
     for image in images:
         if image.moves is None:
             continue
@@ -104,17 +123,21 @@ def moving_fractions(
 def weighted_sums(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions, images: Sequence[Tensor]
 ) -> list[Tensor]:
-    """Return, for each image (H, W, 3), the (N, 3) sums over its pixels, times the blending weight of each Gaussian.
+    """Return, for each image (H, W, 3), the (N, 3) sums over its pixels, times the blending weight
+    of each Gaussian.
 
     By passes back through the blending of a constant colour.
     """
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
     blended = render(gaussians.replace(sh=flat), cameras, options).rgb[0]
-    return [torch.autograd.grad(blended, flat, image, retain_graph=True)[0][:, 0] for image in images]
+    return [
+        torch.autograd.grad(blended, flat, image, retain_graph=True)[0][:, 0] for image in images
+    ]
 
 
 def _ranked(errors: Tensor, shows: Tensor) -> StillErrors:
-    """Return the largest and the ``USUAL`` quantile of ``errors`` (V, N) over the images in which a Gaussian shows."""
+    """Return the largest and the ``USUAL`` quantile of ``errors`` (V, N) over the images in which a
+    Gaussian shows."""
     ordered = errors.sort(dim=0, descending=True).values
     usual = ((1 - USUAL) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
     return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
@@ -126,7 +149,8 @@ def cameras_in_place(views: Sequence[View]) -> list[list[int]]:
 
 
 def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
-    """Return indices of at most ``limit`` views, evenly chosen; of fixed cameras, ``MOMENTS`` of each or more."""
+    """Return indices of at most ``limit`` views, evenly chosen; of fixed cameras, ``MOMENTS`` of
+    each or more."""
     cameras = cameras_in_place(views)
     if not cameras:
         return evenly_spaced(len(views), limit)
@@ -145,11 +169,15 @@ def _median_images(images: Sequence[Image], background: Tensor) -> dict[bytes, T
 def _camera_key(image: Image) -> bytes:
     """Return a key that is equal for images from the same camera pose, but for rounding."""
     cameras = image.cameras
-    return b"".join(x.round(decimals=6).cpu().numpy().tobytes() for x in (cameras.cam_from_world, cameras.intrinsics))
+    return b"".join(
+        x.round(decimals=6).cpu().numpy().tobytes()
+        for x in (cameras.cam_from_world, cameras.intrinsics)
+    )
 
 
 def two_group_threshold(scores: Tensor) -> float:
-    """Return the threshold between two groups of ``scores`` (N,) (Otsu 1979); infinite where all are equal."""
+    """Return the threshold between two groups of ``scores`` (N,) (Otsu 1979); infinite where all
+    are equal."""
     from skimage.filters import threshold_otsu
 
     if not len(scores) or float(scores.min()) == float(scores.max()):
@@ -161,8 +189,8 @@ def two_group_threshold(scores: Tensor) -> float:
 def differing_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
     """Return the fraction of pixels that differ from the median image of their camera.
 
-    Each image is first brought to the brightness of the median (changing exposure is no motion) and averaged over
-    2x2 pixels, against noise.
+    Each image is first brought to the brightness of the median (changing exposure is no motion) and
+    averaged over 2x2 pixels, against noise.
     """
     differing = total = 0
     for images in cameras:

@@ -1,7 +1,8 @@
 """The part of a clip that training sees: it starts around the middle and grows until it is all.
 
-Motion over a whole clip may be far larger than the thing that moves. From the few images around one moment a sharp
-canonical form can be had, and a field that has followed it so far needs little to follow it a little farther.
+Motion over a whole clip may be far larger than the thing that moves. From the few images around one
+moment a sharp canonical form can be had, and a field that has followed it so far needs little to
+follow it a little farther.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from dataclasses import dataclass, field
 MIN_VIEWS = 6
 MIDDLE = 0.5
 FRONTIER_VIEWS = 6
-"""Number of newest views, at the window's ends, that every other step trains on while the window grows."""
+"""Number of newest views, at the window's ends, that every other step trains on while the window
+grows."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,17 @@ class TimeWindow:
     begins: int
     opens: int
     full: int
-    _limits: dict[int, tuple[float, float]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _limits: dict[int, tuple[float, float]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @staticmethod
-    def around_middle(times: Sequence[float], first: float, begins: int, opens: int, full: int) -> TimeWindow:
-        return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full)
+    def around_middle(
+        times: Sequence[float], first: float, begins: int, opens: int, full: int
+    ) -> TimeWindow:
+        return TimeWindow(
+            tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full
+        )
 
     def num_views(self, step: int) -> int:
         start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
@@ -47,17 +55,27 @@ class TimeWindow:
         return MIDDLE - reach, MIDDLE + reach
 
     def holds(self, time: float, step: int) -> bool:
-        """Return whether ``time`` is trained on at ``step``; while it grows, every other step takes only new times."""
+        """Return whether ``time`` is trained on at ``step``; while it grows, every other step takes
+        only new times."""
         # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
         if step <= self.begins:
             return True
         if step not in self._limits:  # once, though all views ask
-            oldest = self.strays[max(self.num_views(step) - FRONTIER_VIEWS, 0)] if self.tracks(step) else 0.0
+            oldest = (
+                self.strays[max(self.num_views(step) - FRONTIER_VIEWS, 0)]
+                if self.tracks(step)
+                else 0.0
+            )
             self._limits.clear()
             self._limits[step] = oldest, self.reach(step)
         oldest, newest = self._limits[step]
         return oldest <= abs(time - MIDDLE) <= newest
 
     def tracks(self, step: int) -> bool:
-        """Return whether ``step`` is for the newest views only: every other one while the window grows."""
-        return self.opens < step < self.full and step % 2 == 0 and self.num_views(step) < len(self.strays)
+        """Return whether ``step`` is for the newest views only: every other one while the window
+        grows."""
+        return (
+            self.opens < step < self.full
+            and step % 2 == 0
+            and self.num_views(step) < len(self.strays)
+        )

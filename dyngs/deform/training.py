@@ -1,7 +1,8 @@
 """Training of a dynamic scene.
 
-Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians), and from the first
-split on the field moves only those whose motion can be seen; the others are frozen and cost nothing more.
+Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians),
+and from the first split on the field moves only those whose motion can be seen; the others are
+frozen and cost nothing more.
 """
 
 from __future__ import annotations
@@ -41,8 +42,10 @@ from dyngs.state import Role, State, with_role
 
 SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25
-"""Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
-MIN_MOVING_FRACTION = 0.02  # Fraction of surely moving Gaussians up to which the scene counts as still
+"""Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in
+place."""
+# Fraction of surely moving Gaussians up to which the scene counts as still
+MIN_MOVING_FRACTION = 0.02
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,8 @@ class TrainingViews:
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False  # in place, so that images show what is still exactly alike
     standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
-    # what one moving camera shows, against N Gaussians that stand still; None where there is no such camera
+    # what one moving camera shows, against N Gaussians that stand still; None where there is no
+    # such camera
     shots: Callable[[Gaussians], Shots | None] = lambda _: None
     options: RenderOptions = field(default_factory=RenderOptions)  # how training images are drawn
 
@@ -93,7 +97,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
-        return DynamicScene(gaussians=gaussians, seen_at=self.times, filter_std=self._update.of(gaussians))
+        return DynamicScene(
+            gaussians=gaussians, seen_at=self.times, filter_std=self._update.of(gaussians)
+        )
 
     def trains_on(self, time: float | None, step: int) -> bool:
         return self._window.holds(time or 0.0, step)
@@ -137,7 +143,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene with Gaussians to begin motion with; None where a static model explains all."""
+        """Return the scene with Gaussians to begin motion with; None where a static model explains
+        all."""
         if step != self.schedule.fine:
             return None
         now = scene.gaussians
@@ -167,13 +174,18 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             self._see_all(bodies.explain_all)
         std = self._update.of(gaussians)
         field = field.to(now.means.device)
-        return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
+        return replace(
+            scene, gaussians=gaussians, field=field, moving=moving, filter_std=std
+        ), result
 
     def all_moving(self, scene: DynamicScene, extent: float) -> DynamicScene:
         if not scene.is_static:
             return scene
-        count, means = len(scene), scene.gaussians.means.detach()
-        setup = FieldSetup(means.mean(0), torch.full_like(means[0], extent), len(self.times), count, extent)
+        count = len(scene)
+        means = scene.gaussians.means.detach()
+        setup = FieldSetup(
+            means.mean(0), torch.full_like(means[0], extent), len(self.times), count, extent
+        )
         field = new_field(self.options.deform, setup, torch.Generator()).to(means.device)
         return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
@@ -182,39 +194,68 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return DynamicScene.restored(self.options, gaussians, tensors)
 
     def state(self) -> State:
-        return with_role({"all_times": torch.ones(1, device="cpu")}, Role.TRAINING) if self._sees_all else {}
+        return (
+            with_role({"all_times": torch.ones(1, device="cpu")}, Role.TRAINING)
+            if self._sees_all
+            else {}
+        )
 
     def _see_all(self, at_once: bool) -> None:
         """Train on all times from the first if ``at_once``: nothing need be followed outwards."""
-        first = 1.0 if at_once or isinstance(self.options.deform, FreeField) else self.options.time_window
+        first = (
+            1.0
+            if at_once or isinstance(self.options.deform, FreeField)
+            else self.options.time_window
+        )
         phases = self.schedule.fine, self.schedule.opens, self.schedule.full
-        self._sees_all, self._window = at_once, TimeWindow.around_middle(self.capture.times, first, *phases)
+        self._sees_all, self._window = (
+            at_once,
+            TimeWindow.around_middle(self.capture.times, first, *phases),
+        )
 
     def _first_bodies(self, still: Gaussians) -> Bodies | None:
         """Return what moves rigidly before one moving camera."""
         shots = None if isinstance(self.options.deform, FreeField) else self.capture.shots(still)
-        return None if shots is None else found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
+        return (
+            None
+            if shots is None
+            else found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
+        )
 
     def _begun(
         self, now: Gaussians, rows: Tensor, first: FirstMotion, bodies: Bodies | None
     ) -> tuple[Sequence[Gaussians], FreeStart | None]:
-        """Return the Gaussians to add when motion begins, and the windows of all that move where these have some."""
-        count = 0 if first.moments or (bodies and bodies.explain_all) else self.options.num_random_moving
+        """Return the Gaussians to add when motion begins, and the windows of all that move where
+        these have some."""
+        count = (
+            0
+            if first.moments or (bodies and bodies.explain_all)
+            else self.options.num_random_moving
+        )
         added = random_gaussians(now, count, self.capture.extent, self._generator)
         if not isinstance(self.options.deform, FreeField):
             return [added, *(bodies.seeds if bodies else ())], None
-        start = free_start(now.select(rows).to(device="cpu"), first.moments, added.to(device="cpu"), len(self.times))
+        start = free_start(
+            now.select(rows).to(device="cpu"),
+            first.moments,
+            added.to(device="cpu"),
+            len(self.times),
+        )
         return start.added, start
 
     def _first_motion(self, still: Gaussians) -> FirstMotion:
         """Return what changes before fixed cameras, for a field that can begin there."""
         if not isinstance(self.options.deform, FreeField):
             return FirstMotion()
-        standing, limit = self.capture.standing(), self.options.num_random_moving
-        return first_motion(standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options)
+        standing = self.capture.standing()
+        limit = self.options.num_random_moving
+        return first_motion(
+            standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options
+        )
 
     def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
-        """Return the scene in which what follows nodes may be there for a part of the clip, once all times are seen."""
+        """Return the scene in which what follows nodes may be there for a part of the clip, once
+        all times are seen."""
         field = scene.field
         if step != max(self.schedule.full, self.schedule.fine + 1) or field is None:
             return scene
@@ -224,22 +265,33 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return replace(scene, field=open_)
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
-        """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""
-        field, now = scene.field, scene.gaussians.detach()
+        """Return the scene in which Gaussians whose motion is too small to be seen no longer
+        move."""
+        field = scene.field
+        now = scene.gaussians.detach()
         if field is None:
             return scene
-        px_size = filter_std(now.means, self.capture.cameras)[scene.moving] / math.sqrt(FILTER_VARIANCE)
+        px_size = filter_std(now.means, self.capture.cameras)[scene.moving] / math.sqrt(
+            FILTER_VARIANCE
+        )
         motion = measure_motion(field, now.select(scene.moving), self.times, px_size)
         moves = motion.pixels >= self.options.freeze_below_px
         if self.capture.cameras_stay:
             means = now.means[scene.moving]
-            seen = self.capture.still_errors(lambda time: deformed(now, field.offsets(means, time), scene.moving))
+            seen = self.capture.still_errors(
+                lambda time: deformed(now, field.offsets(means, time), scene.moving)
+            )
             moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
         return _with_frozen(scene, motion.mean, ~moves)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
-        """Return the mean motion as a penalty: what need not move should not. Windows are short instead."""
-        if self.options.motion_sparsity == 0 or isinstance(self.options.deform, FreeField) or not len(offsets.means):
+        """Return the mean motion as a penalty: what need not move should not. Windows are short
+        instead."""
+        if (
+            self.options.motion_sparsity == 0
+            or isinstance(self.options.deform, FreeField)
+            or not len(offsets.means)
+        ):
             return {}
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
@@ -247,8 +299,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
 
 def _with_frozen(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:
-    """Return the scene in which those of the moving Gaussians that ``stays`` (M,) names stand still at ``mean``."""
-    still, kept = torch.nonzero(stays)[:, 0], torch.nonzero(~stays)[:, 0]
+    """Return the scene in which those of the moving Gaussians that ``stays`` (M,) names stand still
+    at ``mean``."""
+    still = torch.nonzero(stays)[:, 0]
+    kept = torch.nonzero(~stays)[:, 0]
     bake_(scene.gaussians, scene.moving[still], mean.select(still))
     if scene.field is None or not len(kept):
         return replace(scene, field=None, moving=scene.moving[kept])

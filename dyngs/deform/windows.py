@@ -1,6 +1,7 @@
 """Windows in time: each Gaussian that follows a field may be there for a part of the clip only.
 
-Flat-topped, so that what is opaque is equally so for all of its window; open over the whole clip before training.
+Flat-topped, so that what is opaque is equally so for all of its window; open over the whole clip
+before training.
 """
 
 from __future__ import annotations
@@ -18,16 +19,18 @@ from dyngs.ops.adam import Count
 from dyngs.state import Role, State, prefixed
 
 EDGE = 0.05  # Time over which the logit falls by 1 outside of a window, in units of the clip
-MARGIN = 3.0  # Edges by which an open window is longer than the clip, at either end: slopes can still be felt
+# Edges by which an open window is longer than the clip, at either end: slopes can still be felt
+MARGIN = 3.0
 OPEN = -MARGIN * EDGE, 1 + MARGIN * EDGE
 LR, LR_DECAY = 1e-2, 0.1
 
 
 class WindowedField(OuterField):
-    """The offsets of ``others``, and the window of each of M Gaussians added to the logit of its opacity.
+    """The offsets of ``others``, and the window of each of M Gaussians added to the logit of its
+    opacity.
 
-    w(t) = log s((t - a) / e) + log s((b - t) / e), less what it is where a window is open: s is the logistic function,
-    a and b, the ``edges`` (M, 2), are where the window begins and ends.
+    w(t) = log s((t - a) / e) + log s((b - t) / e), less what it is where a window is open: s is the
+    logistic function, a and b, the ``edges`` (M, 2), are where the window begins and ends.
     """
 
     fades = True

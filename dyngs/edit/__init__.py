@@ -1,1 +1,2 @@
-"""Scenes changed after training: another frame, a part, what spoils it taken away, several in one."""
+"""Scenes changed after training: another frame, a part, what spoils it taken away, several in
+one."""

@@ -63,7 +63,8 @@ class ClosedMesh:
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         found = Box(self.corners.min((0, 1)), self.corners.max((0, 1))).holds(points)
-        rows, step = np.nonzero(found)[0], max(1, _AT_ONCE // len(self.corners))
+        rows = np.nonzero(found)[0]
+        step = max(1, _AT_ONCE // len(self.corners))
         for start in range(0, len(rows), step):
             part = rows[start : start + step]
             found[part] = np.abs(_windings(points[part], self.corners)) > 0.5
@@ -71,7 +72,8 @@ class ClosedMesh:
 
 
 def _windings(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return how often (P,) a surface winds around points (P, 3): solid angles of its triangles over 4 pi.
+    """Return how often (P,) a surface winds around points (P, 3): solid angles of its triangles
+    over 4 pi.
 
     Solid angles as by van Oosterom and Strackee (1983). ``corners``: (T, 3, 3).
     """
@@ -86,7 +88,8 @@ def _windings(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def region_of(words: Sequence[str]) -> Region:
-    """Return what ``--crop`` names: "x,y,z x,y,z" (box), "x,y,z RADIUS" (sphere), or the file of a closed mesh.
+    """Return what ``--crop`` names: "x,y,z x,y,z" (box), "x,y,z RADIUS" (sphere), or the file of a
+    closed mesh.
 
     Raises DyngsError: none of these.
     """
@@ -96,13 +99,18 @@ def region_of(words: Sequence[str]) -> Region:
         return read_mesh(Path(text))
     if len(parts) != 2:
         shown = printable(repr(text), 60)
-        raise DyngsError(f"--crop: {shown}: give two corners x,y,z x,y,z, a centre and a radius, or a file of a mesh")
+        raise DyngsError(
+            f"--crop: {shown}: give two corners x,y,z x,y,z, a centre and a radius, or a file of a mesh"
+        )
     first = point(parts[0], "--crop")
     if "," in parts[1]:
         corners = np.array([first, point(parts[1], "--crop")])
-        low, high = corners.min(0), corners.max(0)
+        low = corners.min(0)
+        high = corners.max(0)
         if not (low < high).all():
-            raise DyngsError("--crop: the box is flat; give two opposite corners that differ in x, y and z")
+            raise DyngsError(
+                "--crop: the box is flat; give two opposite corners that differ in x, y and z"
+            )
         return Box(low, high)
     radius = number(parts[1], "--crop")
     if not radius > 0:
@@ -129,17 +137,24 @@ def read_mesh(path: Path) -> ClosedMesh:
     require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of a mesh")
     # From an open file: given a path, trimesh would look for textures next to it.
     with reading(path, "it must be a mesh of triangles; export it again"), path.open("rb") as file:
-        mesh: Any = trimesh.load(file, file_type=path.suffix.lower()[1:], force="mesh", skip_materials=True)
+        mesh: Any = trimesh.load(
+            file, file_type=path.suffix.lower()[1:], force="mesh", skip_materials=True
+        )
         corners = np.asarray(mesh.triangles, np.float64).reshape(-1, 3, 3)
-        closed = bool(len(corners)) and bool(mesh.is_watertight) and bool(mesh.is_winding_consistent)
+        closed = (
+            bool(len(corners)) and bool(mesh.is_watertight) and bool(mesh.is_winding_consistent)
+        )
     if not closed or not np.isfinite(corners).all():
         what = f"{len(corners):,} triangles" if len(corners) else "no triangles"
-        raise DyngsError(f"{path}: the mesh is not closed ({what}), so nothing is inside; fill its holes")
+        raise DyngsError(
+            f"{path}: the mesh is not closed ({what}), so nothing is inside; fill its holes"
+        )
     return ClosedMesh(corners)
 
 
 def held_by(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
-    """Return (N,) bool which Gaussians have their centre in ``region``, at one training time or more.
+    """Return (N,) bool which Gaussians have their centre in ``region``, at one training time or
+    more.
 
     ``world``: from positions of the scene to those that ``region`` means.
     """

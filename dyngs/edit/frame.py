@@ -1,4 +1,5 @@
-"""The frame that a scene gets: what is up, where the origin is, how long a unit is, or all of it by control points."""
+"""The frame that a scene gets: what is up, where the origin is, how long a unit is, or all of it by
+control points."""
 
 from __future__ import annotations
 
@@ -45,9 +46,11 @@ class Frame:
     scale: float | Distance | None = None
 
     def similarity(self, up: Sequence[float] | None, wanted: Sequence[float]) -> Similarity:
-        """Return the similarity that brings the direction ``up`` (3,) to ``wanted`` (3,), and does the rest.
+        """Return the similarity that brings the direction ``up`` (3,) to ``wanted`` (3,), and does
+        the rest.
 
-        Without ``up`` nothing is turned. Raises DyngsError: the scale is no positive factor of modest size.
+        Without ``up`` nothing is turned. Raises DyngsError: the scale is no positive factor of
+        modest size.
         """
         found = Similarity(scale=_factor(self.scale))
         if up is not None:
@@ -67,7 +70,9 @@ def _factor(scale: float | Distance | None) -> float:
         raise DyngsError("--scale: the two points are one; give points that are apart")
     if not _FACTORS[0] <= length / now <= _FACTORS[1]:
         what = "a positive factor, or two points and their distance"
-        raise DyngsError(f"--scale: {length / now:g} is no factor from {_FACTORS[0]:g} to {_FACTORS[1]:g}; give {what}")
+        raise DyngsError(
+            f"--scale: {length / now:g} is no factor from {_FACTORS[0]:g} to {_FACTORS[1]:g}; give {what}"
+        )
     return length / now
 
 
@@ -79,7 +84,9 @@ def point(text: str, option: str) -> Point:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):
         shown = printable(repr(text), 60)
-        raise DyngsError(f"{option}: {shown} is no point; write three numbers x,y,z without spaces, such as 0,-1.5,2")
+        raise DyngsError(
+            f"{option}: {shown} is no point; write three numbers x,y,z without spaces, such as 0,-1.5,2"
+        )
     return x, y, z
 
 
@@ -95,7 +102,8 @@ def number(text: str, option: str) -> float:
 
 
 def direction(text: str) -> Point | str:
-    """Return what ``--up`` names: an axis such as "-y", a direction "x,y,z", or "auto". Raises DyngsError."""
+    """Return what ``--up`` names: an axis such as "-y", a direction "x,y,z", or "auto". Raises
+    DyngsError."""
     if text == "auto":
         return text
     found = AXES[text] if text in AXES else point(text, "--up")
@@ -105,13 +113,16 @@ def direction(text: str) -> Point | str:
 
 
 def scale_of(text: str) -> float | Distance:
-    """Return what ``--scale`` names: a factor, or "x,y,z x,y,z LENGTH". Raises DyngsError: neither."""
+    """Return what ``--scale`` names: a factor, or "x,y,z x,y,z LENGTH". Raises DyngsError:
+    neither."""
     words = text.split()
     if len(words) == 3:
         start, end = (point(word, "--scale") for word in words[:2])
         return Distance(start, end, number(words[2], "--scale"))
     if len(words) != 1 or "," in text:
-        raise DyngsError(f"--scale: {printable(repr(text), 60)}: give a factor, or 'x,y,z x,y,z LENGTH'")
+        raise DyngsError(
+            f"--scale: {printable(repr(text), 60)}: give a factor, or 'x,y,z x,y,z LENGTH'"
+        )
     return number(text, "--scale")
 
 
@@ -121,8 +132,8 @@ class GeoFrame:
 
     Attributes:
         similarity: from the scene to the file.
-        offset: (3,) to be added to positions in the file for those in the world: 0, unless these are too large for
-            float32.
+        offset: (3,) to be added to positions in the file for those in the world: 0, unless these
+            are too large for float32.
         residuals: (P,) distances in the world that remain.
         what, notes: what the points are, and lines about them.
     """
@@ -136,7 +147,9 @@ class GeoFrame:
     @property
     def lines(self) -> tuple[str, ...]:
         """Lines about the result for people."""
-        each = ", ".join(f"{x:.3g}" for x in self.residuals[:12]) + (", ..." if len(self.residuals) > 12 else "")
+        each = ", ".join(f"{x:.3g}" for x in self.residuals[:12]) + (
+            ", ..." if len(self.residuals) > 12 else ""
+        )
         mean = math.sqrt(float(np.square(self.residuals).mean()))
         count = f"{len(self.residuals):,} {self.what}"
         found = f"{count}: scale {self.similarity.scale:.6g}; residuals {each}; root mean square {mean:.3g}"
@@ -149,17 +162,21 @@ class GeoFrame:
 
 
 def geo_frame(path: Path) -> GeoFrame:
-    """Return the frame of control points. Raises DyngsError: no such file, or they do not determine it."""
+    """Return the frame of control points. Raises DyngsError: no such file, or they do not determine
+    it."""
     points, world = np.split(_control_points(path), 2, axis=1)
     try:
         found = fitted(points, world)
     except DyngsError as error:
         raise DyngsError(f"{path}: {error}") from None
     if not _FACTORS[0] <= found.scale <= _FACTORS[1]:
-        raise DyngsError(f"{path}: the scale would be {found.scale:.3g}; check the units of the control points")
+        raise DyngsError(
+            f"{path}: the scale would be {found.scale:.3g}; check the units of the control points"
+        )
     residuals = np.linalg.norm(found.points(points) - world, axis=1)
     middle = world.mean(axis=0).round()
-    spread, distance = np.linalg.norm(world - middle, axis=1).max(), np.linalg.norm(middle)
+    spread = np.linalg.norm(world - middle, axis=1).max()
+    distance = np.linalg.norm(middle)
     if distance > MAX_DISTANCE * spread:
         x, y, z = (np.array(found.shift) - middle).tolist()
         a, b, c = middle.tolist()
@@ -168,7 +185,8 @@ def geo_frame(path: Path) -> GeoFrame:
 
 
 def _control_points(path: Path) -> np.ndarray:
-    """Return rows (P, 6) float64 of a text file: x y z in the scene, X Y Z in the world; first names, # remarks."""
+    """Return rows (P, 6) float64 of a text file: x y z in the scene, X Y Z in the world; first
+    names, # remarks."""
     if not path.exists():
         raise DyngsError(f"{path}: no such file; give rows of x,y,z,X,Y,Z")
     require_regular(path)
@@ -186,6 +204,8 @@ def _control_points(path: Path) -> np.ndarray:
             row = []
         if len(row) != 6 or not np.isfinite(row).all():
             shown = printable(repr(line), 60)
-            raise DyngsError(f"{path}: line {line_number} is {shown}, not six numbers x,y,z,X,Y,Z (scene, then world)")
+            raise DyngsError(
+                f"{path}: line {line_number} is {shown}, not six numbers x,y,z,X,Y,Z (scene, then world)"
+            )
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 6)

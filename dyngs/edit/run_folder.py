@@ -1,4 +1,5 @@
-"""An edited run as a run of its own: fewer Gaussians, and the frame that all that leaves it is moved by."""
+"""An edited run as a run of its own: fewer Gaussians, and the frame that all that leaves it is
+moved by."""
 
 from __future__ import annotations
 
@@ -33,9 +34,12 @@ from dyngs.runs.log import LOG_NAME
 
 
 def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
-    """Return the trainer of a run where it ended; without checkpoints with nothing but its scene."""
+    """Return the trainer of a run where it ended; without checkpoints with nothing but its
+    scene."""
     run = load_run(run_dir, config.data.root)
-    trainer: GaussianTrainer = assemble(config, read_capture_of(config.data, run.info), restored=True)
+    trainer: GaussianTrainer = assemble(
+        config, read_capture_of(config.data, run.info), restored=True
+    )
     if has_only_scene_file(run_dir):
         scene = run.scene.to(trainer.device)
         trainer.model.begin_with(scene, trainer.model.training)
@@ -46,9 +50,14 @@ def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
 
 
 def write_edited_run(
-    run_dir: Path, out: Path, rows: Tensor | None, frame: RunFrame | None, data_root: Path | None = None
+    run_dir: Path,
+    out: Path,
+    rows: Tensor | None,
+    frame: RunFrame | None,
+    data_root: Path | None = None,
 ) -> Path:
-    """Write a run as the new folder ``out``, which is drawn, viewed, exported and pruned as any other.
+    """Write a run as the new folder ``out``, which is drawn, viewed, exported and pruned as any
+    other.
 
     Args:
         rows: (N,) indices of the Gaussians that stay; None: all.
@@ -59,7 +68,9 @@ def write_edited_run(
     """
     config = load_resolved(run_dir, [f"run.dir={out}"], data_root=data_root)
     if rows is not None and has_only_scene_file(run_dir):
-        raise DyngsError(f"{run_dir}: holds no checkpoint that a part could be taken of; give --out FILE.ply")
+        raise DyngsError(
+            f"{run_dir}: holds no checkpoint that a part could be taken of; give --out FILE.ply"
+        )
     with new_folder(out, require_empty) as folder:
         if rows is not None:
             _write_part(config, run_dir, folder, rows)
@@ -78,7 +89,10 @@ def write_edited_run(
 
 
 def _write_part(config: Config, run_dir: Path, folder: Path, rows: Tensor) -> None:
-    with kernel_threads(config.run.threads or num_cores()), deterministic(device_for(config.run.device), True):
+    with (
+        kernel_threads(config.run.threads or num_cores()),
+        deterministic(device_for(config.run.device), True),
+    ):
         trainer = at_end(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)
         kept[rows.to(trainer.device)] = True

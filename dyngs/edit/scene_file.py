@@ -1,4 +1,5 @@
-"""One command's edits of a run or a file of Gaussians, in their order, and the file or run that they end in."""
+"""One command's edits of a run or a file of Gaussians, in their order, and the file or run that
+they end in."""
 
 from __future__ import annotations
 
@@ -17,7 +18,15 @@ from dyngs.edit.merge import merged
 from dyngs.edit.run_folder import write_edited_run
 from dyngs.errors import DyngsError, counted, show
 from dyngs.export.redrawn import Redrawn, compare_run, compare_splats
-from dyngs.export.splat_files import SUFFIX, UP, Writing, read_moment, splats_at, up_of, write_moving
+from dyngs.export.splat_files import (
+    SUFFIX,
+    UP,
+    Writing,
+    read_moment,
+    splats_at,
+    up_of,
+    write_moving,
+)
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.frame import RunFrame
 from dyngs.runs.inputs import inputs_of
@@ -70,7 +79,8 @@ class Edits:
 
 @dataclass(frozen=True)
 class EditedFile:
-    """A file that was written, how it differs from the edited scene when drawn, and what the format does not hold.
+    """A file that was written, how it differs from the edited scene when drawn, and what the format
+    does not hold.
 
     Of a run, which holds all of it, there is only the path.
     """
@@ -82,7 +92,8 @@ class EditedFile:
 
 @dataclass(frozen=True)
 class _Source:
-    """What is edited: a scene; of a file also its contents, and what is up in files of its format by default.
+    """What is edited: a scene; of a file also its contents, and what is up in files of its format
+    by default.
 
     ``rows``: (N,) indices of the Gaussians that are left, of a run; None: all.
     """
@@ -103,7 +114,11 @@ class _Source:
         """Return the Gaussians where ``rows`` (N,) is true."""
         scene: GaussianScene = self.opened.scene
         before = torch.arange(len(scene), device="cpu") if self.rows is None else self.rows
-        return replace(self, opened=self.opened.showing(scene.select(rows.to(scene.device))), rows=before[rows.cpu()])
+        return replace(
+            self,
+            opened=self.opened.showing(scene.select(rows.to(scene.device))),
+            rows=before[rows.cpu()],
+        )
 
     def at(self, time: float) -> SplatFile:
         """Return the Gaussians of one time, in the axes of the source."""
@@ -113,11 +128,18 @@ class _Source:
 
 
 def edit_scene(
-    source: Path, out: Path, edits: Edits, reads: Sequence[Path] = (), data_root: Path | None = None, tell: Tell = show
+    source: Path,
+    out: Path,
+    edits: Edits,
+    reads: Sequence[Path] = (),
+    data_root: Path | None = None,
+    tell: Tell = show,
 ) -> EditedFile:
-    """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the format, none is a run.
+    """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the
+    format, none is a run.
 
-    ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done, and nothing is written.
+    ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done, and
+    nothing is written.
     """
     moves = out.name.lower().endswith(SUFFIX)
     if known_format(out) is None and not moves and out.suffix:
@@ -140,8 +162,11 @@ def edit_scene(
     return _written_moving(found, out, edits, tell) if moves else _written(found, out, edits, tell)
 
 
-def write_part(opened: Opened, rows: torch.Tensor, out: Path, time: float | None = None) -> EditedFile:
-    """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of the format.
+def write_part(
+    opened: Opened, rows: torch.Tensor, out: Path, time: float | None = None
+) -> EditedFile:
+    """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of
+    the format.
 
     Raises DyngsError: it was opened from no file or run, or cannot be written.
     """
@@ -155,9 +180,13 @@ def _opened(source: Path, data_root: Path | None) -> _Source:
     own = format_to_read(source)
     if own is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
-        opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), source)
+        opened = opened_scene(
+            StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), source
+        )
         info = replace(opened.info, world_offset=splat.file_offset)
-        return _Source(replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, own.up)
+        return _Source(
+            replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, own.up
+        )
     return _Source(open_scene(source, data_root=data_root))
 
 
@@ -169,7 +198,9 @@ def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
     count = int(rows.sum())
     if not count:
         points = found.opened.world.points(scene.at(None).means.cpu().numpy())
-        low, high = (", ".join(f"{x:.10g}" for x in end.tolist()) for end in (points.min(0), points.max(0)))
+        low, high = (
+            ", ".join(f"{x:.10g}" for x in end.tolist()) for end in (points.min(0), points.max(0))
+        )
         raise DyngsError(
             f"{source}: --crop leaves none of {counted(len(scene), 'Gaussian')}; they lie between {low} and {high}"
         )
@@ -179,23 +210,32 @@ def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
 
 def _written(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
     """Write a file of Gaussians, at one time of what moves."""
-    moving, direction = not found.opened.scene.is_static, _up(found, edits.frame)
+    moving = not found.opened.scene.is_static
+    direction = _up(found, edits.frame)
     if moving and edits.merge:
-        raise DyngsError("--merge adds to still scenes, and this one moves; `dyngs export --time T` makes one of it")
+        raise DyngsError(
+            "--merge adds to still scenes, and this one moves; `dyngs export --time T` makes one of it"
+        )
     if moving and edits.time is None:
-        tell(f"this is time 0 of a moving scene; --time T gives another one, --out {out.stem}{SUFFIX} all of them")
+        tell(
+            f"this is time 0 of a moving scene; --time T gives another one, --out {out.stem}{SUFFIX} all of them"
+        )
     splat = found.at(edits.time or 0.0)
     if edits.merge:
         splat = merged(splat, direction, edits.merge, tell)
     own = format_of(out)
     if edits.undo:
         if splat.edited == UNMOVED:
-            raise DyngsError("--undo: nothing says that this was edited; `dyngs edit` stores it in what it writes")
+            raise DyngsError(
+                "--undo: nothing says that this was edited; `dyngs edit` stores it in what it writes"
+            )
         edited = undone_file(splat)
         tell("the frame is that of before the first edit")
     else:
         how, up = _frame(found, edits, direction, own.up)
-        edited = moved_file(splat, how, up) if _has_frame(edits) else turned_file(splat, how.turn, up)
+        edited = (
+            moved_file(splat, how, up) if _has_frame(edits) else turned_file(splat, how.turn, up)
+        )
         _tell_frame(edits, up, own.up, tell)
         if edits.geo is not None and any(edits.geo.offset):
             edited = replace(edited, comments=(*edited.comments, edits.geo.comment))
@@ -207,22 +247,32 @@ def _written_moving(found: _Source, out: Path, edits: Edits, tell: Tell) -> Edit
     """Write all training times of a moving scene."""
     scene = found.opened.scene
     if scene.is_static or edits.merge or edits.undo or edits.time is not None:
-        what = "a scene that moves" if scene.is_static else "all times, without --merge, --undo and --time"
+        what = (
+            "a scene that moves"
+            if scene.is_static
+            else "all times, without --merge, --undo and --time"
+        )
         raise DyngsError(f"{out}: {SUFFIX} holds {what}; give a name in {all_suffixes()}")
     how, up = _frame(found, edits, _up(found, edits.frame), UP)
     _tell_frame(edits, up, UP, tell)
     writing = Writing(edit=how, up=up) if _has_frame(edits) else Writing(turn=how.turn, up=up)
     written = write_moving(found.opened, out, scene.times, how=writing)
-    redrawn = compare_run(found.opened, scene, scene.times[0], written.splats[0], read_moment(out, 0))
+    redrawn = compare_run(
+        found.opened, scene, scene.times[0], written.splats[0], read_moment(out, 0)
+    )
     return EditedFile(out, redrawn, written.notes)
 
 
-def _written_run(found: _Source, source: Path, out: Path, edits: Edits, data_root: Path | None, tell: Tell) -> Path:
+def _written_run(
+    found: _Source, source: Path, out: Path, edits: Edits, data_root: Path | None, tell: Tell
+) -> Path:
     """Write a run, which keeps all that it has learned."""
     opened = found.opened
     if opened.captured is None or edits.merge or edits.time is not None:
         what = "a run of its own, of a run, without --merge and --time"
-        raise DyngsError(f"{out}: a name without a suffix is {what}; give a name in {all_suffixes()}")
+        raise DyngsError(
+            f"{out}: a name without a suffix is {what}; give a name in {all_suffixes()}"
+        )
     frame = opened.edited
     if edits.undo:
         if frame is None:
@@ -243,13 +293,16 @@ def _has_frame(edits: Edits) -> bool:
 
 
 def _up(found: _Source, frame: Frame) -> tuple[float, ...] | None:
-    """Return the direction (3,) of the source that is up: as told, else as known; None: nothing says."""
+    """Return the direction (3,) of the source that is up: as told, else as known; None: nothing
+    says."""
     if isinstance(frame.up, tuple):
         return frame.up
     if frame.up is not None:
         known = None if found.splat is not None else found.opened.up
         if known is None:
-            raise DyngsError("--up auto needs the cameras of a run, and there are none; give the direction, as --up=-y")
+            raise DyngsError(
+                "--up auto needs the cameras of a run, and there are none; give the direction, as --up=-y"
+            )
         return tuple((found.opened.frame.rotation @ known[0]).tolist())
     known_axis = up_of(found.opened)
     return None if known_axis is None else known_axis[0]
@@ -258,7 +311,8 @@ def _up(found: _Source, frame: Frame) -> tuple[float, ...] | None:
 def _frame(
     found: _Source, edits: Edits, direction: tuple[float, ...] | None, wanted: str
 ) -> tuple[Similarity, str | None]:
-    """Return the similarity to the frame that is asked for, and what is up there; ``wanted``: up for viewers."""
+    """Return the similarity to the frame that is asked for, and what is up there; ``wanted``: up
+    for viewers."""
     if edits.geo is not None:
         x, y, z = found.opened.world_offset.tolist()
         return edits.geo.similarity.after(Similarity(shift=(x, y, z))), "z"
@@ -274,7 +328,9 @@ def _tell_frame(edits: Edits, up: str | None, wanted: str, tell: Tell) -> None:
         for line in edits.geo.lines:
             tell(line)
         if wanted != up:
-            tell(f"axes are those of the control points, with z up; viewers of the format take {wanted} for up")
+            tell(
+                f"axes are those of the control points, with z up; viewers of the format take {wanted} for up"
+            )
     elif up is None:
         tell("nothing says which way is up, so nothing is turned; --up tells it")
     else:

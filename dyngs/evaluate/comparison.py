@@ -22,7 +22,8 @@ from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 
-COMPARED_VIEWS = 20  # number of views compared per split; enough for before and after, not for a benchmark
+# number of views compared per split; enough for before and after, not for a benchmark
+COMPARED_VIEWS = 20
 ROUNDS = 3
 
 
@@ -36,13 +37,15 @@ class Cost:
     psnr_test: float | None
     fps: float  # one over the median time of drawing a view, deformation included
     megabytes: float  # float32 parameters, the field and masks, in 1e6 bytes
-    stored: float | None = None  # size of the file in 1e6 bytes, where the run is only there as one; else None
+    # size of the file in 1e6 bytes, where the run is only there as one; else None
+    stored: float | None = None
 
 
 def compared(
     folders: Sequence[Path], threads: int, device: torch.device = CPU, data_root: Path | None = None
 ) -> list[Cost]:
-    """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all alike."""
+    """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all
+    alike."""
     runs = [load_run(folder, data_root) for folder in folders]
     capture = read_capture_of(runs[0].config.data, runs[0].info)
     has_test = bool(capture.splits.get("test"))
@@ -71,7 +74,10 @@ def _stored(folder: Path) -> float | None:
 def _psnrs(drawings: Sequence[Drawing], images: Sequence[Image]) -> list[float]:
     truths = [(image, image.composite(drawings[0].background)) for image in images]
     return [
-        fmean(psnr(drawing.image(image.cameras, image.time), truth, image.mask) for image, truth in truths)
+        fmean(
+            psnr(drawing.image(image.cameras, image.time), truth, image.mask)
+            for image, truth in truths
+        )
         for drawing in drawings
     ]
 

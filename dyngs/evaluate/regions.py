@@ -19,24 +19,30 @@ from dyngs.metrics import psnr
 RegionMetric = Literal["psnr_foreground", "psnr_moving", "psnr_static"]
 REGION_METRICS: tuple[RegionMetric, ...] = ("psnr_foreground", "psnr_moving", "psnr_static")
 
-FEWEST_PIXELS = 25  # a region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing
+# a region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing
+FEWEST_PIXELS = 25
 CHANGE = 0.05
-"""Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as moving."""
+"""Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as
+moving."""
 MEDIAN_IMAGES = 31  # number of images, spread over the clip, from which a camera's median is taken
 FEWEST_IMAGES = 3
 
 NO_ALPHA = "the images have no alpha and no silhouettes"
 NO_TIMES = "the images have no times"
-NO_MOTION_KNOWN = "the views have no motion masks, and no camera of this split stands still while time passes"
+NO_MOTION_KNOWN = (
+    "the views have no motion masks, and no camera of this split stands still while time passes"
+)
 TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
 
 
 class Regions:
-    """The regions of the images of one split; ``loader`` holds those of ``views``, ``background`` (3,) is behind them.
+    """The regions of the images of one split; ``loader`` holds those of ``views``, ``background``
+    (3,) is behind them.
 
-    The foreground is where the true image is not fully transparent. What moves is known, in this order, from motion
-    masks, and before cameras that stand still from pixels that differ by ``CHANGE`` from their median over time. What
-    is left does not move. Where there is a foreground, both are parts of it.
+    The foreground is where the true image is not fully transparent. What moves is known, in this
+    order, from motion masks, and before cameras that stand still from pixels that differ by
+    ``CHANGE`` from their median over time. What is left does not move. Where there is a foreground,
+    both are parts of it.
     """
 
     def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:
@@ -53,20 +59,26 @@ class Regions:
         self._has_alpha = False
 
     def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[str, float | None]:
-        """Return the PSNR of a view's regions, dB, by metric; None for too few such pixels, or unknown ones."""
+        """Return the PSNR of a view's regions, dB, by metric; None for too few such pixels, or
+        unknown ones."""
         moves = self.moving(image)
         foreground = None if image.alpha is None else image.alpha > 0
         self._has_alpha |= foreground is not None
-        inside = torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
+        inside = (
+            torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
+        )
         parts = {
             "psnr_foreground": foreground,
             "psnr_moving": None if moves is None else moves & inside,
             "psnr_static": None if moves is None else ~moves & inside,
         }
-        return {metric: _psnr_inside(part, image, rendered, truth) for metric, part in parts.items()}
+        return {
+            metric: _psnr_inside(part, image, rendered, truth) for metric, part in parts.items()
+        }
 
     def scores_of_things(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
-        """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it shows, by label."""
+        """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it
+        shows, by label."""
         if image.labels is None:
             return {}
         labels = image.labels if image.alpha is None else image.labels * (image.alpha > 0)
@@ -104,12 +116,17 @@ class Regions:
         key = tuple(indices)
         if key not in self._medians:
             chosen = [indices[i] for i in evenly_spaced(len(indices), MEDIAN_IMAGES)]
-            shown = [(255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte() for i in chosen]
+            shown = [
+                (255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte()
+                for i in chosen
+            ]
             self._medians[key] = torch.stack(shown).median(dim=0).values
         return self._medians[key].float() / 255
 
 
-def _psnr_inside(part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor) -> float | None:
+def _psnr_inside(
+    part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor
+) -> float | None:
     if part is None:
         return None
     weights = part.float() if image.mask is None else part * image.mask

@@ -29,7 +29,13 @@ from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
-from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, found_corrections, has_only_scene_file, load_run
+from dyngs.runs.checkpoint import (
+    SCENE_FILE,
+    LoadedRun,
+    found_corrections,
+    has_only_scene_file,
+    load_run,
+)
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_refinement import fitted_to_image
@@ -42,13 +48,16 @@ MOST_BY_BACKGROUND = 1.0
 class PoseRefinement:
     """Scores from poses that were fitted to the tested images; None where that was not done."""
 
-    psnr: float | None = None  # from cameras, or of a person from body poses, fitted to the whole images
+    # from cameras, or of a person from body poses, fitted to the whole images
+    psnr: float | None = None
     to_images: PoseScores | None = None  # of a person, all scores of these
     # of a person, from poses fitted to the silhouettes alone; None without silhouettes
     to_silhouettes: PoseScores | None = None
 
 
-def scores_from_own_poses(drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips) -> PoseRefinement:
+def scores_from_own_poses(
+    drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips
+) -> PoseRefinement:
     """Return the scores of images from poses that were fitted to them; the scene stays as it is."""
     avatar = avatar_of(drawing.scene)
     if avatar is None:
@@ -69,23 +78,30 @@ def _person_scores(
 
 
 def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
-    """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in world units."""
-    scene, background = require_gaussians(drawing.scene, "what cameras are fitted to"), drawing.background
+    """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in
+    world units."""
+    scene = require_gaussians(drawing.scene, "what cameras are fitted to")
+    background = drawing.background
     options = scene.options
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
         fitted = fitted_to_image(scene, image, background, size, options=options)
         with torch.no_grad():
-            rendering = scene.render(fitted.cameras, image.time, options=options, background=background)
+            rendering = scene.render(
+                fitted.cameras, image.time, options=options, background=background
+            )
         scores.append(psnr(rendering.rgb[0], image.composite(background), image.mask))
     return fmean(scores)
 
 
-def images_of_split(capture: Capture, views: Sequence[View], run_dir: Path, run: LoadedRun) -> ImageLoader:
-    """Return the images of ``views``, a split of ``capture``, with the cameras that training found, if any.
+def images_of_split(
+    capture: Capture, views: Sequence[View], run_dir: Path, run: LoadedRun
+) -> ImageLoader:
+    """Return the images of ``views``, a split of ``capture``, with the cameras that training found,
+    if any.
 
-    Images that were not trained on have the lens that they share with others, and the pose of a camera that stands
-    still; all other poses are those of the capture.
+    Images that were not trained on have the lens that they share with others, and the pose of a
+    camera that stands still; all other poses are those of the capture.
     """
     images = ImageLoader(views, run.config.data)
     found = found_corrections(run_dir, run, capture.splits["train"])
@@ -96,7 +112,8 @@ def images_of_split(capture: Capture, views: Sequence[View], run_dir: Path, run:
 
 @dataclass(frozen=True)
 class EvalReport:
-    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see docs/formats.md."""
+    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see
+    docs/formats.md."""
 
     split: str
     num_views: int
@@ -104,8 +121,8 @@ class EvalReport:
     width: int
     height: int
     background: str
-    # ``psnr, ssim, flip, lpips and the like``: means over the views of what ``ViewScore`` holds, None where one has
-    # none
+    # ``psnr, ssim, flip, lpips and the like``: means over the views of what ``ViewScore`` holds,
+    # None where one has none
     psnr: float
     ssim: float
     flip: float | None
@@ -114,12 +131,14 @@ class EvalReport:
     num_gaussians: int
     num_moving: int
     moving_fraction: float
-    # float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per Gaussian
+    # float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12
+    # bytes per Gaussian
     model_mb: float
     field_mb: float  # of these, the field's
-    colour_floats: float  # numbers per Gaussian that its colour takes, with its fraction of a network
-    # one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and metrics not
-    # counted
+    # numbers per Gaussian that its colour takes, with its fraction of a network
+    colour_floats: float
+    # one over the median time of drawing one view, after a warm-up: deformation and rendering;
+    # loading and metrics not counted
     fps: float
     deform_fraction: float  # median fraction of that time that the deformation takes
     seconds_train: float
@@ -132,12 +151,15 @@ class EvalReport:
     per_view: tuple[ViewScore, ...] = ()
     psnr_person: float | None = None
     ssim_person: float | None = None
-    stored_mb: float | None = None  # size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others
-    # ``psnr_foreground, psnr_moving, psnr_static``: means over the views that have such a region (``Regions``)
+    # size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others
+    stored_mb: float | None = None
+    # ``psnr_foreground, psnr_moving, psnr_static``: means over the views that have such a region
+    # (``Regions``)
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
-    psnr_things: dict[int, float] = field(default_factory=dict)  # means over the views that show a thing, by its label
+    # means over the views that show a thing, by its label
+    psnr_things: dict[int, float] = field(default_factory=dict)
     moving_from: str | None = None  # how it was found what moves, None where it was not
     # ``track_error_px, track_within_5px, track_motion_px``: see ``TrackScores``
     track_error_px: float | None = None
@@ -145,7 +167,8 @@ class EvalReport:
     track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
-    # ``psnr_own_poses, own_poses, silhouette_poses``: see ``PoseRefinement``; None where that was not requested
+    # ``psnr_own_poses, own_poses, silhouette_poses``: see ``PoseRefinement``; None where that was
+    # not requested
     psnr_own_poses: float | None = None
     # ``psnr_white, psnr_black``: None where images have no alpha
     psnr_white: float | None = None
@@ -185,11 +208,13 @@ def evaluate_run(
     data_root: Path | None = None,
     capture: Capture | None = None,
 ) -> EvalReport:
-    """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
+    """Return the report of a run on one split and write it into its folder: ``metrics.json``,
+    ``metrics_SPLIT.json``.
 
-    ``threads``: 0 leaves their number as it is. ``refine_poses``: also score from poses of a person, else of the
-    cameras, that were fitted to the images themselves; always done for a run that refined its cameras. ``data_root``:
-    where the capture lies by now. ``capture``: of the run, if it was read already.
+    ``threads``: 0 leaves their number as it is. ``refine_poses``: also score from poses of a
+    person, else of the cameras, that were fitted to the images themselves; always done for a run
+    that refined its cameras. ``data_root``: where the capture lies by now. ``capture``: of the run,
+    if it was read already.
     """
     draws_on = device_for(device)
     _require_possible(run_dir, split, refine_poses)
@@ -203,13 +228,20 @@ def evaluate_run(
         loader = images_of_split(capture, views, run_dir, run)
         loader.device = draws_on
         regions = Regions(views, loader, drawing.background)
-        images, lpips = (loader[i] for i in range(len(loader))), load_lpips(lpips_net, draws_on)
-        scores, reasons = score_views(scene, images, drawing.options, drawing.background, lpips, regions)
+        images = (loader[i] for i in range(len(loader)))
+        lpips = load_lpips(lpips_net, draws_on)
+        scores, reasons = score_views(
+            scene, images, drawing.options, drawing.background, lpips, regions
+        )
         temporal = {"flicker": flicker_of_split(drawing, loader, views)}
         temporal["flicker_error"] = flicker_error(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
-        fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips) if asked else PoseRefinement()
+        fitted = (
+            scores_from_own_poses(drawing, loader, run.info.extent, lpips)
+            if asked
+            else PoseRefinement()
+        )
     report = EvalReport(
         split=split,
         background=background,
@@ -226,7 +258,9 @@ def evaluate_run(
         **_of_views(scores),
         **_facts(run_dir, run, scene),
     )
-    reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason is not None}
+    reasons |= {
+        name: metric.reason for name, metric in temporal.items() if metric.reason is not None
+    }
     report = replace(report, reasons=reasons | _reasons(report, regions, tracks))
     write_text(report_path(run_dir, split), report.to_json())
     return report
@@ -244,11 +278,19 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
     facts = {
         "seconds_train": run.seconds_train,
         "step": run.step,
-        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
+        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size
+        if has_only_scene_file(run_dir)
+        else None,
     }
     if not isinstance(scene, GaussianScene):
         values = sum(x.tensor.numel() for x in scene.drawing_state().values())
-        none = {"num_gaussians": 0, "num_moving": 0, "moving_fraction": 0.0, "field_mb": 0.0, "colour_floats": 0.0}
+        none = {
+            "num_gaussians": 0,
+            "num_moving": 0,
+            "moving_fraction": 0.0,
+            "field_mb": 0.0,
+            "colour_floats": 0.0,
+        }
         return facts | none | {"model_mb": 4e-6 * values}
     return facts | {
         "num_gaussians": len(scene),
@@ -261,7 +303,8 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
 
 
 def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the fields of a report on views; means of regions are over the views that have one, others over all."""
+    """Return the fields of a report on views; means of regions are over the views that have one,
+    others over all."""
     means: dict[str, Any] = {
         "num_views": len(scores),
         "width": scores[0].width,
@@ -271,20 +314,33 @@ def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "psnr_per_time": psnr_per_time((score.time, score.psnr) for score in scores),
         "per_view": tuple(scores),
     }
-    means |= means_of(scores) | means_of(scores, ("flip", "psnr_right", "psnr_right_fitted", "psnr_white"))
+    means |= means_of(scores) | means_of(
+        scores, ("flip", "psnr_right", "psnr_right_fitted", "psnr_white")
+    )
     for metric in REGION_METRICS:
-        known = [value for value in (getattr(score, metric) for score in scores) if value is not None]
+        known = [
+            value for value in (getattr(score, metric) for score in scores) if value is not None
+        ]
         means[metric] = fmean(known) if known else None
     labels = sorted({label for score in scores for label in score.psnr_things})
-    shown = {i: [score.psnr_things[i] for score in scores if i in score.psnr_things] for i in labels}
+    shown = {
+        i: [score.psnr_things[i] for score in scores if i in score.psnr_things] for i in labels
+    }
     return means | {"psnr_things": {label: fmean(known) for label, known in shown.items()}}
 
 
 def _reasons(report: EvalReport, regions: Regions, tracks: TrackScores) -> dict[str, str]:
-    """Return why there are no values of parts of the images, and no errors of tracks, by the metric."""
-    reasons = {metric: regions.reason(metric) for metric in REGION_METRICS if getattr(report, metric) is None}
+    """Return why there are no values of parts of the images, and no errors of tracks, by the
+    metric."""
+    reasons = {
+        metric: regions.reason(metric)
+        for metric in REGION_METRICS
+        if getattr(report, metric) is None
+    }
     if report.psnr_right is None:
-        reasons |= dict.fromkeys(("psnr_right", "psnr_right_fitted"), "half a view has no pixel that counts")
+        reasons |= dict.fromkeys(
+            ("psnr_right", "psnr_right_fitted"), "half a view has no pixel that counts"
+        )
     return reasons if tracks.reason is None else reasons | {"track_error_px": tracks.reason}
 
 
@@ -293,21 +349,29 @@ def report_path(run_dir: Path, split: str) -> Path:
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
 
 
-def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:
+def _track_scores(
+    run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]
+) -> TrackScores:
     tracks = read_true_tracks(capture)
     cameras = training_cameras(views, run.config.data)
     if not isinstance(scene, GaussianScene):
         return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")
-    return track_scores(scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits))
+    return track_scores(
+        scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits)
+    )
 
 
 def parameter_megabytes(scene: GaussianScene) -> float:
-    """Return the size in 1e6 bytes as float32: 236 bytes per Gaussian at SH degree 3, the field, and masks as bits.
+    """Return the size in 1e6 bytes as float32: 236 bytes per Gaussian at SH degree 3, the field,
+    and masks as bits.
 
     Harmonics of a Gaussian that are all zero beyond the base colour do not count.
     """
     shapes = sum(x.numel() for name, x in scene.gaussians.tensors().items() if name != "sh")
-    return 4e-6 * (shapes + scene.num_colour_values + scene.num_motion_values) + 1e-6 * scene.num_mask_bytes
+    return (
+        4e-6 * (shapes + scene.num_colour_values + scene.num_motion_values)
+        + 1e-6 * scene.num_mask_bytes
+    )
 
 
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
@@ -320,7 +384,9 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
     if run.config.model.may_move and run.renderable.is_static:
-        notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
+        notes.append(
+            "the model is dynamic, but nothing moves in it: it is drawn as fast as a static one"
+        )
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")
     return tuple(notes)

@@ -32,23 +32,30 @@ NONE_OPAQUE = f"no Gaussian is more opaque than {MIN_OPACITY:g}"
 
 @dataclass(frozen=True)
 class TrackScores:
-    """Errors of tracks over all pairs of a view and a point that it shows; None where ``reason`` says why."""
+    """Errors of tracks over all pairs of a view and a point that it shows; None where ``reason``
+    says why."""
 
     # mean distance in the image between where the model carries a point and where it truly is
     error_px: float | None = None
     within_5px: float | None = None  # fraction of distances below ``CLOSE_PX``
-    motion_px: float | None = None  # mean distance of a model in which nothing moves, for comparison
+    # mean distance of a model in which nothing moves, for comparison
+    motion_px: float | None = None
     reason: str | None = None
 
 
 def track_scores(
-    scene: GaussianScene, tracks: TrueTracks | None, split: Sequence[tuple[View, Cameras]], views: Sequence[View]
+    scene: GaussianScene,
+    tracks: TrueTracks | None,
+    split: Sequence[tuple[View, Cameras]],
+    views: Sequence[View],
 ) -> TrackScores:
-    """Return the errors of a scene's motion in the images of a split, of which each view has its camera.
+    """Return the errors of a scene's motion in the images of a split, of which each view has its
+    camera.
 
-    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any of
-    ``views``, of all splits, shows it; from there they carry it as they move and turn. Where Gaussians are there for a
-    while only, others take over at each time. Distances are at most the diagonal of the image.
+    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of
+    those at which any of ``views``, of all splits, shows it; from there they carry it as they move
+    and turn. Where Gaussians are there for a while only, others take over at each time. Distances
+    are at most the diagonal of the image.
     """
     if tracks is None:
         return TrackScores(reason=NO_TRACKS)
@@ -57,8 +64,11 @@ def track_scores(
         return TrackScores(reason=NONE_OPAQUE)
     bound = _bind(scene, tracks, _times_of(tracks, views))
     rows = {name: row for row, name in enumerate(tracks.views.tolist())}
-    moved = _handed_on(scene, bound, sorted({view.time for view, _ in split if view.time is not None}))
-    errors, motions = [], []
+    moved = _handed_on(
+        scene, bound, sorted({view.time for view, _ in split if view.time is not None})
+    )
+    errors = []
+    motions = []
     for view, cameras in split:
         if view.time is None or view.name not in rows:
             continue
@@ -76,7 +86,9 @@ def track_scores(
     if not errors:
         return TrackScores(reason=NONE_SEEN)
     error = np.concatenate(errors)
-    return TrackScores(float(error.mean()), float((error < CLOSE_PX).mean()), float(np.concatenate(motions).mean()))
+    return TrackScores(
+        float(error.mean()), float((error < CLOSE_PX).mean()), float(np.concatenate(motions).mean())
+    )
 
 
 @dataclass(frozen=True)
@@ -91,7 +103,9 @@ class _Bound:
 
     def carried(self, scene: GaussianScene, time: float) -> np.ndarray:
         """Return the (P, 3) points at ``time``."""
-        return _carried(self.points, self.poses, _poses(scene, time).of(self.carriers), self.weights)
+        return _carried(
+            self.points, self.poses, _poses(scene, time).of(self.carriers), self.weights
+        )
 
 
 @dataclass(frozen=True)
@@ -107,27 +121,36 @@ class _Poses:
 
 def _poses(scene: GaussianScene, time: float) -> _Poses:
     gaussians = scene.at(time)
-    return _Poses(*(x.detach().cpu().double().numpy() for x in (gaussians.means, unit_quats(gaussians.quats))))
+    return _Poses(
+        *(x.detach().cpu().double().numpy() for x in (gaussians.means, unit_quats(gaussians.quats)))
+    )
 
 
 def _carried(points: np.ndarray, before: _Poses, after: _Poses, weights: np.ndarray) -> np.ndarray:
-    """Return ``points`` (P, 3) as (P, K) Gaussians carry them, which move and turn, with ``weights`` (P, K).
+    """Return ``points`` (P, 3) as (P, K) Gaussians carry them, which move and turn, with
+    ``weights`` (P, K).
 
-    What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone would not do.
+    What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone
+    would not do.
     """
     from scipy.spatial.transform import Rotation
 
     there = np.isfinite(points).all(1)
     found = np.full(points.shape, np.nan)
     arms = points[there, None] - before.means[there]
-    first, last = (Rotation.from_quat(x.quats[there].reshape(-1, 4)[:, [1, 2, 3, 0]]) for x in (before, after))
+    first, last = (
+        Rotation.from_quat(x.quats[there].reshape(-1, 4)[:, [1, 2, 3, 0]]) for x in (before, after)
+    )
     arms = (last * first.inv()).apply(arms.reshape(-1, 3)).reshape(arms.shape)
     found[there] = (weights[there, :, None] * (after.means[there] + arms)).sum(axis=1)
     return found
 
 
-def _handed_on(scene: GaussianScene, bound: _Bound, times: Sequence[float]) -> dict[float, np.ndarray]:
-    """Return where points are at ``times``, each carried from one time to the next by the Gaussians that are opaque.
+def _handed_on(
+    scene: GaussianScene, bound: _Bound, times: Sequence[float]
+) -> dict[float, np.ndarray]:
+    """Return where points are at ``times``, each carried from one time to the next by the Gaussians
+    that are opaque.
 
     Empty where the same Gaussians are there at all times.
     """
@@ -141,8 +164,11 @@ def _handed_on(scene: GaussianScene, bound: _Bound, times: Sequence[float]) -> d
         for now, then in pairwise(order):
             rows = np.flatnonzero(np.isfinite(found[now]).all(1) & ~np.isfinite(found[then]).all(1))
             if len(rows):
-                carriers, weights = _nearest(scene, now, poses[now].means, found[now][rows], bound.weights.shape[1])
-                before, after = poses[now].of(carriers), poses[then].of(carriers)
+                carriers, weights = _nearest(
+                    scene, now, poses[now].means, found[now][rows], bound.weights.shape[1]
+                )
+                before = poses[now].of(carriers)
+                after = poses[then].of(carriers)
                 found[then][rows] = _carried(found[now][rows], before, after, weights)
     return found
 
@@ -150,19 +176,23 @@ def _handed_on(scene: GaussianScene, bound: _Bound, times: Sequence[float]) -> d
 def _nearest(
     scene: GaussianScene, time: float, means: np.ndarray, points: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (P, K) rows of the ``count`` Gaussians nearest to ``points`` (P, 3), and their weights, by opacity."""
+    """Return (P, K) rows of the ``count`` Gaussians nearest to ``points`` (P, 3), and their
+    weights, by opacity."""
     from scipy.spatial import KDTree
 
     opacities = _opacities(scene, time)
     # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
-    opaque = np.argsort(-opacities, kind="stable")[: max(count, int((opacities > MIN_OPACITY).sum()))]
+    opaque = np.argsort(-opacities, kind="stable")[
+        : max(count, int((opacities > MIN_OPACITY).sum()))
+    ]
     _, nearest = KDTree(means[opaque]).query(points, k=count)
     chosen = opaque[np.reshape(nearest, (len(points), count))]
     return chosen, opacities[chosen] / opacities[chosen].sum(axis=1, keepdims=True)
 
 
 def _times_of(tracks: TrueTracks, views: Sequence[View]) -> np.ndarray:
-    """Return the (T,) times of the tracks as the capture has them, by its views; NaN of those that no view shows."""
+    """Return the (T,) times of the tracks as the capture has them, by its views; NaN of those that
+    no view shows."""
     times = np.full(len(tracks.points), np.nan)
     known = {view.name: view.time for view in views if view.time is not None}
     for name, row in zip(tracks.views.tolist(), tracks.moments.tolist(), strict=True):
@@ -187,13 +217,15 @@ def _bind(scene: GaussianScene, tracks: TrueTracks, times: np.ndarray) -> _Bound
         points = tracks.points[row, members].astype(np.float64)
         chosen, weights = _nearest(scene, time, poses.means, points, carriers_each)
         bound.points[members], bound.times[members], bound.carriers[members] = points, time, chosen
-        bound.poses.means[members], bound.poses.quats[members] = poses.means[chosen], poses.quats[chosen]
+        bound.poses.means[members] = poses.means[chosen]
+        bound.poses.quats[members] = poses.quats[chosen]
         bound.weights[members] = weights
     return bound
 
 
 def _binding_rows(tracks: TrueTracks, times: np.ndarray) -> dict[int, list[int]]:
-    """Return, by row of ``times``, the points bound then: nearest to the middle of when they are seen."""
+    """Return, by row of ``times``, the points bound then: nearest to the middle of when they are
+    seen."""
     seen = np.zeros(tracks.points.shape[:2], bool)
     np.logical_or.at(seen, tracks.moments, tracks.visible)
     seen &= np.isfinite(tracks.points).all(axis=2) & np.isfinite(times)[:, None]
@@ -215,7 +247,9 @@ def _opacities(scene: GaussianScene, time: float | None) -> np.ndarray:
 
 def _pixels(points: np.ndarray, cameras: Cameras) -> np.ndarray:
     """Return the (P, 2) pixels of ``points`` (P, 3); NaN of those behind the camera."""
-    pose, intrinsics = (x[0].cpu().double().numpy() for x in (cameras.cam_from_world, cameras.intrinsics))
+    pose, intrinsics = (
+        x[0].cpu().double().numpy() for x in (cameras.cam_from_world, cameras.intrinsics)
+    )
     local = points @ pose[:3, :3].T + pose[:3, 3]
     depth = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
     return (local / depth) @ intrinsics[:2].T

@@ -1,7 +1,9 @@
-"""Scores of single views, and their means: the render against the truth, and how long it took to draw.
+"""Scores of single views, and their means: the render against the truth, and how long it took to
+draw.
 
-Of people also inside their box, and on black, as published figures have it. Where training images differ in exposure,
-so do test images: the published protocol (Martin-Brualla et al. 2021) fits the left half, and scores the right half.
+Of people also inside their box, and on black, as published figures have it. Where training images
+differ in exposure, so do test images: the published protocol (Martin-Brualla et al. 2021) fits the
+left half, and scores the right half.
 """
 
 from __future__ import annotations
@@ -41,21 +43,28 @@ class Drawing:
 
     @torch.no_grad()
     def image(self, cameras: Cameras, time: float | None) -> Tensor:
-        """Return the image (H, W, 3) of the one camera at ``time``; upscaled bilinearly if ``scale`` < 1."""
+        """Return the image (H, W, 3) of the one camera at ``time``; upscaled bilinearly if
+        ``scale`` < 1."""
         small = cameras.scaled(self.scale)
-        rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[0]
+        rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[
+            0
+        ]
         size = (cameras.height, cameras.width)
         if rgb.shape[:2] == size:
             return rgb
-        upscaled = torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None], size=size, mode="bilinear")
+        upscaled = torch.nn.functional.interpolate(
+            rgb.permute(2, 0, 1)[None], size=size, mode="bilinear"
+        )
         return upscaled[0].permute(1, 2, 0)
 
 
-def seconds_in_turn(drawings: Sequence[Drawing], images: Sequence[Image], rounds: int) -> np.ndarray:
+def seconds_in_turn(
+    drawings: Sequence[Drawing], images: Sequence[Image], rounds: int
+) -> np.ndarray:
     """Return the seconds (D, ``rounds`` * I) that each of D drawings takes for each image.
 
-    All draw each image in turn, starting with another one each time, so that other load on the machine affects all
-    alike. ``images``: I; their cameras and times are drawn.
+    All draw each image in turn, starting with another one each time, so that other load on the
+    machine affects all alike. ``images``: I; their cameras and times are drawn.
     """
     seconds = np.zeros((len(drawings), rounds * len(images)))
     for drawing in drawings:
@@ -74,9 +83,9 @@ def seconds_in_turn(drawings: Sequence[Drawing], images: Sequence[Image], rounds
 class ViewScore:
     """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
 
-    ``render_seconds`` holds ``deform_seconds``. Of images with alpha, ``psnr_white`` and ``psnr_black`` are of the full
-    image on white and on black. Of people, ``psnr_person`` and ``ssim_person`` are inside the person's box,
-    ``ssim_black`` and ``lpips_black`` on black.
+    ``render_seconds`` holds ``deform_seconds``. Of images with alpha, ``psnr_white`` and
+    ``psnr_black`` are of the full image on white and on black. Of people, ``psnr_person`` and
+    ``ssim_person`` are inside the person's box, ``ssim_black`` and ``lpips_black`` on black.
     """
 
     name: str
@@ -105,7 +114,8 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class PoseScores:
-    """Means over views of a person in poses that were fitted to these views themselves; names as in ``ViewScore``."""
+    """Means over views of a person in poses that were fitted to these views themselves; names as in
+    ``ViewScore``."""
 
     psnr: float
     ssim: float
@@ -129,8 +139,8 @@ def score_views(
 ) -> tuple[list[ViewScore], dict[str, str]]:
     """Return scores of the Gaussians against images, and the reasons for metrics that are None.
 
-    The scene is drawn at the time of each image on ``background`` (3,); ``regions`` are of the split, None: not
-    measured.
+    The scene is drawn at the time of each image on ``background`` (3,); ``regions`` are of the
+    split, None: not measured.
     """
     scores: list[ViewScore] = []
     reasons: dict[str, str] = {}
@@ -141,8 +151,11 @@ def score_views(
         rendered = rendering.rgb[0]
         if not rendered.isfinite().all():
             raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
-        truth, mask = image.composite(background), image.mask
-        people = {} if avatar_of(scene) is None else person_scores(image, rendering, background, lpips)
+        truth = image.composite(background)
+        mask = image.mask
+        people = (
+            {} if avatar_of(scene) is None else person_scores(image, rendering, background, lpips)
+        )
         parts = right_half_scores(image, rendering, background)
         parts |= background_scores(image, rendering, background)
         parts |= {} if regions is None else regions.scores(image, rendered, truth)
@@ -170,12 +183,16 @@ def score_views(
     return scores, reasons
 
 
-def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips: Lpips) -> dict[str, float | None]:
+def person_scores(
+    image: Image, rendering: Rendering, background: Tensor, lpips: Lpips
+) -> dict[str, float | None]:
     """Return the scores by their names in ``ViewScore``; none where nobody is to be seen."""
     box = None if image.alpha is None else silhouette_box(image.alpha)
     if box is None:
         return {}
-    truth, mask, rendered = image.composite(background), image.mask, rendering.rgb[0]
+    truth = image.composite(background)
+    mask = image.mask
+    rendered = rendering.rgb[0]
     inside = None if mask is None else mask[box]
     black = rendered - rendering.transmittance[0][..., None] * background
     return {
@@ -186,8 +203,11 @@ def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips:
     }
 
 
-def background_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float | None]:
-    """Return ``psnr_white`` and ``psnr_black``, dB, from one rendering on ``background`` (3,); None without alpha."""
+def background_scores(
+    image: Image, rendering: Rendering, background: Tensor
+) -> dict[str, float | None]:
+    """Return ``psnr_white`` and ``psnr_black``, dB, from one rendering on ``background`` (3,); None
+    without alpha."""
     scores: dict[str, float | None] = {"psnr_white": None, "psnr_black": None}
     if image.alpha is None:
         return scores
@@ -198,10 +218,14 @@ def background_scores(image: Image, rendering: Rendering, background: Tensor) ->
     return scores
 
 
-def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float | None]:
-    """Return ``psnr_right`` and ``psnr_right_fitted``, dB; None where a half of the image has no pixel that counts.
+def right_half_scores(
+    image: Image, rendering: Rendering, background: Tensor
+) -> dict[str, float | None]:
+    """Return ``psnr_right`` and ``psnr_right_fitted``, dB; None where a half of the image has no
+    pixel that counts.
 
-    That is the PSNR of the right half as the scene shows it, and after an affine colour fitted on the left half.
+    That is the PSNR of the right half as the scene shows it, and after an affine colour fitted on
+    the left half.
     """
     truth = image.composite(background)
     left = torch.zeros_like(truth[..., 0])
@@ -219,11 +243,21 @@ def right_half_scores(image: Image, rendering: Rendering, background: Tensor) ->
     }
 
 
-_OF_POSES = ("psnr", "ssim", "lpips", "psnr_person", "ssim_person", "psnr_black", "ssim_black", "lpips_black")
+_OF_POSES = (
+    "psnr",
+    "ssim",
+    "lpips",
+    "psnr_person",
+    "ssim_person",
+    "psnr_black",
+    "ssim_black",
+    "lpips_black",
+)
 
 
 def means_of(scores: Sequence[ViewScore], names: Sequence[str] = _OF_POSES) -> dict[str, Any]:
-    """Return the means of metrics; by default those that exist for poses of the capture and for fitted ones."""
+    """Return the means of metrics; by default those that exist for poses of the capture and for
+    fitted ones."""
     return {name: mean_of([getattr(score, name) for score in scores]) for name in names}
 
 

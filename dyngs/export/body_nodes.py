@@ -1,4 +1,5 @@
-"""Bodies that turn as animated nodes of a ``.glb``; all other Gaussians stand as they are at one time."""
+"""Bodies that turn as animated nodes of a ``.glb``; all other Gaussians stand as they are at one
+time."""
 
 from __future__ import annotations
 
@@ -46,30 +47,42 @@ class BodiesFile:
 
 @torch.no_grad()
 def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY_ARE) -> BodiesFile:
-    """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an animation, one for the rest.
+    """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
+    animation, one for the rest.
 
-    Without the animation the file shows the scene at ``time``. Raises DyngsError: no body turns in this run, or the
-    file cannot be written.
+    Without the animation the file shows the scene at ``time``. Raises DyngsError: no body turns in
+    this run, or the file cannot be written.
     """
     inputs_of(opened).require_output(path)
     scene = field_scene_of(opened.scene)
     field = None if scene is None else bodies_of(scene.field)
     if scene is None or field is None:
-        raise DyngsError("--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N")
+        raise DyngsError(
+            "--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N"
+        )
     scene = replace(scene, masks=None)  # the rows of the labels
     splat = splats_at(opened, scene, time, how)
     require_writable(path, splat.gaussians)
     gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
     gaussians = with_degree(gaussians, min(gaussians.sh_degree, _MOST_DEGREE))
-    labels = torch.full((len(scene),), -1, device=scene.moving.device).index_copy(0, scene.moving, field.rest.labels)
+    labels = torch.full((len(scene),), -1, device=scene.moving.device).index_copy(
+        0, scene.moving, field.rest.labels
+    )
     moments = np.linspace(0.0, 1.0, _STEPS_PER_TIME * max(len(scene.times) - 1, 1) + 1)
-    here, there = _poses(field, [time], splat.frame), _poses(field, moments, splat.frame)
-    document, nodes, meshes, channels = GlbDocument(), [], [], []
+    here = _poses(field, [time], splat.frame)
+    there = _poses(field, moments, splat.frame)
+    document = GlbDocument()
+    nodes = []
+    meshes = []
+    channels = []
     for body in range(-1, len(field.rest.centers)):
         own = gaussians.picked(torch.nonzero(labels == body)[:, 0])
         if not len(own):
             continue
-        node: dict[str, object] = {"name": "rest" if body < 0 else f"body {body}", "mesh": len(meshes)}
+        node: dict[str, object] = {
+            "name": "rest" if body < 0 else f"body {body}",
+            "mesh": len(meshes),
+        }
         if body >= 0:
             place = here.places[0, body]
             own = own.replace(means=(own.means.double() - torch.from_numpy(place)).float())
@@ -90,7 +103,9 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     }
     with atomic_file(path) as temporary:
         document.write(temporary)
-    notes = [f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}"]
+    notes = [
+        f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}"
+    ]
     notes.append(f"all else and shadows stand as at time {time:g}; a sequence has their motion")
     return BodiesFile(path, splat, (*notes, *offset_notes(splat, "the file states it")))
 

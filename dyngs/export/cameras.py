@@ -1,4 +1,5 @@
-"""Cameras of a run as a transforms.json: those of training as training found them, the others by the capture."""
+"""Cameras of a run as a transforms.json: those of training as training found them, the others by
+the capture."""
 
 from __future__ import annotations
 
@@ -22,12 +23,17 @@ _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 def write_cameras(
-    path: Path, capture: Capture, splits: Mapping[Split, Sequence[View]], world: Similarity | None = None
+    path: Path,
+    capture: Capture,
+    splits: Mapping[Split, Sequence[View]],
+    world: Similarity | None = None,
 ) -> Path:
-    """Write cameras of train, val and test in nerfstudio's layout, and the capture's points; return ``path``.
+    """Write cameras of train, val and test in nerfstudio's layout, and the capture's points; return
+    ``path``.
 
-    ``file_path`` is the way to the images from the folder of ``path``. Poses are moved by ``world``; without it they
-    are in the world of the capture's files. Coefficients of distortion are those of the capture.
+    ``file_path`` is the way to the images from the folder of ``path``. Poses are moved by
+    ``world``; without it they are in the world of the capture's files. Coefficients of distortion
+    are those of the capture.
     """
     for out in (path, path.with_name(POINTS_NAME)):
         inputs_of(capture).require_output(out)
@@ -54,9 +60,13 @@ def write_cameras(
 def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dict[str, object]:
     """Return the entry of a view; its files are named as seen from ``folder``."""
     pose = opengl_from_cam(view.cam_from_world)
-    pose[:3] = np.concatenate([world.rotation @ pose[:3, :3], world.points(pose[:3, 3])[:, None]], axis=1)
+    pose[:3] = np.concatenate(
+        [world.rotation @ pose[:3, :3], world.points(pose[:3, 3])[:, None]], axis=1
+    )
     first, last = capture.span or (0.0, 1.0)
-    (fx, _, cx), (_, fy, cy) = (view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1])).tolist()[:2]
+    (fx, _, cx), (_, fy, cy) = (
+        view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1])
+    ).tolist()[:2]
     frame: dict[str, object] = {
         "file_path": _way(view.image_path, folder),
         "transform_matrix": pose.tolist(),
@@ -81,13 +91,20 @@ def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dic
         frame["time"] = first + view.time * (last - first)
     if view.frame is not None:
         frame["frame"] = view.frame
-    files = {"mask_path": view.mask_path, "depth_file_path": view.depth_path, "flow_file_path": view.flow_path}
-    files["instance_mask_path" if view.motion_mask_labels else "motion_mask_path"] = view.motion_mask_path
+    files = {
+        "mask_path": view.mask_path,
+        "depth_file_path": view.depth_path,
+        "flow_file_path": view.flow_path,
+    }
+    files["instance_mask_path" if view.motion_mask_labels else "motion_mask_path"] = (
+        view.motion_mask_path
+    )
     return frame | {key: _way(file, folder) for key, file in files.items() if file is not None}
 
 
 def _way(file: Path, folder: Path) -> str:
-    """Return the way from ``folder`` to ``file``; the whole path where there is none, as between two drives."""
+    """Return the way from ``folder`` to ``file``; the whole path where there is none, as between
+    two drives."""
     file = Path(os.path.abspath(file))
     try:
         return os.path.relpath(file, folder).replace(os.sep, "/")

@@ -1,4 +1,5 @@
-"""The camera path of a command: placed by cameras, a person or points, read from a file, or the camera of one view."""
+"""The camera path of a command: placed by cameras, a person or points, read from a file, or the
+camera of one view."""
 
 from __future__ import annotations
 
@@ -11,7 +12,14 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.camera_paths.along import path_along
 from dyngs.camera_paths.orbit import frame_orbit_for_points, orbit_of, orbit_path, spiral_path
-from dyngs.camera_paths.path import CameraPath, path_file, read_path, resize_cameras, static_path, with_times
+from dyngs.camera_paths.path import (
+    CameraPath,
+    path_file,
+    read_path,
+    resize_cameras,
+    static_path,
+    with_times,
+)
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.export.images import file_stems
@@ -32,35 +40,46 @@ _RING = 24
 class PathOptions:
     """Cameras and times to render."""
 
-    # "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None: one
-    # fixed camera
+    # "orbit", "spiral", "along" (the training cameras), a JSON file of cameras
+    # (docs/camera_paths.md), or None: one fixed camera
     path: str | None = "orbit"
-    num_frames: int | None = None  # frames of a path that is not a file; None: as many as a motion has, else 120
+    # frames of a path that is not a file; None: as many as a motion has, else 120
+    num_frames: int | None = None
     # width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file
     size: tuple[int, int] | None = None
-    # scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view for a
-    # fixed camera, from 0 to 1 along a path
+    # scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of
+    # the view for a fixed camera, from 0 to 1 along a path
     times: tuple[float, ...] | None = None
-    view: str | None = None  # the view of the fixed camera: its name, the name of its image, or its number from 0
+    # the view of the fixed camera: its name, the name of its image, or its number from 0
+    view: str | None = None
     split: str | None = None  # split of that view; None: test, or val or train if there is none
 
 
 def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
-    """Return the cameras and times along which a scene is rendered, with notes about defaults that were chosen.
+    """Return the cameras and times along which a scene is rendered, with notes about defaults that
+    were chosen.
 
-    Raises DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what
-    a file cannot have.
+    Raises DyngsError: a missing capture, no such view, an invalid path file, times that do not fit
+    its frames, or what a file cannot have.
     """
-    scene, times = opened.renderable, options.times
+    scene = opened.renderable
+    times = options.times
     if opened.captured is None:
         _require_fitting(opened, options)
-    path = _fixed_camera(opened, options) if options.path is None else _moving(opened, options.path, options)
+    path = (
+        _fixed_camera(opened, options)
+        if options.path is None
+        else _moving(opened, options.path, options)
+    )
     notes = path.notes
     if scene.is_static and times is not None:
         notes = (*notes, "nothing moves in this run: it looks the same at all times")
     elif not scene.is_static and path.times is None:
         path = with_times(path, np.linspace(0, 1, len(path)).tolist())
-        notes = (*notes, "time runs from 0 to 1 along the path; --time or --times choose other times")
+        notes = (
+            *notes,
+            "time runs from 0 to 1 along the path; --time or --times choose other times",
+        )
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
@@ -69,10 +88,13 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
 def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
     """Return the view called ``name``, by default the first one.
 
-    ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0. ``split``:
-    None looks for a name in all, for a number in the first that has views. Raises DyngsError: no such view or split.
+    ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the
+    split, from 0. ``split``: None looks for a name in all, for a number in the first that has
+    views. Raises DyngsError: no such view or split.
     """
-    order = [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
+    order = (
+        [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
+    )
     candidates = [split_views(capture, s) for s in order]
     if name is None:
         return candidates[0][0]
@@ -90,7 +112,8 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
 
 
 def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
-    """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all of their motion.
+    """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all
+    of their motion.
 
     z is up where nothing says what is.
     """
@@ -106,7 +129,8 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
 
 
 def points_at(scene: Renderable, time: float | None = None) -> Tensor:
-    """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box of all else."""
+    """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box
+    of all else."""
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
@@ -121,19 +145,24 @@ def front_of(opened: Opened, ring: Cameras) -> int:
 def _require_fitting(opened: Opened, options: PathOptions) -> None:
     file = opened.config.data.root
     if options.path == "along":
-        raise DyngsError(f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit")
+        raise DyngsError(
+            f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit"
+        )
     if opened.person is not None:
         if options.view is not None:
             raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
     elif options.path is None or options.times is not None or options.view is not None:
         kind = file.suffix.lower()
-        raise DyngsError(f"{file}: a {kind} holds one time and no views; leave out --time, --times and --view")
+        raise DyngsError(
+            f"{file}: a {kind} holds one time and no views; leave out --time, --times and --view"
+        )
 
 
 def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
     if opened.captured is None:
         ring = orbit_around(opened, _RING, options.size or DEFAULT_SIZE)
-        camera, times = ring.select(front_of(opened, ring)), opened.renderable.times
+        camera = ring.select(front_of(opened, ring))
+        times = opened.renderable.times
     else:
         view = view_to_show(opened.capture, options.view, options.split)
         (camera,) = training_cameras([view], opened.config.data)
@@ -155,8 +184,11 @@ def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
 
 
 def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
-    """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by the scene."""
-    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(opened.renderable.times))
+    """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by
+    the scene."""
+    frames = options.num_frames or (
+        DEFAULT_FRAMES if opened.fps is None else len(opened.renderable.times)
+    )
     up = None if opened.stated_up is None else opened.direction_of(opened.stated_up)
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
@@ -164,7 +196,9 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
             return CameraPath(orbit_around(opened, frames, size))
         ring = orbit_around(opened, _RING, size)
         arc = [(front_of(opened, ring) + i) % _RING for i in (-1, 0, 1)]
-        near = replace(ring, cam_from_world=ring.cam_from_world[arc], intrinsics=ring.intrinsics[arc])
+        near = replace(
+            ring, cam_from_world=ring.cam_from_world[arc], intrinsics=ring.intrinsics[arc]
+        )
         return CameraPath(spiral_path(near, frames))
     views = opened.capture.splits["train"]
     cameras = cameras_for_paths(views, opened.config.data)
@@ -174,10 +208,14 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
             if opened.person is None or orbit.width is None:
                 return CameraPath(orbit_path(cameras, frames, up), notes=orbit.notes)
             notes = ("the person was filmed from one side: the orbit goes all around them",)
-            return CameraPath(orbit_around(opened, frames, (cameras.width, cameras.height)), notes=notes)
+            return CameraPath(
+                orbit_around(opened, frames, (cameras.width, cameras.height)), notes=notes
+            )
         case "spiral":
             return CameraPath(spiral_path(cameras, frames, up))
         case _:
             times = [view.time for view in views if view.time is not None]
-            clip = len(times) == len(views) and not opened.renderable.is_static and opened.fps is None
+            clip = (
+                len(times) == len(views) and not opened.renderable.is_static and opened.fps is None
+            )
             return path_along(cameras, frames, times if clip else None, up)

@@ -26,30 +26,48 @@ class SheetRow:
     rendered: np.ndarray
 
 
-def contact_sheet(rows: Sequence[SheetRow], error_gain: float = 5.0, panel_width: int = 480) -> np.ndarray:
-    """Return a sheet (H', W', 3) uint8 with truth, render and error side by side, one labelled view per row.
+def contact_sheet(
+    rows: Sequence[SheetRow], error_gain: float = 5.0, panel_width: int = 480
+) -> np.ndarray:
+    """Return a sheet (H', W', 3) uint8 with truth, render and error side by side, one labelled view
+    per row.
 
-    The error is the mean absolute difference of the channels times ``error_gain``, in magma colours (black = equal).
-    Images wider than ``panel_width`` are shrunk, after the difference was taken. Raises ValueError: no rows, or a truth
-    and a render of different sizes.
+    The error is the mean absolute difference of the channels times ``error_gain``, in magma colours
+    (black = equal). Images wider than ``panel_width`` are shrunk, after the difference was taken.
+    Raises ValueError: no rows, or a truth and a render of different sizes.
     """
     if not rows:
         raise ValueError("a contact sheet needs at least one row")
     bands = []
     for row in rows:
         if row.truth.shape != row.rendered.shape or row.truth.ndim != 3:
-            raise ValueError(f"{row.label}: truth {row.truth.shape} and render {row.rendered.shape} differ in shape")
-        truth, rendered = to_uint8(row.truth), to_uint8(row.rendered)
-        difference = np.abs(truth.astype(np.float32) - rendered.astype(np.float32)).mean(axis=2) / 255.0
+            raise ValueError(
+                f"{row.label}: truth {row.truth.shape} and render {row.rendered.shape} differ in shape"
+            )
+        truth = to_uint8(row.truth)
+        rendered = to_uint8(row.rendered)
+        difference = (
+            np.abs(truth.astype(np.float32) - rendered.astype(np.float32)).mean(axis=2) / 255.0
+        )
         panels = (truth, rendered, color_map(error_gain * difference, "magma"))
-        bands.append(_band(row.label, f"error x{error_gain:g}", [_shrink(panel, panel_width) for panel in panels]))
+        bands.append(
+            _band(
+                row.label,
+                f"error x{error_gain:g}",
+                [_shrink(panel, panel_width) for panel in panels],
+            )
+        )
     width = max(band.shape[1] for band in bands)
-    padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=BACKGROUND) for b in bands]
+    padded = [
+        np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=BACKGROUND)
+        for b in bands
+    ]
     return np.pad(np.concatenate(padded), ((0, GAP), (0, 0), (0, 0)), constant_values=BACKGROUND)
 
 
 def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
-    """Return near and far for ``depth_to_rgb``: the 1st and 99th percentile of depth where alpha is at least 0.5.
+    """Return near and far for ``depth_to_rgb``: the 1st and 99th percentile of depth where alpha is
+    at least 0.5.
 
     Any equal shapes, so that the frames of a video can share limits. (0, 1) if nothing is opaque.
     """
@@ -60,23 +78,31 @@ def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
     return float(near), float(far)
 
 
-def depth_to_rgb(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
-    """Return depth as colours (H, W, 3) uint8: near is red, far is blue (turbo), darkened to black where alpha is 0.
+def depth_to_rgb(
+    depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None
+) -> np.ndarray:
+    """Return depth as colours (H, W, 3) uint8: near is red, far is blue (turbo), darkened to black
+    where alpha is 0.
 
-    ``depth``: (H, W) expected depth in world units; non-finite values count as far. ``alpha``: (H, W) in [0, 1].
-    ``limits``: near and far; None: ``depth_limits`` of this image.
+    ``depth``: (H, W) expected depth in world units; non-finite values count as far. ``alpha``: (H,
+    W) in [0, 1]. ``limits``: near and far; None: ``depth_limits`` of this image.
     """
     near, far = limits or depth_limits(depth, alpha)
-    fraction = (far - np.nan_to_num(depth, nan=far, posinf=far, neginf=near)) / max(far - near, 1e-12)
+    fraction = (far - np.nan_to_num(depth, nan=far, posinf=far, neginf=near)) / max(
+        far - near, 1e-12
+    )
     colors = color_map(np.clip(fraction, 0.0, 1.0), "turbo").astype(np.float32)
     return (colors * np.clip(alpha, 0.0, 1.0)[..., None] + 0.5).astype(np.uint8)
 
 
 def color_map(values: np.ndarray, name: str) -> np.ndarray:
-    """Return colours (H, W, 3) uint8 of values (H, W) in [0, 1], by a colour map of OpenImageIO (magma, turbo...)."""
+    """Return colours (H, W, 3) uint8 of values (H, W) in [0, 1], by a colour map of OpenImageIO
+    (magma, turbo...)."""
     import OpenImageIO as oiio
 
-    source = oiio.ImageBuf(np.ascontiguousarray(np.clip(values, 0.0, 1.0)[..., None], dtype=np.float32))
+    source = oiio.ImageBuf(
+        np.ascontiguousarray(np.clip(values, 0.0, 1.0)[..., None], dtype=np.float32)
+    )
     colored = oiio.ImageBufAlgo.color_map(source, 0, name)
     if colored.has_error:
         raise ValueError(f"no colour map '{name}': {colored.geterror()}")
@@ -88,7 +114,9 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
 
 def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
     height, width = panels[0].shape[:2]
-    band = np.full((LABEL_HEIGHT + height, GAP + len(panels) * (width + GAP), 3), BACKGROUND, np.uint8)
+    band = np.full(
+        (LABEL_HEIGHT + height, GAP + len(panels) * (width + GAP), 3), BACKGROUND, np.uint8
+    )
     for i, panel in enumerate(panels):
         left = GAP + i * (width + GAP)
         band[LABEL_HEIGHT:, left : left + width] = panel
@@ -107,8 +135,11 @@ def _write_text(strip: np.ndarray, text: str) -> None:
     import OpenImageIO as oiio
 
     image = oiio.ImageBuf(np.ascontiguousarray(strip))
-    ink, size = (0.85, 0.85, 0.85), LARGEST_TEXT
-    while size > SMALLEST_TEXT and oiio.ImageBufAlgo.text_size(text, size).width > strip.shape[1] - 4:
+    ink = (0.85, 0.85, 0.85)
+    size = LARGEST_TEXT
+    while (
+        size > SMALLEST_TEXT and oiio.ImageBufAlgo.text_size(text, size).width > strip.shape[1] - 4
+    ):
         size -= 1
     if oiio.ImageBufAlgo.render_text(image, 2, LABEL_HEIGHT - 7, text, size, textcolor=ink):
         strip[:] = image.get_pixels(oiio.UINT8)

@@ -22,7 +22,8 @@ from dyngs.splats.splat_file import SplatFile, drawing_options, splat_options
 
 VIEWS = 4
 _LONGEST_SIDE = 240
-_LEAST_FRACTION = 0.002  # cameras that see the scene in fewer pixels than this are replaced by an orbit
+# cameras that see the scene in fewer pixels than this are replaced by an orbit
+_LEAST_FRACTION = 0.002
 FAINT = 30.0  # dB, below which a line about the difference is a warning
 
 
@@ -45,11 +46,14 @@ class Redrawn:
         return self.psnr < FAINT
 
 
-def compare_run(opened: Opened, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile) -> Redrawn:
-    """Return how a file differs from a scene at one time, seen by cameras of its capture, else from an orbit.
+def compare_run(
+    opened: Opened, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile
+) -> Redrawn:
+    """Return how a file differs from a scene at one time, seen by cameras of its capture, else from
+    an orbit.
 
-    ``time``: in [0, 1]. ``meant``: what the file is meant to hold, turned from the axes of the scene. Raises
-    DyngsError: no camera sees anything.
+    ``time``: in [0, 1]. ``meant``: what the file is meant to hold, turned from the axes of the
+    scene. Raises DyngsError: no camera sees anything.
     """
     with torch.no_grad():
         moment = scene.time_step(time)
@@ -59,8 +63,12 @@ def compare_run(opened: Opened, scene: GaussianScene, time: float, meant: SplatF
                 continue
             drawn = scene.render(cameras, moment, background=_black(moment.gaussians.means))
             if float((drawn.alpha > 0.1).float().mean()) >= _LEAST_FRACTION:
-                return compare(drawn.rgb, frame.cameras(cameras), read, scene.options.near * frame.scale)
-    raise DyngsError("nothing of the scene is seen by the cameras of the capture, or from an orbit around it")
+                return compare(
+                    drawn.rgb, frame.cameras(cameras), read, scene.options.near * frame.scale
+                )
+    raise DyngsError(
+        "nothing of the scene is seen by the cameras of the capture, or from an orbit around it"
+    )
 
 
 def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
@@ -68,15 +76,21 @@ def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
 
     Raises DyngsError: the file cannot be read.
     """
-    cameras, moved = around(splat), written.splat.frame.after(splat.frame.inverse())
+    cameras = around(splat)
+    moved = written.splat.frame.after(splat.frame.inverse())
     options = drawing_options(splat)
     with torch.no_grad():
-        wanted = render(splat.gaussians, cameras, options, background=_black(splat.gaussians.means)).rgb
-    return compare(wanted, moved.cameras(cameras), read_splats(written.path), options.near * moved.scale)
+        wanted = render(
+            splat.gaussians, cameras, options, background=_black(splat.gaussians.means)
+        ).rgb
+    return compare(
+        wanted, moved.cameras(cameras), read_splats(written.path), options.near * moved.scale
+    )
 
 
 def compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> Redrawn:
-    """Return how what a file holds, seen by cameras in its axes, differs from images (V, H, W, 3)."""
+    """Return how what a file holds, seen by cameras in its axes, differs from images (V, H, W,
+    3)."""
     options = replace(splat_options(splat), near=near)
     with torch.no_grad():
         drawn = render(splat.gaussians, cameras, options, background=_black(wanted)).rgb
@@ -85,20 +99,27 @@ def compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> 
 
 
 def capture_cameras(opened: Opened) -> Cameras | None:
-    """Return a few training cameras, in images of modest size; None where no capture can be read."""
+    """Return a few training cameras, in images of modest size; None where no capture can be
+    read."""
     cameras = opened.cameras
     if cameras is None:
         return None
     rows = np.unique(np.linspace(0, len(cameras) - 1, VIEWS).round().astype(int))
-    few = replace(cameras, cam_from_world=cameras.cam_from_world[rows], intrinsics=cameras.intrinsics[rows])
+    few = replace(
+        cameras, cam_from_world=cameras.cam_from_world[rows], intrinsics=cameras.intrinsics[rows]
+    )
     fraction = min(1.0, _LONGEST_SIDE / max(few.width, few.height))
-    return resize_cameras(few, max(1, round(fraction * few.width)), max(1, round(fraction * few.height)))
+    return resize_cameras(
+        few, max(1, round(fraction * few.width)), max(1, round(fraction * few.height))
+    )
 
 
 def around(splat: SplatFile) -> Cameras:
     """Return an orbit around Gaussians, in their own axes."""
     means = splat.gaussians.means.numpy()
-    return frame_orbit_for_points(means, VIEWS, (_LONGEST_SIDE, _LONGEST_SIDE * 3 // 4), AXES[splat.up or "z"])
+    return frame_orbit_for_points(
+        means, VIEWS, (_LONGEST_SIDE, _LONGEST_SIDE * 3 // 4), AXES[splat.up or "z"]
+    )
 
 
 def _black(like: Tensor) -> Tensor:

@@ -24,7 +24,8 @@ from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
 from dyngs.storage.tensors import FIELD, drawable
 
 MISSED = 1.05
-"""A file whose images change by so many times what is allowed is not written; less is rounding of the drawing."""
+"""A file whose images change by so many times what is allowed is not written; less is rounding of
+the drawing."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +39,20 @@ class SceneFile:
 
 
 def write_scene_file(
-    run_dir: Path, out: Path, max_change: float | None = None, field_step: float = 1.0, data_root: Path | None = None
+    run_dir: Path,
+    out: Path,
+    max_change: float | None = None,
+    field_step: float = 1.0,
+    data_root: Path | None = None,
 ) -> SceneFile:
-    """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that can be drawn.
+    """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that
+    can be drawn.
 
-    ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean square over all values
-    of some training images, grey levels of 255; None: what lowers their PSNR by ``LOSS_DB``. ``field_step``: how many
-    times as coarsely the field is rounded. Raises DyngsError: no such run, ``out`` holds another one, or the images
-    would change by more than ``max_change``; nothing is written then.
+    ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean
+    square over all values of some training images, grey levels of 255; None: what lowers their PSNR
+    by ``LOSS_DB``. ``field_step``: how many times as coarsely the field is rounded. Raises
+    DyngsError: no such run, ``out`` holds another one, or the images would change by more than
+    ``max_change``; nothing is written then.
     """
     config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)
@@ -54,7 +61,10 @@ def write_scene_file(
         scene = restored_model(checkpoint, config.model)
         plan = storage_plan(config, checkpoint, scene, max_change)
         precision = plan.precision
-        steps = {name: step * (field_step if name.startswith(FIELD) else 1) for name, step in precision.steps.items()}
+        steps = {
+            name: step * (field_step if name.startswith(FIELD) else 1)
+            for name, step in precision.steps.items()
+        }
         data = encoded(checkpoint.info, scene, steps, plan.coarseness)
         if plan.images is not None and precision.allowed is not None and field_step == 1:
             stored = restored_model(decoded(data), config.model)
@@ -68,7 +78,9 @@ def write_scene_file(
     return SceneFile(out / SCENE_FILE, precision, len(data), num_bytes_exact(scene))
 
 
-def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], after: Sequence[Tensor]) -> Precision:
+def _checked(
+    run_dir: Path, precision: Precision, before: Sequence[Tensor], after: Sequence[Tensor]
+) -> Precision:
     """The precision with the change from the images ``before`` to those of the file.
 
     Raises DyngsError: it is more than what is allowed.

@@ -1,4 +1,5 @@
-"""Runs as files of Gaussians: all, only the moving or only the static ones; at one time, at many, as tracks."""
+"""Runs as files of Gaussians: all, only the moving or only the static ones; at one time, at many,
+as tracks."""
 
 from __future__ import annotations
 
@@ -22,11 +23,26 @@ from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.formats import Format, Written, fitted, format_named, moved_file, turned_file, write_splats
+from dyngs.splats.formats import (
+    Format,
+    Written,
+    fitted,
+    format_named,
+    moved_file,
+    turned_file,
+    write_splats,
+)
 from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.sog_levels import write_sog_levels
-from dyngs.splats.splat_file import SplatFile, drawable, from_linear, geo_comment, offset_notes, unit_rotations
+from dyngs.splats.splat_file import (
+    SplatFile,
+    drawable,
+    from_linear,
+    geo_comment,
+    offset_notes,
+    unit_rotations,
+)
 
 Part = Literal["all", "moving", "still"]
 
@@ -35,10 +51,12 @@ Part = Literal["all", "moving", "still"]
 class Writing:
     """How Gaussians are written."""
 
-    # unit quaternion wxyz, from the axes of the capture, or of the frame of an edited run, to those of the file
+    # unit quaternion wxyz, from the axes of the capture, or of the frame of an edited run, to those
+    # of the file
     turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     up: str | None = None  # axis that then points up, such as "-y"; None: not known
-    sh_degree: int | None = None  # degree of the harmonics in the file; None: as they are, up to what the format holds
+    # degree of the harmonics in the file; None: as they are, up to what the format holds
+    sh_degree: int | None = None
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
     own: Format | None = None  # a variant of the format that the suffix names; None: the usual one
 
@@ -47,12 +65,17 @@ AS_THEY_ARE = Writing()
 
 
 def writing_of(
-    opened: Opened, target: str, up: str | None = None, from_up: str | None = None, sh_degree: int | None = None
+    opened: Opened,
+    target: str,
+    up: str | None = None,
+    from_up: str | None = None,
+    sh_degree: int | None = None,
 ) -> tuple[Writing, str]:
     """Return how a scene is written, and a line about which way is up in the file.
 
-    ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep": nothing is turned.
-    ``from_up``: axis that is up in the scene; None: found as ``up_of`` does. Raises DyngsError: no such axis.
+    ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep":
+    nothing is turned. ``from_up``: axis that is up in the scene; None: found as ``up_of`` does.
+    Raises DyngsError: no such axis.
     """
     edited = opened.edited
     if up == "keep" or (edited is not None and edited.fixed and up is None):
@@ -69,13 +92,18 @@ def writing_of(
     name = nearest_axis(direction)
     here = name if name is not None and AXES[name] == tuple(direction) else "a slanted direction"
     frame = "capture" if edited is None else "edited run"
-    turned = f"the axes of the {frame} are kept" if here == wanted else f"turned, it was {here} in the {frame}"
+    turned = (
+        f"the axes of the {frame} are kept"
+        if here == wanted
+        else f"turned, it was {here} in the {frame}"
+    )
     how = Writing(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
 def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
-    """Return the direction (3,) that is up and what says so: an axis where one is within 30 degrees; None: nothing.
+    """Return the direction (3,) that is up and what says so: an axis where one is within 30
+    degrees; None: nothing.
 
     In the axes in which ``splats_at`` gives the scene as it is.
     """
@@ -93,8 +121,9 @@ def write_run_splats(
 ) -> Written:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
-    A 3D filter is fused, and colours of a network become harmonics; the header, where the format has one, states the
-    render mode, and the time if something moves. Raises DyngsError: the part is empty, or an unknown suffix.
+    A 3D filter is fused, and colours of a network become harmonics; the header, where the format
+    has one, states the render mode, and the time if something moves. Raises DyngsError: the part is
+    empty, or an unknown suffix.
     """
     inputs_of(opened).require_output(path)
     return _write(opened, scene_part(opened.scene, part), path, time, how)
@@ -110,9 +139,9 @@ def write_run_sequence(
 ) -> list[Written]:
     """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
 
-    All files are written into a hidden folder first and appear together; those of an earlier sequence of the same
-    length are replaced. Raises DyngsError: the part is empty, the folder holds other such files, or they cannot be
-    written.
+    All files are written into a hidden folder first and appear together; those of an earlier
+    sequence of the same length are replaced. Raises DyngsError: the part is empty, the folder holds
+    other such files, or they cannot be written.
     """
     scene = scene_part(opened.scene, part)
     names = frame_names(len(times), suffix)
@@ -123,12 +152,17 @@ def write_run_sequence(
     is_new = not folder.exists()
     staging = temporary_folder_beside(folder / "frames")
     try:
-        written = [_write(opened, scene, staging / name, time, how) for name, time in zip(names, times, strict=True)]
+        written = [
+            _write(opened, scene, staging / name, time, how)
+            for name, time in zip(names, times, strict=True)
+        ]
         for name in names:
             os.replace(staging / name, folder / name)
         staging.rmdir()
     except OSError as error:
-        raise DyngsError(f"cannot write the sequence {folder}: {error.strerror or error}") from error
+        raise DyngsError(
+            f"cannot write the sequence {folder}: {error.strerror or error}"
+        ) from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
         if is_new:
@@ -140,7 +174,8 @@ def write_run_sequence(
 def write_run_levels(
     opened: Opened, folder: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level, and notes.
+    """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level,
+    and notes.
 
     Raises DyngsError: the part is empty, or the folder holds something.
     """
@@ -151,7 +186,8 @@ def write_run_levels(
 
 
 def frame_names(count: int, suffix: str = ".ply") -> list[str]:
-    """Return ``frame_0000.ply`` and so on, with at least four digits and names in the order of the frames."""
+    """Return ``frame_0000.ply`` and so on, with at least four digits and names in the order of the
+    frames."""
     digits = max(4, len(str(count - 1)))
     return [f"frame_{i:0{digits}d}{suffix}" for i in range(count)]
 
@@ -163,20 +199,30 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
     found = scene.part(part)
     if not len(found):
         empty = "every Gaussian of this run moves: it has no still part"
-        raise DyngsError("nothing moves in this run: it has no dynamic part" if part == "moving" else empty)
+        raise DyngsError(
+            "nothing moves in this run: it has no dynamic part" if part == "moving" else empty
+        )
     return found
 
 
-def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = AS_THEY_ARE) -> SplatFile:
-    """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked for.
+def splats_at(
+    opened: Opened, scene: GaussianScene, time: float, how: Writing = AS_THEY_ARE
+) -> SplatFile:
+    """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
+    for.
 
     A run that was edited is in its frame, which the file can undo.
     """
     model = opened.config.model
     with torch.no_grad():
         moment = scene.time_step(time)
-    gaussians, shader = moment.gaussians, scene.shader(moment)
-    comments = [f"step: {opened.step}"] if scene.is_static else [f"step: {opened.step}", f"dyngs time {time!r}"]
+    gaussians = moment.gaussians
+    shader = scene.shader(moment)
+    comments = (
+        [f"step: {opened.step}"]
+        if scene.is_static
+        else [f"step: {opened.step}", f"dyngs time {time!r}"]
+    )
     if shader is not None:
         baked = with_harmonics(gaussians, shader)
         gaussians = baked.gaussians
@@ -193,7 +239,9 @@ def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = 
 
 
 def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: Writing) -> Written:
-    return write_splats(path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree, own=how.own)
+    return write_splats(
+        path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree, own=how.own
+    )
 
 
 def _require_no_others(folder: Path, names: Sequence[str], suffix: str) -> None:
@@ -216,20 +264,24 @@ MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in me
 
 @dataclass(frozen=True)
 class Tracks:
-    """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays of the file."""
+    """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays
+    of the file."""
 
-    # (N, T, 3) in the coordinates of the capture, or of the frame of an edited run, float32; float64 if the scene was
-    # rebased because it is far from its origin, where float32 is too coarse, or edited
+    # (N, T, 3) in the coordinates of the capture, or of the frame of an edited run, float32;
+    # float64 if the scene was rebased because it is far from its origin, where float32 is too
+    # coarse, or edited
     positions: np.ndarray
     times: np.ndarray  # (T,) float64 in [0, 1]
     moving: np.ndarray  # (N,) bool, false if the position never changes
-    ids: np.ndarray  # (N,) int64 index of each Gaussian in the model, which is also its row in an exported .ply
+    # (N,) int64 index of each Gaussian in the model, which is also its row in an exported .ply
+    ids: np.ndarray
 
 
 def tracks_of(
     scene: GaussianScene, times: Sequence[float], frame: Similarity = UNMOVED, *, part: str = "all"
 ) -> Tracks:
-    """Return the tracks of a scene, or with ``part`` "moving" of what moves, moved by ``frame`` to what people mean.
+    """Return the tracks of a scene, or with ``part`` "moving" of what moves, moved by ``frame`` to
+    what people mean.
 
     Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
     """
@@ -237,7 +289,9 @@ def tracks_of(
     moves = torch.zeros(len(scene), dtype=torch.bool, device=device)
     moves[scene.rows] = not scene.is_static
     moving = scene_part(scene, "moving") if part == "moving" or not scene.is_static else None
-    ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
+    ids = (
+        torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
+    )
     kind = np.float32 if frame == UNMOVED else np.float64
     size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
     if size > MAX_BYTES:
@@ -257,7 +311,8 @@ def tracks_of(
 
 
 def write_tracks(path: Path, tracks: Tracks) -> Path:
-    """Write tracks as uncompressed .npz, atomically: one array per field of ``Tracks``, no pickle. Return the path.
+    """Write tracks as uncompressed .npz, atomically: one array per field of ``Tracks``, no pickle.
+    Return the path.
 
     Raises DyngsError: non-finite positions, or the file cannot be written.
     """
@@ -285,7 +340,11 @@ class MovingFile:
 
 
 def write_moving(
-    opened: Opened, path: Path, times: Sequence[float], part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: Opened,
+    path: Path,
+    times: Sequence[float],
+    part: Part = "all",
+    how: Writing = AS_THEY_ARE,
 ) -> MovingFile:
     """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s.
 
@@ -307,12 +366,16 @@ def write_moving(
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
-        notes = (*notes, "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians")
+        notes = (
+            *notes,
+            "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians",
+        )
     return MovingFile(path, splats, notes)
 
 
 def read_moment(path: Path, index: int) -> SplatFile:
-    """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package fourdgs.
+    """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package
+    fourdgs.
 
     Raises DyngsError: the package is missing, or values that are not finite.
     """
@@ -349,4 +412,6 @@ def _packages(path: Path) -> tuple[Any, Any]:
     try:
         return import_module("fourdgs.model"), import_module("fourdgs.keyframe_delta_writer")
     except ImportError:
-        raise DyngsError(f"{path}: .4dgs files need the package fourdgs: pip install 'dyngs[4dgs]'") from None
+        raise DyngsError(
+            f"{path}: .4dgs files need the package fourdgs: pip install 'dyngs[4dgs]'"
+        ) from None

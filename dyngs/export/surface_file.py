@@ -1,4 +1,5 @@
-"""A scene's surface as a mesh that other programs read: .ply, .glb or .obj with colours of vertices."""
+"""A scene's surface as a mesh that other programs read: .ply, .glb or .obj with colours of
+vertices."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ class Cut:
     """How a surface is cut out of a scene; None: as usual.
 
     Attributes:
-        level: density at the surface of a field, per unit of a world whose innermost cube has half side 1.5.
+        level: density at the surface of a field, per unit of a world whose innermost cube has half
+            side 1.5.
         cells: along the longest side of the space that a field or Gaussians are looked at in.
         segments: of an edge of a curved triangle.
     """
@@ -54,38 +56,55 @@ class Cut:
     def require_fitting(self, scene: object) -> None:
         """Check that all that is given goes with the kind of scene. Raises DyngsError."""
         if self.level is not None and not isinstance(scene, FieldScene):
-            raise DyngsError("--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)")
+            raise DyngsError(
+                "--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)"
+            )
         if self.segments is not None and not isinstance(scene, TriangleScene):
-            raise DyngsError("--segments goes with --format mesh of curved triangles (model.kind=bg_triangle)")
+            raise DyngsError(
+                "--segments goes with --format mesh of curved triangles (model.kind=bg_triangle)"
+            )
         if self.segments is not None and not 1 <= self.segments <= MOST_SEGMENTS:
             raise DyngsError(f"--segments {self.segments}: give 1 to {MOST_SEGMENTS}")
         if self.cells is not None and isinstance(scene, TriangleScene):
-            raise DyngsError("--cells goes with --format mesh of radiance fields and Gaussians, not of triangles")
+            raise DyngsError(
+                "--cells goes with --format mesh of radiance fields and Gaussians, not of triangles"
+            )
         if self.cells is not None and not 8 <= self.cells <= MOST_CELLS:
             raise DyngsError(f"--cells {self.cells}: give 8 to {MOST_CELLS}")
 
 
-def upright_surface(opened: Opened, suffix: str, up: str | None, from_up: str | None) -> tuple[Writing, str]:
+def upright_surface(
+    opened: Opened, suffix: str, up: str | None, from_up: str | None
+) -> tuple[Writing, str]:
     """Return how the mesh of a scene is turned, and a line about it, as of ``writing_of``.
 
-    Viewers take y for up in .glb and .obj; those of .ply have no convention, so it stays in the axes of the capture.
+    Viewers take y for up in .glb and .obj; those of .ply have no convention, so it stays in the
+    axes of the capture.
     """
     usual = "keep" if suffix.lower() == ".ply" else None
     return writing_of(opened, "y", up or usual, from_up)
 
 
 def write_surface(
-    opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | None = None, how: Writing = AS_THEY_ARE
+    opened: Opened,
+    out: Path,
+    *,
+    time: float = 0.0,
+    cut: Cut | None = None,
+    how: Writing = AS_THEY_ARE,
 ) -> Surface:
     """Write the surface of a scene at ``time`` and return it.
 
-    The file is in the coordinates of the capture or of the edit, turned by ``how``. Raises DyngsError: a person, a
-    suffix of no mesh, an option of another kind, no capture where that is needed, or no surface is there.
+    The file is in the coordinates of the capture or of the edit, turned by ``how``. Raises
+    DyngsError: a person, a suffix of no mesh, an option of another kind, no capture where that is
+    needed, or no surface is there.
     """
     cut = cut or Cut()
     cut.require_fitting(opened.renderable)
     if out.suffix.lower() not in SUFFIXES:
-        raise DyngsError(f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}")
+        raise DyngsError(
+            f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}"
+        )
     inputs_of(opened).require_output(out)
     surface = _surface(opened, time, cut)
     vertices = Similarity(how.turn).points(opened.world.points(surface.vertices))
@@ -97,7 +116,8 @@ def write_surface(
 
 
 def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
-    """Return the file of a mesh; vertices (V, 3) too far from the origin for float32 are written with more digits."""
+    """Return the file of a mesh; vertices (V, 3) too far from the origin for float32 are written
+    with more digits."""
     import trimesh
 
     detail = float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
@@ -125,13 +145,18 @@ def _surface(opened: Opened, time: float, cut: Cut) -> Surface:
         case GaussianScene() as scene if opened.person is None:
             return _surface_of_gaussians(opened, scene, time, cut)
         case _:
-            raise DyngsError("a surface is that of a still or moving scene; a person's mesh is its body")
+            raise DyngsError(
+                "a surface is that of a still or moving scene; a person's mesh is its body"
+            )
 
 
 def _surface_of_gaussians(opened: Opened, scene: GaussianScene, time: float, cut: Cut) -> Surface:
-    """Return what training cameras see of Gaussians; what they frame, where there is a background."""
+    """Return what training cameras see of Gaussians; what they frame, where there is a
+    background."""
     views = opened.capture.splits["train"]
-    cameras = training_cameras([views[i] for i in evenly_spaced(len(views), VIEWS)], opened.config.data)
+    cameras = training_cameras(
+        [views[i] for i in evenly_spaced(len(views), VIEWS)], opened.config.data
+    )
     box = gaussians.opaque_box(scene.at(time))
     if not opened.capture.has_alpha:
         box = _common(box, space_of(NgpModel(), None, opened.capture))
@@ -139,8 +164,10 @@ def _surface_of_gaussians(opened: Opened, scene: GaussianScene, time: float, cut
 
 
 def _common(box: tuple[Tensor, Tensor], space: Space) -> tuple[Tensor, Tensor]:
-    """Return the corners of what ``box`` and the innermost cube share; of the cube where that is little."""
+    """Return the corners of what ``box`` and the innermost cube share; of the cube where that is
+    little."""
     middle = torch.tensor(space.centre, device="cpu")
-    low, high = torch.maximum(box[0], middle - space.half), torch.minimum(box[1], middle + space.half)
+    low = torch.maximum(box[0], middle - space.half)
+    high = torch.minimum(box[1], middle + space.half)
     shares_much = bool((high - low > 0.1 * space.half).all())
     return (low, high) if shares_much else (middle - space.half, middle + space.half)

@@ -17,10 +17,12 @@ from dyngs.files.write import require_replaceable
 
 
 class VideoWriter:
-    """Context manager that encodes images as MP4 for any player: H.264, yuv420p, BT.709, constant frame rate.
+    """Context manager that encodes images as MP4 for any player: H.264, yuv420p, BT.709, constant
+    frame rate.
 
-    The file appears when the block ends without an error; otherwise (or without any image) there is none, and an
-    earlier one stays. Images of odd width or height are padded by repeating the last column or row.
+    The file appears when the block ends without an error; otherwise (or without any image) there is
+    none, and an earlier one stays. Images of odd width or height are padded by repeating the last
+    column or row.
 
         with VideoWriter(Path("orbit.mp4"), fps=30) as video:
             video.add(rgb)
@@ -29,7 +31,8 @@ class VideoWriter:
     def __init__(self, path: Path, fps: float = 30.0, quality: int = 18) -> None:
         """Prepare a writer; nothing is written yet.
 
-        ``fps`` is more than 0; ``quality`` x264's constant rate factor, 0 (lossless) to 51; 18 is visually lossless.
+        ``fps`` is more than 0; ``quality`` x264's constant rate factor, 0 (lossless) to 51; 18 is
+        visually lossless.
         """
         if not 0 < fps <= 1000:
             raise DyngsError(f"cannot write {path}: fps must be in (0, 1000], got {fps:g}")
@@ -50,7 +53,9 @@ class VideoWriter:
         if self._size is None:
             self._open(rgb.shape[0], rgb.shape[1])
         if rgb.shape[:2] != self._size:
-            raise ValueError(f"all images of a video must have one size, got {rgb.shape[:2]} after {self._size}")
+            raise ValueError(
+                f"all images of a video must have one size, got {rgb.shape[:2]} after {self._size}"
+            )
         height, width = rgb.shape[:2]
         if height % 2 or width % 2:
             rgb = np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
@@ -58,7 +63,10 @@ class VideoWriter:
         self.num_frames += 1
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if kind is None and self._container is None:
             raise DyngsError(f"cannot write {self.path}: the video has no images")
@@ -68,7 +76,9 @@ class VideoWriter:
                 self._close()
                 os.replace(self._temporary or self.path, self.path)
         except OSError as problem:
-            raise DyngsError(f"cannot write the video {self.path}: {problem.strerror or problem}") from problem
+            raise DyngsError(
+                f"cannot write the video {self.path}: {problem.strerror or problem}"
+            ) from problem
         finally:
             self._discard()
 
@@ -90,14 +100,16 @@ class VideoWriter:
             raise DyngsError(f"cannot write the video {self.path} ({error}){advice}") from error
         self._size = (height, width)
         stream = self._stream
-        stream.width, stream.height = width + width % 2, height + height % 2
+        stream.width = width + width % 2
+        stream.height = height + height % 2
         stream.pix_fmt = "yuv420p"
         stream.thread_count = 1  # the bytes depend on their number
         stream.options = {"crf": str(self.quality), "preset": "medium"}
         context = stream.codec_context
         self._colours = int(Colorspace.ITU709), int(ColorRange.MPEG)
         context.colorspace, context.color_range = self._colours
-        context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+        context.color_primaries = ColorPrimaries.BT709
+        context.color_trc = ColorTrc.BT709
 
     def _encode(self, rgb: np.ndarray | None) -> None:
         """Encode an image; None flushes the encoder."""
@@ -110,7 +122,9 @@ class VideoWriter:
                 return
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
             space, extent = self._colours
-            frame = frame.reformat(format="yuv420p", dst_colorspace=space, dst_color_range=extent, interpolation="AREA")
+            frame = frame.reformat(
+                format="yuv420p", dst_colorspace=space, dst_color_range=extent, interpolation="AREA"
+            )
             frame.pts = self.num_frames
             frame.time_base = 1 / self._stream.codec_context.framerate
             self._container.mux(self._stream.encode(frame))
@@ -118,7 +132,8 @@ class VideoWriter:
             raise DyngsError(f"cannot write the video {self.path}: {error}") from error
 
     def _close(self) -> None:
-        container, self._container = self._container, None
+        container = self._container
+        self._container = None
         if container is not None:
             container.close()
 

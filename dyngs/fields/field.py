@@ -19,7 +19,8 @@ TIME_OCTAVES = 4
 TIME = 1 + 2 * TIME_OCTAVES
 """Numbers that a time in [0, 1] is encoded in."""
 PUBLISHED_HALF = 1.5
-"""Half the side of the cube of published figures: densities are per unit of a world in which the cube is as large."""
+"""Half the side of the cube of published figures: densities are per unit of a world in which the
+cube is as large."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class Field(ABC):
 
         Args:
             near: what is nearer is not drawn, world units.
-            shifts: (R, K) random numbers in [0, 1) that place the samples, see ``num_shifts``; None: evenly.
+            shifts: (R, K) random numbers in [0, 1) that place the samples, see ``num_shifts``;
+                None: evenly.
         """
 
     @property
@@ -68,12 +70,14 @@ class Field(ABC):
         """Return (M,) densities, per world unit, at points (M, 3) of the world."""
 
     def may_hold(self, points: Tensor) -> Tensor:
-        """Return (M,) bool: whether there may be anything at points (M, 3) of the world, before looking."""
+        """Return (M,) bool: whether there may be anything at points (M, 3) of the world, before
+        looking."""
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
 
     @abstractmethod
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
-        """Return (M, 3) colours of points (M, 3) of the world, seen along unit directions (M, 3)."""
+        """Return (M, 3) colours of points (M, 3) of the world, seen along unit directions (M,
+        3)."""
 
     @abstractmethod
     def state(self) -> State:
@@ -101,7 +105,8 @@ def truncated_exp(x: Tensor) -> Tensor:
 
 
 def encoded(x: Tensor, octaves: int) -> Tensor:
-    """Return (M, D (1 + 2 octaves)): x, then the sines and cosines of 2^k x of each octave k, without pi (NeRF)."""
+    """Return (M, D (1 + 2 octaves)): x, then the sines and cosines of 2^k x of each octave k,
+    without pi (NeRF)."""
     parts = [x]
     for k in range(octaves):
         parts += [(2.0**k * x).sin(), (2.0**k * x).cos()]

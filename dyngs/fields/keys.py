@@ -30,10 +30,12 @@ class FieldModel(ModelSection):
 
 
 class NgpModel(FieldModel):
-    """Instant-NGP (Müller et al. 2022) with the protocol of nerfacc's occupancy grid (Li et al. 2023)."""
+    """Instant-NGP (Müller et al. 2022) with the protocol of nerfacc's occupancy grid (Li et al.
+    2023)."""
 
     kind: Literal["ngp"] = Field(
-        default="ngp", description="radiance field: hash grid and small networks (Instant-NGP; docs/family.md)"
+        default="ngp",
+        description="radiance field: hash grid and small networks (Instant-NGP; docs/family.md)",
     )
     sizes: Literal["cpu", "published"] = Field(
         default="cpu",
@@ -42,7 +44,9 @@ class NgpModel(FieldModel):
     )
     levels: int | None = Field(default=None, ge=1, le=32, description="levels of the hash grid")
     features: Literal[1, 2, 4, 8] | None = Field(default=None, description="features per level")
-    log2_rows: int | None = Field(default=None, ge=4, le=24, description="most rows of a level, as a power of two")
+    log2_rows: int | None = Field(
+        default=None, ge=4, le=24, description="most rows of a level, as a power of two"
+    )
     finest: int | None = Field(
         default=None,
         ge=16,
@@ -51,7 +55,10 @@ class NgpModel(FieldModel):
         "as many with surroundings, or 4096 as published",
     )
     log2_samples: int | None = Field(
-        default=None, ge=8, le=22, description="samples per step, as a power of two; the number of rays follows"
+        default=None,
+        ge=8,
+        le=22,
+        description="samples per step, as a power of two; the number of rays follows",
     )
     cells: int | None = Field(
         default=None,
@@ -59,7 +66,9 @@ class NgpModel(FieldModel):
         le=512,
         description="cells of the occupancy grid along an axis of each cube; null: 128, 64 with surroundings",
     )
-    weight_decay: float = Field(default=1e-6, ge=0, description="L2 penalty of the networks' weights, in Adam")
+    weight_decay: float = Field(
+        default=1e-6, ge=0, description="L2 penalty of the networks' weights, in Adam"
+    )
 
 
 class NerfModel(FieldModel):
@@ -70,6 +79,10 @@ class NerfModel(FieldModel):
     )
     lr: Positive = Field(default=5e-4, le=1, description="learning rate of Adam at its height")
     width: int = Field(default=256, ge=8, le=1024, description="features of the hidden layers")
-    coarse: int = Field(default=64, ge=4, le=1024, description="samples of a ray for the coarse network")
-    fine: int = Field(default=128, ge=4, le=1024, description="more samples of a ray for the fine network")
+    coarse: int = Field(
+        default=64, ge=4, le=1024, description="samples of a ray for the coarse network"
+    )
+    fine: int = Field(
+        default=128, ge=4, le=1024, description="more samples of a ray for the fine network"
+    )
     rays: int = Field(default=1024, ge=1, le=2**16, description="rays per step")

@@ -21,7 +21,8 @@ from dyngs.models.views import evaluation_background
 
 
 def start(run: RunStart) -> FieldTraining[Any]:
-    """Return the field of a capture before its first step. Raises DyngsError: a capture that it cannot hold."""
+    """Return the field of a capture before its first step. Raises DyngsError: a capture that it
+    cannot hold."""
     model = run.config.model
     assert isinstance(model, (NgpModel, NerfModel))
     try:
@@ -38,7 +39,8 @@ def start(run: RunStart) -> FieldTraining[Any]:
 def restore(model: NgpModel | NerfModel, checkpoint: Checkpoint) -> FieldScene:
     """Return the scene of a checkpoint."""
     stored = checkpoint.part("field")
-    space, times = stored_space(stored), stored_times(stored)
+    space = stored_space(stored)
+    times = stored_times(stored)
     field: Field
     if isinstance(model, NgpModel):
         field = NgpField.restored(model, space, checkpoint)

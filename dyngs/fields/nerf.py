@@ -1,4 +1,5 @@
-"""NeRF (Mildenhall et al. 2020): a coarse and a fine network of positions and directions, the slow reference.
+"""NeRF (Mildenhall et al. 2020): a coarse and a fine network of positions and directions, the slow
+reference.
 
 R rays, K samples of each, M = R K.
 """
@@ -24,12 +25,14 @@ from dyngs.tensor_checks import require_tensor
 
 DEPTH, SKIP = 8, 5  # Hidden layers of the trunk; the layer that sees the position again
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
-POSITION, DIRECTION = 3 * (1 + 2 * POSITION_OCTAVES), 3 * (1 + 2 * DIRECTION_OCTAVES)
+POSITION = 3 * (1 + 2 * POSITION_OCTAVES)
+DIRECTION = 3 * (1 + 2 * DIRECTION_OCTAVES)
 
 
 @dataclass(frozen=True)
 class NerfNetwork:
-    """Weights and biases of the trunk, whose outputs are density and bottleneck, and of the colours' layers."""
+    """Weights and biases of the trunk, whose outputs are density and bottleneck, and of the
+    colours' layers."""
 
     trunk: tuple[Layer, ...]
     head: tuple[Layer, ...]
@@ -37,7 +40,8 @@ class NerfNetwork:
     @staticmethod
     def shapes(model: NerfModel) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Return (in, out) of the layers of trunk and head."""
-        width, first = model.width, POSITION + (TIME if model.time else 0)
+        width = model.width
+        first = POSITION + (TIME if model.time else 0)
         trunk = [first, *[width] * DEPTH, width + 1]
         pairs = [(i + (first if n == SKIP else 0), o) for n, (i, o) in enumerate(pairwise(trunk))]
         return pairs, [(width + DIRECTION, width // 2), (width // 2, 3)]
@@ -48,7 +52,9 @@ class NerfNetwork:
             bias = torch.zeros(outputs, device="cpu").requires_grad_()
             return Layer(glorot(inputs, outputs, generator).requires_grad_(), bias)
 
-        trunk, head = (tuple(layer(*shape) for shape in shapes) for shapes in NerfNetwork.shapes(model))
+        trunk, head = (
+            tuple(layer(*shape) for shape in shapes) for shapes in NerfNetwork.shapes(model)
+        )
         return NerfNetwork(trunk, head)
 
     @staticmethod
@@ -60,7 +66,9 @@ class NerfNetwork:
 
         trunk, head = (
             tuple(
-                Layer(tensor(f"{name}.{part}.{n}.weight", o, i), tensor(f"{name}.{part}.{n}.bias", o))
+                Layer(
+                    tensor(f"{name}.{part}.{n}.weight", o, i), tensor(f"{name}.{part}.{n}.bias", o)
+                )
                 for n, (i, o) in enumerate(shapes)
             )
             for part, shapes in zip(("trunk", "head"), NerfNetwork.shapes(model), strict=True)
@@ -70,8 +78,14 @@ class NerfNetwork:
     @property
     def parameters(self) -> dict[str, Tensor]:
         parts = {"trunk": self.trunk, "head": self.head}
-        layers = {f"{name}.{n}": layer for name, part in parts.items() for n, layer in enumerate(part)}
-        return {f"{name}.{kind}": getattr(x, kind) for name, x in layers.items() for kind in ("weight", "bias")}
+        layers = {
+            f"{name}.{n}": layer for name, part in parts.items() for n, layer in enumerate(part)
+        }
+        return {
+            f"{name}.{kind}": getattr(x, kind)
+            for name, x in layers.items()
+            for kind in ("weight", "bias")
+        }
 
     def outputs(self, places: Tensor) -> Tensor:
         """Return (M, 1 + width) raw densities and bottlenecks of encoded places."""
@@ -100,7 +114,8 @@ class NerfField(Field):
 
     @staticmethod
     def restored(model: NerfModel, space: Space, checkpoint: Checkpoint) -> NerfField:
-        """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
+        """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not
+        fit."""
         stored = checkpoint.part("field")
         coarse, fine = (NerfNetwork.restored(model, stored, name) for name in ("coarse", "fine"))
         return NerfField(space, coarse, fine, model.coarse, model.fine, model.time)
@@ -112,7 +127,11 @@ class NerfField(Field):
     @property
     def parameters(self) -> Mapping[str, Tensor]:
         networks = {"coarse": self.coarse, "fine": self.fine}
-        return {f"{name}.{key}": x for name, network in networks.items() for key, x in network.parameters.items()}
+        return {
+            f"{name}.{key}": x
+            for name, network in networks.items()
+            for key, x in network.parameters.items()
+        }
 
     def state(self) -> State:
         return with_role({name: x.detach() for name, x in self.parameters.items()}, Role.SHARED)
@@ -133,14 +152,19 @@ class NerfField(Field):
         outputs = self.fine.outputs(self._places(self.space.unit(points), time))
         return self.fine.colours(outputs, encoded(directions, DIRECTION_OCTAVES))
 
-    def _through(self, network: NerfNetwork, rays: Rays, distances: Tensor, time: float) -> tuple[Seen, Tensor]:
+    def _through(
+        self, network: NerfNetwork, rays: Rays, distances: Tensor, time: float
+    ) -> tuple[Seen, Tensor]:
         """Return what rays see at distances (R, K), ascending, and the weights (R, K) of these."""
         samples = along(rays, self.space, distances)
         outputs = network.outputs(self._places(samples.coords, time))
         directions = encoded(rays.directions, DIRECTION_OCTAVES)[samples.rays]
-        seen: Composited = composite(self._densities(outputs), network.colours(outputs, directions), samples, 0.0)
+        seen: Composited = composite(
+            self._densities(outputs), network.colours(outputs, directions), samples, 0.0
+        )
         weights = seen.weights.view(distances.shape)
-        depth = (weights * distances).sum(1)  # at the sample, as published; the last one has no middle
+        # at the sample, as published; the last one has no middle
+        depth = (weights * distances).sum(1)
         return Seen(seen.colour, seen.transmittance, depth, len(samples)), weights
 
     def _places(self, coords: Tensor, time: float) -> Tensor:

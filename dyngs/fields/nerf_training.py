@@ -1,4 +1,5 @@
-"""NeRF in training: so many rays of one image per step, squared errors of both networks, and its schedule."""
+"""NeRF in training: so many rays of one image per step, squared errors of both networks, and its
+schedule."""
 
 from __future__ import annotations
 

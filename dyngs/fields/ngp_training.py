@@ -1,4 +1,5 @@
-"""Instant-NGP in training: as many rays as fill a step with samples, cells kept up to date, and its schedule."""
+"""Instant-NGP in training: as many rays as fill a step with samples, cells kept up to date, and its
+schedule."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ FIRST_SAMPLES = 256  # Samples that a ray is taken to need before any was counte
 MOST_RAYS = 1 << 15  # Of an image in a step
 LOOKED_AT = 2  # Random cells looked at in an update of the occupied ones, per sample of a step
 WARM_UP, FIRST_RATE = 100, 0.01  # Steps in which the rate rises from this fraction of itself
-DROPS, DROP = (0.5, 0.75, 0.9), 0.33  # Fractions of the run at which the rate falls by this factor
+DROPS = (0.5, 0.75, 0.9)
+DROP = 0.33  # Fractions of the run at which the rate falls by this factor
 
 
 class NgpTraining(FieldTraining[NgpField]):
@@ -37,7 +39,8 @@ class NgpTraining(FieldTraining[NgpField]):
         self._wanted = max(1, self._num_samples // self._batch)
         self._occupancy = self._new_occupancy(field)
         field.occupied.copy_(self._occupancy.seen)
-        self._counted = torch.zeros(2, dtype=torch.float64, device="cpu")  # rays and samples of this step
+        # rays and samples of this step
+        self._counted = torch.zeros(2, dtype=torch.float64, device="cpu")
         self._rays = max(1, self._wanted // FIRST_SAMPLES)
 
     def _new_occupancy(self, field: NgpField) -> Occupancy:
@@ -74,7 +77,9 @@ class NgpTraining(FieldTraining[NgpField]):
                 x.grad.add_(x.detach(), alpha=self._model.weight_decay)
         updated = super().update(step)
         if self._occupancy.is_due(step):
-            occupied = self._occupancy.updated(self._field, step, self._like.seen_at, self._run.generator)
+            occupied = self._occupancy.updated(
+                self._field, step, self._like.seen_at, self._run.generator
+            )
             self._field.occupied.copy_(occupied)
         rays, samples = self._counted.tolist()
         self._rays = max(1, min(MOST_RAYS, int(rays * self._wanted / max(samples, 1.0))))
@@ -100,7 +105,9 @@ class NgpTraining(FieldTraining[NgpField]):
         if self._field.space != before:  # to find what cameras see takes seconds
             self._occupancy = self._new_occupancy(self._field)
         self._occupancy.load_state(stored)
-        self._rays = min(MOST_RAYS, max(1, int(require_tensor("rays", stored["rays"], (1,), torch.int64))))
+        self._rays = min(
+            MOST_RAYS, max(1, int(require_tensor("rays", stored["rays"], (1,), torch.int64)))
+        )
 
     def place(self, device: torch.device) -> None:
         super().place(device)

@@ -13,7 +13,14 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.fields.field import Field
 from dyngs.fields.space import rays_of
-from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep, composited, fixed_cameras
+from dyngs.models.renderable import (
+    DrawOptions,
+    Renderable,
+    Rendering,
+    TimeStep,
+    composited,
+    fixed_cameras,
+)
 from dyngs.ops.rays import Space
 from dyngs.state import Role, State, StateTensor, prefixed
 from dyngs.tensor_checks import require_moments, require_tensor
@@ -51,11 +58,15 @@ class FieldScene(Renderable):
     def state(self) -> State:
         space = self.field.space
         numbers = torch.tensor(
-            [*space.centre, space.half, space.cascades, space.cells], dtype=torch.float64, device="cpu"
+            [*space.centre, space.half, space.cascades, space.cells],
+            dtype=torch.float64,
+            device="cpu",
         )
         times = torch.tensor(self.seen_at, dtype=torch.float64, device="cpu")
         own = {"space": StateTensor(numbers, Role.SHARED)} | self.field.state()
-        return prefixed("field", own | ({"times": StateTensor(times, Role.SHARED)} if self.seen_at else {}))
+        return prefixed(
+            "field", own | ({"times": StateTensor(times, Role.SHARED)} if self.seen_at else {})
+        )
 
     def render(
         self,
@@ -69,12 +80,17 @@ class FieldScene(Renderable):
         behind = self.background if background is None else background
         now = time if isinstance(time, TimeStep) else self.time_step(time)
         cameras = fixed_cameras(cameras, behind, next(iter(self.field.parameters.values())))
-        views = [self._view(cameras.select(i), now.time or 0.0, options) for i in range(len(cameras))]
+        views = [
+            self._view(cameras.select(i), now.time or 0.0, options) for i in range(len(cameras))
+        ]
         rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
         return composited(rgb, through, depth, options, behind)
 
-    def _view(self, camera: Cameras, time: float, options: DrawOptions) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z (H, W)."""
+    def _view(
+        self, camera: Cameras, time: float, options: DrawOptions
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z
+        (H, W)."""
         rays, z = rays_of(camera)
         parts = []
         for begin in range(0, len(rays), CHUNK):

@@ -20,18 +20,20 @@ from dyngs.fields.keys import FieldModel
 from dyngs.ops.rays import Rays, Space
 
 MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
-CELLS, FAR_CELLS = 128, 64  # Along an axis of a single cube, and of each of several: looking at all takes a while
+# Along an axis of a single cube, and of each of several: looking at all takes a while
+CELLS, FAR_CELLS = 128, 64
 BESIDE = 1.25
-"""Half the side of an innermost cube that holds the cameras, in the farthest distances of one from its middle."""
+"""Half the side of an innermost cube that holds the cameras, in the farthest distances of one from
+its middle."""
 SEEN_FAR = 0.02  # Fraction of the sparse points that may lie outside of the outermost cube
 
 
 def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
     """Return the space of the field of ``capture``.
 
-    An object before a background lies in a cube around the point that the cameras look at, as large as what all of them
-    frame. So does the innermost cube of other captures, with others around it for what is far away; where the cameras
-    do not look at one point it holds the cameras.
+    An object before a background lies in a cube around the point that the cameras look at, as large
+    as what all of them frame. So does the innermost cube of other captures, with others around it
+    for what is far away; where the cameras do not look at one point it holds the cameras.
 
     Args:
         cells: of each cube along an axis; None: as suits their number.
@@ -72,7 +74,8 @@ def _space(middle: np.ndarray, half: float, cascades: int, cells: int | None) ->
 
 
 def _framed(views: Sequence[View], middle: np.ndarray) -> float:
-    """Return half the side of the cube around ``middle`` that images frame, the median over views."""
+    """Return half the side of the cube around ``middle`` that images frame, the median over
+    views."""
     halves = []
     for view in views:
         x, y, z = view.cam_from_world[:3, :3] @ middle + view.cam_from_world[:3, 3]
@@ -96,26 +99,37 @@ def _cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
 
 
 def rays_of(cameras: Cameras, pixels: Tensor | None = None) -> tuple[Rays, Tensor]:
-    """Return the rays of one camera through the centres of ``pixels`` (R,), row by row; None: of all.
+    """Return the rays of one camera through the centres of ``pixels`` (R,), row by row; None: of
+    all.
 
     Also (R,) the view-space z of what lies a unit along each.
     """
     if pixels is None:
         pixels = torch.arange(cameras.width * cameras.height, device=cameras.intrinsics.device)
-    intrinsics, pose = cameras.intrinsics[0], cameras.cam_from_world[0]
-    x, y = pixels % cameras.width + 0.5, torch.div(pixels, cameras.width, rounding_mode="floor") + 0.5
+    intrinsics = cameras.intrinsics[0]
+    pose = cameras.cam_from_world[0]
+    x = pixels % cameras.width + 0.5
+    y = torch.div(pixels, cameras.width, rounding_mode="floor") + 0.5
     local = torch.stack(
-        [(x - intrinsics[0, 2]) / intrinsics[0, 0], (y - intrinsics[1, 2]) / intrinsics[1, 1], torch.ones_like(x)], -1
+        [
+            (x - intrinsics[0, 2]) / intrinsics[0, 0],
+            (y - intrinsics[1, 2]) / intrinsics[1, 1],
+            torch.ones_like(x),
+        ],
+        -1,
     ).to(pose.dtype)
     z = 1 / local.square().sum(-1).sqrt()
     local = local * z[:, None]
     rotation = pose[:3, :3]
-    directions = local[:, :1] * rotation[0] + local[:, 1:2] * rotation[1] + local[:, 2:] * rotation[2]
+    directions = (
+        local[:, :1] * rotation[0] + local[:, 1:2] * rotation[1] + local[:, 2:] * rotation[2]
+    )
     return Rays(cameras.centers.expand(len(x), 3), directions), z
 
 
 def part_of(image: Image, pixels: Tensor) -> Image:
-    """Return ``pixels`` (R,) of an image alone, (1, R), with the camera of the whole; without maps."""
+    """Return ``pixels`` (R,) of an image alone, (1, R), with the camera of the whole; without
+    maps."""
 
     def taken(x: Tensor | None) -> Tensor | None:
         return None if x is None else x.flatten(0, 1)[pixels][None]

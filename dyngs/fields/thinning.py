@@ -1,7 +1,8 @@
-"""Fewer samples for the networks: of those that hardly show, one in four, which stands for the others, too.
+"""Fewer samples for the networks: of those that hardly show, one in four, which stands for the
+others, too.
 
-R rays, M samples. A sample within an occupied cell but before or behind the surface costs as much as one that is seen,
-and says as little as its neighbours.
+R rays, M samples. A sample within an occupied cell but before or behind the surface costs as much
+as one that is seen, and says as little as its neighbours.
 """
 
 from __future__ import annotations
@@ -26,18 +27,24 @@ def reached_samples(densities: Tensor, samples: Samples) -> tuple[Samples, Tenso
 
 @torch.no_grad()
 def thinned_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tuple[Samples, Tensor]:
-    """As ``reached_samples``; of light ones each fourth is taken, four times as long around the same middle.
+    """As ``reached_samples``; of light ones each fourth is taken, four times as long around the
+    same middle.
 
-    What rays see, and the gradients by densities, are on average those of all samples. ``shifts`` (R,) in [0, 1): which
-    of four it is, at random for each ray.
+    What rays see, and the gradients by densities, are on average those of all samples. ``shifts``
+    (R,) in [0, 1): which of four it is, at random for each ray.
     """
     through, _ = reached(densities, samples)
     weights = composite(densities, densities[:, None].expand(-1, 3).contiguous(), samples).weights
-    place = torch.arange(len(samples), device=densities.device) + (shifts * EVERY).long()[samples.rays.long()]
+    place = (
+        torch.arange(len(samples), device=densities.device)
+        + (shifts * EVERY).long()[samples.rays.long()]
+    )
     light = weights < LIGHT
     chosen = through & (~light | (place % EVERY == 0))
     more = light.to(densities) * ((EVERY - 1) / 2) * (samples.ends - samples.starts)
-    return kept_samples(replace(samples, starts=samples.starts - more, ends=samples.ends + more), chosen)
+    return kept_samples(
+        replace(samples, starts=samples.starts - more, ends=samples.ends + more), chosen
+    )
 
 
 @torch.no_grad()
@@ -51,4 +58,6 @@ def kept_samples(samples: Samples, chosen: Tensor) -> tuple[Samples, Tensor]:
 def _chosen(samples: Samples, chosen: Tensor, offsets: Tensor) -> tuple[Samples, Tensor]:
     which = chosen.nonzero()[:, 0]
     rays = samples.rays[which].long()
-    return Samples(offsets, rays, samples.starts[which], samples.ends[which], samples.coords[which]), which
+    return Samples(
+        offsets, rays, samples.starts[which], samples.ends[which], samples.coords[which]
+    ), which

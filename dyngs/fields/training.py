@@ -1,4 +1,5 @@
-"""Radiance fields in training: rays of one image per view of a step, Adam with its schedule, and the occupied cells."""
+"""Radiance fields in training: rays of one image per view of a step, Adam with its schedule, and
+the occupied cells."""
 
 from __future__ import annotations
 
@@ -57,7 +58,9 @@ class FieldTraining(Model[FieldScene], Generic[F]):
         function: of rendered and true colours, whose mean is minimised.
     """
 
-    def __init__(self, run: RunStart, field: F, function: Callable[[Tensor, Tensor], Tensor]) -> None:
+    def __init__(
+        self, run: RunStart, field: F, function: Callable[[Tensor, Tensor], Tensor]
+    ) -> None:
         self._run, self._field, self._function = run, field, function
         self._adam = AdamState.zero(field.parameters)
         self._batch = run.config.train.batch_size
@@ -101,25 +104,43 @@ class FieldTraining(Model[FieldScene], Generic[F]):
         """Take in how many samples the rays of an image needed."""
 
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
-        generator, device = self._run.generator, background.device
+        generator = self._run.generator
+        device = background.device
         camera = image.cameras.to(device=device)
-        pixels = torch.randint(camera.width * camera.height, (self.num_rays,), generator=generator, device="cpu")
-        shifts = torch.rand((len(pixels), self._field.num_shifts), generator=generator, device="cpu")
-        pixels, shifts = sent(pixels, device), sent(shifts, device)
+        pixels = torch.randint(
+            camera.width * camera.height, (self.num_rays,), generator=generator, device="cpu"
+        )
+        shifts = torch.rand(
+            (len(pixels), self._field.num_shifts), generator=generator, device="cpu"
+        )
+        pixels = sent(pixels, device)
+        shifts = sent(shifts, device)
         rays, z = rays_of(camera, pixels)
-        seen = self._field.seen(rays, image.time or 0.0, near=self._like.options.near, shifts=shifts)
+        seen = self._field.seen(
+            rays, image.time or 0.0, near=self._like.options.near, shifts=shifts
+        )
         self.counted(len(rays), seen.num_samples)
         part = part_of(image, pixels)
         penalties: dict[str, Tensor] = {}
         if seen.coarse is not None:
             coarse = seen.coarse.colour + seen.coarse.transmittance[:, None] * background
-            penalties["coarse"] = masked_mean(self._function(coarse[None], part.composite(background)), part.mask)
+            penalties["coarse"] = masked_mean(
+                self._function(coarse[None], part.composite(background)), part.mask
+            )
         rgb = seen.colour + seen.transmittance[:, None] * background
-        far = (seen.depth * z / (1 - seen.transmittance).clamp_min(1e-9))[None, None] if depth else None
-        return Drawn(Rendering(rgb[None, None], seen.transmittance[None, None], far), penalties, image=part)
+        far = (
+            (seen.depth * z / (1 - seen.transmittance).clamp_min(1e-9))[None, None]
+            if depth
+            else None
+        )
+        return Drawn(
+            Rendering(rgb[None, None], seen.transmittance[None, None], far), penalties, image=part
+        )
 
     def update(self, step: int) -> Updated:
-        updates = [self._update_of(name, x, self.rate(step)) for name, x in self._field.parameters.items()]
+        updates = [
+            self._update_of(name, x, self.rate(step)) for name, x in self._field.parameters.items()
+        ]
         return Updated(self._adam.steps_(updates, step=step, betas=self.betas))
 
     def _update_of(self, name: str, x: Tensor, rate: float) -> AdamUpdate | None:
@@ -129,7 +150,8 @@ class FieldTraining(Model[FieldScene], Generic[F]):
         return self.scene.state() | prefixed("adam", self._adam.state())
 
     def restored_field(self, checkpoint: Checkpoint) -> F:
-        """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
+        """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not
+        fit."""
         raise NotImplementedError
 
     def restore(self, checkpoint: Checkpoint) -> None:

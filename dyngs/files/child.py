@@ -1,4 +1,5 @@
-"""Python processes that dyngs starts. They find the packages of this process, none in its folder."""
+"""Python processes that dyngs starts. They find the packages of this process, none in its
+folder."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ def python_command(module: str, *arguments: str) -> list[str]:
     ``python -m`` imports modules from the current folder, which may hold files of strangers.
     ``python -I`` does not, but ignores PYTHONPATH and ``pip install --user``: they are passed on.
     """
-    places = [os.path.abspath(place) for place in sys.path if place and not _is_current_folder(place)]
+    places = [
+        os.path.abspath(place) for place in sys.path if place and not _is_current_folder(place)
+    ]
     start = _START.format(
         user_sites=ascii([site.getusersitepackages()] if site.ENABLE_USER_SITE else []),
         places=ascii(places),

@@ -1,7 +1,9 @@
-"""Containment of untrusted captures: their files must lie in their folder, their images must not be too large.
+"""Containment of untrusted captures: their files must lie in their folder, their images must not be
+too large.
 
-A capture may name any file of the user as one of its images, by a link, an absolute path or ``..``, and an image of
-a few kilobytes may fill all memory. Every path is checked here before it is opened, every image before it is decoded.
+A capture may name any file of the user as one of its images, by a link, an absolute path or ``..``,
+and an image of a few kilobytes may fill all memory. Every path is checked here before it is opened,
+every image before it is decoded.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ _MAX_LISTED = 100_000
 
 @dataclass(frozen=True)
 class _Boundary:
-    """The folder that files must lie in: ``root``, and ``real`` with links resolved; ``folders`` is a cache."""
+    """The folder that files must lie in: ``root``, and ``real`` with links resolved; ``folders`` is
+    a cache."""
 
     root: Path
     real: str
@@ -46,7 +49,8 @@ _max_megapixels: ContextVar[float] = ContextVar("max_megapixels", default=MAX_ME
 
 @contextmanager
 def staying_within(root: Path, follow_links: bool = False) -> Iterator[None]:
-    """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if ``follow_links``."""
+    """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
+    ``follow_links``."""
     token = _boundary.set(None if follow_links else _Boundary(root, os.path.realpath(root)))
     try:
         yield
@@ -96,8 +100,10 @@ def inside(path: Path) -> Path:
 
 
 def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
-    """Check that an image is not too large to be decoded; more than four channels count in proportion."""
-    megapixels, limit = width * height * max(channels / 4, 1) / 1e6, _max_megapixels.get()
+    """Check that an image is not too large to be decoded; more than four channels count in
+    proportion."""
+    megapixels = width * height * max(channels / 4, 1) / 1e6
+    limit = _max_megapixels.get()
     if megapixels > limit:
         many = f" of {channels} channels" if channels > 4 else ""
         raise DyngsError(
@@ -112,9 +118,11 @@ def max_decoded_mb() -> int:
 
 
 def leaving_links(root: Path) -> list[tuple[Path, str]]:
-    """List links among the first 100,000 entries below ``root`` that lead out of it, with targets; none is followed."""
+    """List links among the first 100,000 entries below ``root`` that lead out of it, with targets;
+    none is followed."""
     real = os.path.realpath(root)
-    found, seen = [], 0
+    found = []
+    seen = 0
     for folder, names, files in os.walk(root):
         for name in sorted((*names, *files)):
             path = Path(folder, name)

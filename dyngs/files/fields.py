@@ -33,11 +33,14 @@ def read_json(path: Path) -> object:
             return json.loads(read_limited(inside(path)))
         except json.JSONDecodeError as error:
             where = f"{path}, line {error.lineno} column {error.colno}"
-            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
+            raise DyngsError(
+                f"{where}: broken JSON ({error.msg}); copy or export it again"
+            ) from error
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file within the limit on its size, UTF-8 or, as its first bytes show, UTF-16 or UTF-32."""
+    """Return the text of a file within the limit on its size, UTF-8 or, as its first bytes show,
+    UTF-16 or UTF-32."""
     data = read_limited(inside(path))
     return data.decode(json.detect_encoding(data))
 
@@ -55,7 +58,8 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 
 def matrix_of(where: str, key: str, value: object) -> np.ndarray:
-    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not checked."""
+    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not
+    checked."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -72,7 +76,8 @@ def entry(where: object, fields: object, key: str) -> Any:
 
 
 def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
-    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the file may differ."""
+    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the
+    file may differ."""
     array = float_array(value)
     fits = array is not None and (shape is None or array.size == math.prod(shape))
     if array is None or not fits or not (np.abs(array) <= LARGEST).all():
@@ -83,14 +88,18 @@ def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> n
 
 def first_few(items: Collection[object]) -> str:
     """Return the first five items as text for messages, and how many more there are."""
-    return ", ".join(str(item) for item in list(items)[:5]) + (f" and {len(items) - 5} more" if len(items) > 5 else "")
+    return ", ".join(str(item) for item in list(items)[:5]) + (
+        f" and {len(items) - 5} more" if len(items) > 5 else ""
+    )
 
 
 def float_array(value: object) -> np.ndarray | None:
     """Return ``value`` as a float64 array, None where it holds anything but numbers."""
     try:
         array = np.asarray(value) if _is_numeric(value) else None
-        return array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
+        return (
+            array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
+        )
     except (TypeError, ValueError, OverflowError):
         return None
 

@@ -18,7 +18,8 @@ def folded(name: str) -> str:
 
 
 class FileFinder:
-    """Finds files below ``root`` by the names in a capture; lists a folder once, if a name differs."""
+    """Finds files below ``root`` by the names in a capture; lists a folder once, if a name
+    differs."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -27,8 +28,9 @@ class FileFinder:
     def find(self, written: str) -> Path:
         """Return the file that ``written`` names, relative to ``root``; if it is missing, its path.
 
-        Backslashes separate folders, too. Case and Unicode form may differ if a single file fits. Of an
-        absolute path that does not exist, the longest end that is a file below ``root`` is taken.
+        Backslashes separate folders, too. Case and Unicode form may differ if a single file fits.
+        Of an absolute path that does not exist, the longest end that is a file below ``root`` is
+        taken.
         """
         for text in (written, written.replace("\\", "/")):
             path = Path(os.path.normpath(self.root / text))
@@ -52,7 +54,8 @@ class FileFinder:
         return path if path.is_file() else None
 
     def _entry(self, folder: Path, part: str) -> str | None:
-        """Return the entry of a folder with this name, else the only one with this key, else None."""
+        """Return the entry of a folder with this name, else the only one with this key, else
+        None."""
         if folder not in self._listings:
             entries: dict[str, list[str]] = {}
             for name in os.listdir(folder) if inside(folder).is_dir() else ():

@@ -1,7 +1,8 @@
-"""glTF 2.0 (``.glb``, ``.gltf``, ``.vrma``): reader of untrusted documents and their numbers, writer of ``.glb``.
+"""glTF 2.0 (``.glb``, ``.gltf``, ``.vrma``): reader of untrusted documents and their numbers,
+writer of ``.glb``.
 
-Only what meshes of points, skins and animations need is looked at. Local letters: K elements of an accessor, D numbers
-of each.
+Only what meshes of points, skins and animations need is looked at. Local letters: K elements of an
+accessor, D numbers of each.
 """
 
 from __future__ import annotations
@@ -16,7 +17,15 @@ from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    PositiveInt,
+    ValidationError,
+)
 
 from dyngs.errors import DyngsError, require_regular
 from dyngs.files.limits import require_at_most
@@ -31,10 +40,12 @@ _MOST_PARTS = 1 << 16
 """Limit on nodes, accessors, channels and the like."""
 _MOST_DOCUMENT_BYTES = 1 << 24
 _MOST_NUMBERS = 1 << 25
-"""Limit on the numbers read of all accessors together, each of which may be named many times; a larger file may have
-four for each of its bytes. It is 100 joints with rotation, translation and scale in 30,000 keys."""
+"""Limit on the numbers read of all accessors together, each of which may be named many times; a
+larger file may have four for each of its bytes. It is 100 joints with rotation, translation and
+scale in 30,000 keys."""
 _KEPT_NUMBERS = 1 << 20
-"""Numbers of an accessor up to which they are kept for the next time, as animations name the same times often."""
+"""Numbers of an accessor up to which they are kept for the next time, as animations name the same
+times often."""
 
 _Number = Annotated[FiniteFloat, Field(ge=-1e9, le=1e9)]
 _Three = Annotated[tuple[_Number, ...], Field(min_length=3, max_length=3)]
@@ -159,7 +170,8 @@ class _Document(_Part):
 
 
 class GltfFile:
-    """The document of a file, and access to the numbers in its buffers. Raises DyngsError: not glTF 2.0, or damaged."""
+    """The document of a file, and access to the numbers in its buffers. Raises DyngsError: not glTF
+    2.0, or damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -179,7 +191,8 @@ class GltfFile:
         return DyngsError(f"{self.path}: {problem}")
 
     def numbers(self, index: int, kind: str, dtype: type[np.floating] = np.float64) -> np.ndarray:
-        """Return the numbers (K, D) of an accessor, normalised integers in [-1, 1] or [0, 1]; NaN and infinities stay.
+        """Return the numbers (K, D) of an accessor, normalised integers in [-1, 1] or [0, 1]; NaN
+        and infinities stay.
 
         Raises DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
         """
@@ -188,21 +201,30 @@ class GltfFile:
             raise self.error(f"accessor {index} is missing; export it again")
         accessor = document.accessors[index]
         if accessor.type != kind or accessor.componentType not in _TYPES:
-            raise self.error(f"accessor {index} must hold {kind}, not {accessor.type[:20]!r}; export it again")
+            raise self.error(
+                f"accessor {index} must hold {kind}, not {accessor.type[:20]!r}; export it again"
+            )
         if accessor.bufferView is None or accessor.sparse is not None:
-            raise self.error(f"accessor {index} is sparse or has no data; export it with plain accessors")
+            raise self.error(
+                f"accessor {index} is sparse or has no data; export it with plain accessors"
+            )
         view, data = self._view(accessor.bufferView, f"accessor {index}")
-        stored, width = np.dtype("<" + _TYPES[accessor.componentType]), _WIDTHS[kind]
+        stored = np.dtype("<" + _TYPES[accessor.componentType])
+        width = _WIDTHS[kind]
         stride = view.byteStride or width * stored.itemsize
         needed = accessor.byteOffset + stride * (accessor.count - 1) + width * stored.itemsize
         if len(data) < needed:
-            raise self.error(f"accessor {index} lies outside its buffer; the file is cut off or broken")
+            raise self.error(
+                f"accessor {index} lies outside its buffer; the file is cut off or broken"
+            )
         self._count += accessor.count * width
         most = max(_MOST_NUMBERS, 4 * sum(map(len, self._buffers.values())))
         require_at_most(self.path, self._count, most, "numbers")
         if (index, dtype) in self._kept:
             return self._kept[index, dtype]
-        found = np.ndarray((accessor.count, width), stored, data, accessor.byteOffset, (stride, stored.itemsize))
+        found = np.ndarray(
+            (accessor.count, width), stored, data, accessor.byteOffset, (stride, stored.itemsize)
+        )
         with np.errstate(invalid="ignore"):
             values = found.astype(dtype)
         if accessor.normalized and stored.kind in "iu":
@@ -212,7 +234,8 @@ class GltfFile:
         return values
 
     def view_bytes(self, index: object, who: str) -> bytes:
-        """Return the bytes of a buffer view that ``who`` names. Raises DyngsError: it is missing or cut off."""
+        """Return the bytes of a buffer view that ``who`` names. Raises DyngsError: it is missing or
+        cut off."""
         if not isinstance(index, int) or index < 0:
             raise self.error(f"{who} names no buffer view; export it again")
         return bytes(self._view(index, who)[1])
@@ -224,7 +247,9 @@ class GltfFile:
         view = self.document.bufferViews[index]
         if any("compression" in name for name in view.extensions):
             raise self.error(f"{who} is compressed; export it without compression")
-        data = memoryview(self._buffer(view.buffer))[view.byteOffset : view.byteOffset + view.byteLength]
+        data = memoryview(self._buffer(view.buffer))[
+            view.byteOffset : view.byteOffset + view.byteLength
+        ]
         if len(data) < view.byteLength:
             raise self.error(f"{who} lies outside its buffer; the file is cut off or broken")
         return view, data
@@ -246,7 +271,12 @@ class GltfFile:
                 raise self.error("an embedded buffer is not base64; export it again") from None
         name = unquote(uri)
         parts = PurePosixPath(name).parts
-        if not parts or ".." in parts or PurePosixPath(name).is_absolute() or set(name) & {":", "\\", "\0"}:
+        if (
+            not parts
+            or ".." in parts
+            or PurePosixPath(name).is_absolute()
+            or set(name) & {":", "\\", "\0"}
+        ):
             raise self.error(f"its buffer {name[:60]!r} is not a file beside it; export it as .glb")
         beside = self.path.parent / name
         if beside.exists() and not beside.is_file():
@@ -254,7 +284,9 @@ class GltfFile:
         try:
             return beside.read_bytes()
         except OSError as error:
-            raise self.error(f"its buffer {name[:60]!r} cannot be read ({error.strerror})") from error
+            raise self.error(
+                f"its buffer {name[:60]!r} cannot be read ({error.strerror})"
+            ) from error
 
 
 def _chunks(path: Path) -> tuple[bytes, bytes]:
@@ -269,7 +301,8 @@ def _chunks(path: Path) -> tuple[bytes, bytes]:
     found: dict[bytes, bytes] = {}
     start = 12
     while start + 8 <= len(content):
-        size, kind = int.from_bytes(content[start : start + 4], "little"), content[start + 4 : start + 8]
+        size = int.from_bytes(content[start : start + 4], "little")
+        kind = content[start + 4 : start + 8]
         if start + 8 + size > len(content):
             raise DyngsError(f"{path}: is cut off; copy or export it again")
         found.setdefault(kind, content[start + 8 : start + 8 + size])
@@ -284,7 +317,8 @@ class GlbDocument:
     """A glTF document to write, and its buffer.
 
     Attributes:
-        json: the document; all parts but accessors, buffer views and buffers are added by the caller.
+        json: the document; all parts but accessors, buffer views and buffers are added by the
+            caller.
     """
 
     def __init__(self) -> None:
@@ -298,23 +332,37 @@ class GlbDocument:
         """Add an accessor of (K, D) or (K,) numbers; return its index.
 
         Args:
-            values: float32, uint8, uint16 or uint32; rows of several numbers take a multiple of four bytes.
+            values: float32, uint8, uint16 or uint32; rows of several numbers take a multiple of
+                four bytes.
             use: ``VERTICES`` or ``INDICES`` for those of a mesh.
             limits: whether the smallest and the largest number of each column are stated.
         """
         rows = values.reshape(len(values), -1)
-        component = next(number for number, name in _TYPES.items() if name == f"{rows.dtype.kind}{rows.itemsize}")
-        accessor: dict[str, Any] = {"bufferView": self._add(rows, rows.nbytes, use), "componentType": component}
-        accessor |= {"count": len(rows), "type": {width: name for name, width in _WIDTHS.items()}[rows.shape[1]]}
+        component = next(
+            number for number, name in _TYPES.items() if name == f"{rows.dtype.kind}{rows.itemsize}"
+        )
+        accessor: dict[str, Any] = {
+            "bufferView": self._add(rows, rows.nbytes, use),
+            "componentType": component,
+        }
+        accessor |= {
+            "count": len(rows),
+            "type": {width: name for name, width in _WIDTHS.items()}[rows.shape[1]],
+        }
         if limits:
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         self._accessors.append(accessor)
         return len(self._accessors) - 1
 
     def add_placeholder(self, values: np.ndarray, limits: bool = False) -> int:
-        """Add an accessor of float32 numbers (K, D) that an extension provides; return its index."""
+        """Add an accessor of float32 numbers (K, D) that an extension provides; return its
+        index."""
         kinds = {width: name for name, width in _WIDTHS.items()}
-        accessor: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": kinds[values.shape[1]]}
+        accessor: dict[str, Any] = {
+            "componentType": 5126,
+            "count": len(values),
+            "type": kinds[values.shape[1]],
+        }
         if limits:
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         self._accessors.append(accessor)
@@ -324,14 +372,23 @@ class GlbDocument:
         """Add a buffer view; return its index."""
         return self._add(content, len(content), None)
 
-    def add_animation(self, name: str, seconds: np.ndarray, channels: Sequence[tuple[int, str, np.ndarray]]) -> None:
-        """Add an animation: nodes, each with a path ("translation", ...) and its (F, D) values at (F,) ``seconds``."""
+    def add_animation(
+        self, name: str, seconds: np.ndarray, channels: Sequence[tuple[int, str, np.ndarray]]
+    ) -> None:
+        """Add an animation: nodes, each with a path ("translation", ...) and its (F, D) values at
+        (F,) ``seconds``."""
         times = self.add_numbers(seconds.astype(np.float32), limits=True)
         samplers = [
-            {"input": times, "output": self.add_numbers(values.astype(np.float32))} for _, _, values in channels
+            {"input": times, "output": self.add_numbers(values.astype(np.float32))}
+            for _, _, values in channels
         ]
-        targets = [{"sampler": i, "target": {"node": node, "path": path}} for i, (node, path, _) in enumerate(channels)]
-        self.json.setdefault("animations", []).append({"name": name, "channels": targets, "samplers": samplers})
+        targets = [
+            {"sampler": i, "target": {"node": node, "path": path}}
+            for i, (node, path, _) in enumerate(channels)
+        ]
+        self.json.setdefault("animations", []).append(
+            {"name": name, "channels": targets, "samplers": samplers}
+        )
 
     def _add(self, content: bytes | np.ndarray, size: int, use: int | None) -> int:
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": size}
@@ -342,7 +399,11 @@ class GlbDocument:
 
     def write(self, path: Path) -> None:
         """Write the file, not atomically."""
-        buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._size}]}
+        buffers = {
+            "accessors": self._accessors,
+            "bufferViews": self._views,
+            "buffers": [{"byteLength": self._size}],
+        }
         text = json.dumps(self.json | buffers, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         with open(path, "wb") as out:

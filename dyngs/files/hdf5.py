@@ -29,19 +29,32 @@ def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
     try:
         h5py = import_module("h5py")
     except ImportError:
-        raise DyngsError(f"{path}: HDF5 files need the package h5py; run pip install 'dyngs[people]'") from None
+        raise DyngsError(
+            f"{path}: HDF5 files need the package h5py; run pip install 'dyngs[people]'"
+        ) from None
     if not inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it")
     advice = f"'{key}' must be a data set in an HDF5 file; copy the file again"
     with reading(path, advice), h5py.File(path, "r") as file:
         # A link inside the file may lead to another file.
-        found: Any = file.get(key) if isinstance(file.get(key, getlink=True), h5py.HardLink) else None
-        if not isinstance(found, h5py.Dataset) or not found.shape or found.external or found.is_virtual:
+        found: Any = (
+            file.get(key) if isinstance(file.get(key, getlink=True), h5py.HardLink) else None
+        )
+        if (
+            not isinstance(found, h5py.Dataset)
+            or not found.shape
+            or found.external
+            or found.is_virtual
+        ):
             raise DyngsError(f"{path}: the data set '{key}' is missing; export it again")
         if rows is None:
             return found.shape
         if found.dtype.kind not in "biuf":
             raise DyngsError(f"{path}: '{key}' must hold numbers; export it again")
         shape = found.shape if isinstance(rows, EllipsisType) else found.shape[1:]
-        check_size(path, max(math.prod(shape), math.prod(found.chunks or ())), max(1, found.dtype.itemsize // 4))
+        check_size(
+            path,
+            max(math.prod(shape), math.prod(found.chunks or ())),
+            max(1, found.dtype.itemsize // 4),
+        )
         return found[rows]

@@ -1,4 +1,5 @@
-"""Limits on the memory that untrusted files may ask for, and the environment variable that raises them."""
+"""Limits on the memory that untrusted files may ask for, and the environment variable that raises
+them."""
 
 from __future__ import annotations
 
@@ -15,19 +16,23 @@ MOST_TEXT_BYTES = 1 << 26
 
 
 def allowed(most: int) -> int:
-    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not set."""
+    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not
+    set."""
     text = os.environ.get(VARIABLE, "1")
     try:
         factor = float(text)
     except ValueError:
         factor = 0.0
     if not 1 <= factor <= 1e6:
-        raise DyngsError(f"{VARIABLE}={text:.20} must be a number from 1 to 1e6: how many times the usual limits hold")
+        raise DyngsError(
+            f"{VARIABLE}={text:.20} must be a number from 1 to 1e6: how many times the usual limits hold"
+        )
     return int(most * factor)
 
 
 def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
-    """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that ``DYNGS_LIMITS`` may raise."""
+    """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that
+    ``DYNGS_LIMITS`` may raise."""
     if amount > most and amount > allowed(most):
         shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
         factor = math.ceil(amount / most) if amount < 10**18 else "N"

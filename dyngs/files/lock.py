@@ -1,4 +1,5 @@
-"""A lock for one writer at a time in a folder, released by the system when its process ends, however it ends."""
+"""A lock for one writer at a time in a folder, released by the system when its process ends,
+however it ends."""
 
 from __future__ import annotations
 
@@ -23,13 +24,15 @@ else:
     import fcntl
 
 LOCK_NAME = "run.lock"
-"""File that exists while a process writes into the folder; one left by a killed process has no effect."""
+"""File that exists while a process writes into the folder; one left by a killed process has no
+effect."""
 
 _HELD = (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK)
 _WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 _WAIT = 1.0  # seconds between two looks at a folder that another process makes
 _FAR = 2**30
-"""Offset of the locked byte on Windows, past the end of the file: a locked byte cannot be read by others."""
+"""Offset of the locked byte on Windows, past the end of the file: a locked byte cannot be read by
+others."""
 
 
 class InUseError(DyngsError):
@@ -37,14 +40,17 @@ class InUseError(DyngsError):
 
 
 class Held:
-    """A folder that this process writes into; ``alone``: no other does, which is not known where there are no locks."""
+    """A folder that this process writes into; ``alone``: no other does, which is not known where
+    there are no locks."""
 
     def __init__(self, folder: Path, *, alone: bool) -> None:
         self._folder, self.alone = folder, alone
-        self._opened = None if sys.platform == "win32" else os.open(folder, os.O_RDONLY)  # there it cannot be renamed
+        # there it cannot be renamed
+        self._opened = None if sys.platform == "win32" else os.open(folder, os.O_RDONLY)
 
     def folder(self) -> Path | None:
-        """Return where the folder is by now, also after it was renamed; None: it was removed, or cannot be found."""
+        """Return where the folder is by now, also after it was renamed; None: it was removed, or
+        cannot be found."""
         if self._opened is None or _is_the_same(self._opened, self._folder):
             return self._folder
         path = _path_of(self._opened)
@@ -60,10 +66,12 @@ class Held:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[Held]:
-    """Yield the folder, into which no other process writes in the block, if its file system has locks.
+    """Yield the folder, into which no other process writes in the block, if its file system has
+    locks.
 
-    The folder is made where it is missing, and removed where nothing came of it. The file ``run.lock`` says who writes.
-    A file system that has no locks (some network file systems) is told of in a line on stderr.
+    The folder is made where it is missing, and removed where nothing came of it. The file
+    ``run.lock`` says who writes. A file system that has no locks (some network file systems) is
+    told of in a line on stderr.
 
     Raises:
         InUseError: another process writes there.
@@ -72,7 +80,9 @@ def writing(folder: Path) -> Iterator[Held]:
     require_within_run(folder)
     links = leaving_links(folder)
     if links:
-        raise DyngsError(f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it")
+        raise DyngsError(
+            f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it"
+        )
     made = _made(folder)
     try:
         file, locks = _locked(folder / LOCK_NAME)
@@ -88,11 +98,14 @@ def writing(folder: Path) -> Iterator[Held]:
                 path.rmdir()  # only succeeds if nothing came of it
 
 
-def make_once(folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str) -> None:
+def make_once(
+    folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str
+) -> None:
     """Create a folder of the cache by calling ``make``, or print ``found`` if it exists.
 
-    One of several processes creates it, the others wait for it. Without file locks each of them calls ``make``, and the
-    first result is kept. Raises DyngsError: as ``make`` does, or the cache cannot be written.
+    One of several processes creates it, the others wait for it. Without file locks each of them
+    calls ``make``, and the first result is kept. Raises DyngsError: as ``make`` does, or the cache
+    cannot be written.
     """
     path = folder.with_name(f".{folder.name}.lock")
     _made(folder.parent)
@@ -152,7 +165,9 @@ def _locked(path: Path) -> tuple[int, bool]:
             os.close(file)
             if error.errno not in _HELD:
                 raise DyngsError(f"cannot lock {path}: {error.strerror or error}") from error
-            raise InUseError(f"{folder}: {_owner(path)}; wait until it has ended, or give another folder") from None
+            raise InUseError(
+                f"{folder}: {_owner(path)}; wait until it has ended, or give another folder"
+            ) from None
 
 
 def _opened(path: Path) -> int:
@@ -207,8 +222,13 @@ def _is_the_same(file: int, path: Path) -> bool:
 
 
 def _sign(file: int) -> None:
-    """Write who has the lock, for the message to others; without room on the disk nobody is told."""
-    owner = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
+    """Write who has the lock, for the message to others; without room on the disk nobody is
+    told."""
+    owner = {
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "since": time.strftime("%Y-%m-%d %H:%M:%S"),
+    }
     with suppress(OSError):
         os.ftruncate(file, 0)
         os.lseek(file, 0, os.SEEK_SET)
@@ -220,7 +240,9 @@ def _owner(path: Path) -> str:
     try:
         with path.open("rb") as file:
             known = json.loads(file.read(4096))
-        pid, host, since = int(known["pid"]), str(known["host"]), str(known["since"])
+        pid = int(known["pid"])
+        host = str(known["host"])
+        since = str(known["since"])
     except (OSError, ValueError, KeyError, TypeError):
         return "another process is writing there"
     return f"process {pid} on {host} has been writing there since {since}"

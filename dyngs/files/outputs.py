@@ -1,4 +1,5 @@
-"""No output replaces an input: the one check of every path that a command or a function is about to write to."""
+"""No output replaces an input: the one check of every path that a command or a function is about to
+write to."""
 
 from __future__ import annotations
 
@@ -28,20 +29,23 @@ class Inputs:
 
     Args:
         paths: of what is read; what is None or does not exist counts for nothing.
-        elsewhere: yields more files where they are costly to find; only called for outputs that exist.
+        elsewhere: yields more files where they are costly to find; only called for outputs that
+            exist.
     """
 
-    def __init__(self, paths: Iterable[Path | None], elsewhere: Callable[[], Iterable[Path]] = tuple) -> None:
+    def __init__(
+        self, paths: Iterable[Path | None], elsewhere: Callable[[], Iterable[Path]] = tuple
+    ) -> None:
         self.paths = tuple(path for path in paths if path is not None)
         self.elsewhere = elsewhere
 
     def require_output(self, out: Path) -> None:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
-        Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is
-        read; it is a folder that holds a link to an input; a link leads it out of its run folder; or it is a device,
-        a pipe or the like. A run folder in a capture, an empty folder, and a folder around a capture may be written
-        to.
+        Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in
+        a folder that is read; it is a folder that holds a link to an input; a link leads it out of
+        its run folder; or it is a device, a pipe or the like. A run folder in a capture, an empty
+        folder, and a folder around a capture may be written to.
         """
         require_within_run(out)
         require_replaceable(out)
@@ -62,7 +66,9 @@ class Inputs:
             path = out / name
             source = self._files.get(_identity(path) or ("", ""))
             if source is not None and os.path.abspath(source) != os.path.abspath(path):
-                raise DyngsError(f"{out}: holds {name}, a link to {source}, which is read; give another folder")
+                raise DyngsError(
+                    f"{out}: holds {name}, a link to {source}, which is read; give another folder"
+                )
 
     @cached_property
     def _folders(self) -> tuple[Path, ...]:
@@ -70,9 +76,17 @@ class Inputs:
 
     @cached_property
     def _files(self) -> dict[_Identity, Path]:
-        """All files that are read, also below folders and through links, by what tells them from others."""
-        single = (path for path in (*self.paths, *_sources(self.paths), *self.elsewhere()) if not path.is_dir())
-        paths = (*single, *(path for folder in self._folders for path in _files_below(folder, set())))
+        """All files that are read, also below folders and through links, by what tells them from
+        others."""
+        single = (
+            path
+            for path in (*self.paths, *_sources(self.paths), *self.elsewhere())
+            if not path.is_dir()
+        )
+        paths = (
+            *single,
+            *(path for folder in self._folders for path in _files_below(folder, set())),
+        )
         return {identity: path for path in paths if (identity := _identity(path)) is not None}
 
 
@@ -82,19 +96,23 @@ def require_within_run(out: Path) -> None:
         if (run / _RUN_MARK).is_file() and any((run / name).exists() for name in _OF_RUNS):
             place = out if out.is_dir() else out.parent
             if not place.resolve().is_relative_to(run.resolve()):
-                raise DyngsError(f"{out}: a link leads to {place.resolve()}, out of the run; give another output")
+                raise DyngsError(
+                    f"{out}: a link leads to {place.resolve()}, out of the run; give another output"
+                )
             return
 
 
 def require_new_folder(out: Path) -> None:
-    """Check that ``out`` does not exist or is an empty folder. Raises DyngsError if it holds something or is a file."""
+    """Check that ``out`` does not exist or is an empty folder. Raises DyngsError if it holds
+    something or is a file."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DyngsError(f"{out} exists already; name a new folder")
 
 
 @contextmanager
 def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) -> Iterator[Path]:
-    """Yield a hidden folder next to ``out`` that gets its name when the block ends well, and is removed otherwise.
+    """Yield a hidden folder next to ``out`` that gets its name when the block ends well, and is
+    removed otherwise.
 
     Raises DyngsError: by ``require``, before and after; ``out`` cannot be written.
     """
@@ -114,7 +132,8 @@ def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) 
 
 
 def note_sources(capture: Path, *sources: Path) -> None:
-    """Write into a made capture where its photos or videos lie, next to those noted before; no output replaces them."""
+    """Write into a made capture where its photos or videos lie, next to those noted before; no
+    output replaces them."""
     known = _read_sources(capture)
     names = list(dict.fromkeys([*known, *(os.path.abspath(source) for source in sources)]))
     if names != known:
@@ -123,7 +142,8 @@ def note_sources(capture: Path, *sources: Path) -> None:
 
 def _require_outside(out: Path, folder: Path) -> None:
     """Check that an existing ``out`` is not ``folder`` and does not lie in it; it may hold it."""
-    own, root = _identity(out), _identity(folder)
+    own = _identity(out)
+    root = _identity(folder)
     if own == root:
         raise DyngsError(f"{out}: is the folder that is read; give another output")
     if out.is_dir() and not any(out.iterdir()):
@@ -146,12 +166,14 @@ def _read_sources(capture: Path) -> list[str]:
     try:
         names = json.loads(read_limited(capture / SOURCES_NAME, _MAX_SOURCES_BYTES))["sources"]
         return [name for name in names if isinstance(name, str) and "\0" not in name]
-    except (DyngsError, OSError, ValueError, KeyError, TypeError, RecursionError):  # costs no more than this protection
+    except (DyngsError, OSError, ValueError, KeyError, TypeError, RecursionError):
+        # costs no more than this protection
         return []
 
 
 def _files_below(folder: Path, seen: set[_Identity]) -> Iterator[Path]:
-    """Yield all files below a folder, also through links to folders, each folder once; those of runs are left out."""
+    """Yield all files below a folder, also through links to folders, each folder once; those of
+    runs are left out."""
     identity = _identity(folder)
     if identity is None or identity in seen:
         return
@@ -169,9 +191,12 @@ def _files_below(folder: Path, seen: set[_Identity]) -> Iterator[Path]:
 
 
 def _ways(path: Path) -> tuple[Path, Path]:
-    """Return where a path lies, and where a link of that name leads to; with no links above either."""
+    """Return where a path lies, and where a link of that name leads to; with no links above
+    either."""
     real = Path(os.path.realpath(path))
-    return (real if path.name in ("", "..") else Path(os.path.realpath(path.parent), path.name)), real
+    return (
+        real if path.name in ("", "..") else Path(os.path.realpath(path.parent), path.name)
+    ), real
 
 
 def _identity(path: Path) -> _Identity | None:
@@ -182,4 +207,5 @@ def _identity(path: Path) -> _Identity | None:
         return None
     if status.st_ino:
         return status.st_dev, status.st_ino
-    return "", os.path.realpath(path).casefold()  # a file system without such numbers; they mostly ignore case
+    # a file system without such numbers; they mostly ignore case
+    return "", os.path.realpath(path).casefold()

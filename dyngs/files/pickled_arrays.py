@@ -1,7 +1,8 @@
-"""Arrays in pickles: interpretation of the few classes and functions that their writers name, without calling them.
+"""Arrays in pickles: interpretation of the few classes and functions that their writers name,
+without calling them.
 
-A name in a pickle becomes a ``Name``, which is only text; ``Arrays`` rebuilds the arrays that calls of these names by
-NumPy, SciPy, chumpy or joblib stand for.
+A name in a pickle becomes a ``Name``, which is only text; ``Arrays`` rebuilds the arrays that calls
+of these names by NumPy, SciPy, chumpy or joblib stand for.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import require_text
 
 _MOST_ENTRIES = 1 << 24
-"""Entries of all sparse matrices of a file, zeros included; joint regressors of bodies have half a million."""
+"""Entries of all sparse matrices of a file, zeros included; joint regressors of bodies have half a
+million."""
 _MOST_AXES = 32
 _LARGEST_AXIS = 1 << 48
 _MOST_LEVELS = 8
@@ -69,7 +71,8 @@ class Array(np.ndarray):
     """An array out of a pickle.
 
     Attributes:
-        awaits: how the state that will fill it spells the array; None once it is filled, which happens but once.
+        awaits: how the state that will fill it spells the array; None once it is filled, which
+            happens but once.
         levels: of arrays of objects in each other, itself counted.
     """
 
@@ -78,12 +81,18 @@ class Array(np.ndarray):
 
 
 def shown(value: object) -> str:
-    """Return a short text for messages: strings, numbers and None as they are, else the name of the type."""
-    return repr(value)[:20] if isinstance(value, (str, float, bool, type(None))) else type(value).__name__
+    """Return a short text for messages: strings, numbers and None as they are, else the name of the
+    type."""
+    return (
+        repr(value)[:20]
+        if isinstance(value, (str, float, bool, type(None)))
+        else type(value).__name__
+    )
 
 
 class Arrays:
-    """Interpretation of the names in one pickle, a file of ``size`` bytes; ``read`` returns the next bytes of it."""
+    """Interpretation of the names in one pickle, a file of ``size`` bytes; ``read`` returns the
+    next bytes of it."""
 
     def __init__(self, path: Path, size: int, read: Callable[[int], bytes]) -> None:
         self._path, self._read = path, read
@@ -104,7 +113,8 @@ class Arrays:
         return found
 
     def called(self, name: object, arguments: object) -> object:
-        """Return the object that a call stands for; raises exceptions of any kind for wrong arguments."""
+        """Return the object that a call stands for; raises exceptions of any kind for wrong
+        arguments."""
         if not isinstance(name, Name) or not isinstance(arguments, tuple):
             raise ValueError("it calls what is no function")
         if name.array is not None:
@@ -112,17 +122,21 @@ class Arrays:
         if name.text == "numpy.dtype":
             return Dtype(arguments[0] if arguments else None)
         if name.text not in _CALLS:
-            raise ValueError(f"it makes a {name.text!r:.40}, but only numbers, text and arrays are read")
+            raise ValueError(
+                f"it makes a {name.text!r:.40}, but only numbers, text and arrays are read"
+            )
         return _CALLS[name.text](self, *arguments)
 
     def build(self, target: object, state: object) -> None:
-        """Set the state of ``target``, made by ``called``; raises exceptions of any kind for a wrong state."""
+        """Set the state of ``target``, made by ``called``; raises exceptions of any kind for a
+        wrong state."""
         if isinstance(target, Dtype):
             _set_order(target, state)
             return
         if not isinstance(target, Array) or target.awaits is None:
             raise ValueError("it sets the state of what has none")
-        spelled, target.awaits = target.awaits, None
+        spelled = target.awaits
+        target.awaits = None
         if spelled == "plain":
             self._fill(target, self._beside(state) if isinstance(state, dict) else state)
         elif not isinstance(state, dict):
@@ -136,7 +150,8 @@ class Arrays:
             self._become(target, dense if spelled == "columns" else np.ascontiguousarray(dense.T))
 
     def charge(self, count: int) -> None:
-        """Count bytes of memory allocated for the file; raises ValueError if there are too many for its size."""
+        """Count bytes of memory allocated for the file; raises ValueError if there are too many for
+        its size."""
         self._bytes_left -= count
         if self._bytes_left < 0:
             raise ValueError("it makes many large arrays out of the same bytes")
@@ -145,7 +160,8 @@ class Arrays:
         _, shape, dtype, fortran, raw = state
         if not isinstance(dtype, Dtype):
             raise ValueError("an array in it has no proper type and shape")
-        count, kind = _count(shape), dtype.value.kind
+        count = _count(shape)
+        kind = dtype.value.kind
         raw = raw.encode("latin-1") if isinstance(raw, str) else raw  # bytes of Python 2
         wanted = count * (1 if kind == "O" else dtype.value.itemsize)
         if not isinstance(raw, list if kind == "O" else (bytes, bytearray)) or len(raw) != wanted:
@@ -165,12 +181,19 @@ class Arrays:
 
     def _beside(self, state: dict[str, Any]) -> tuple[Any, ...]:
         """State of an array whose bytes joblib wrote into the file after this entry."""
-        shape, dtype = state["shape"], state["dtype"]
+        shape = state["shape"]
+        dtype = state["dtype"]
         if not isinstance(dtype, Dtype) or dtype.value.kind == "O":
             raise ValueError("an array in it does not hold numbers")
         if state.get("numpy_array_alignment_bytes") is not None:
             self._read(self._read(1)[0])
-        return 1, shape, dtype, state["order"] == "F", self._read(_count(shape) * dtype.value.itemsize)
+        return (
+            1,
+            shape,
+            dtype,
+            state["order"] == "F",
+            self._read(_count(shape) * dtype.value.itemsize),
+        )
 
     def _dense(self, state: dict[str, Any], height: Any, width: Any) -> np.ndarray:
         """Return the dense (height, width) array of a matrix of compressed columns."""
@@ -180,9 +203,15 @@ class Arrays:
         if not fits or not len(data) == len(row) or row.dtype.kind not in "iu":
             raise ValueError("a sparse matrix in it is damaged")
         self.sparse_entries += entries
-        require_at_most(self._path, self.sparse_entries, _MOST_ENTRIES, "entries of sparse matrices")
+        require_at_most(
+            self._path, self.sparse_entries, _MOST_ENTRIES, "entries of sparse matrices"
+        )
         counts = np.diff(pointers.astype(np.int64))
-        if counts.min(initial=0) < 0 or counts.sum() != len(data) or ((row < 0) | (row >= height)).any():
+        if (
+            counts.min(initial=0) < 0
+            or counts.sum() != len(data)
+            or ((row < 0) | (row >= height)).any()
+        ):
             raise ValueError("a sparse matrix in it is damaged")
         self._bytes_left += 8 * entries  # which are counted above
         dense = np.zeros((height, width))
@@ -194,7 +223,9 @@ class Arrays:
             raise ValueError("an array in it is of an unknown class")
         return _awaiting(kind.array)
 
-    def _from_bytes(self, raw: object, dtype: object, shape: object, order: object, axes: object = None) -> np.ndarray:
+    def _from_bytes(
+        self, raw: object, dtype: object, shape: object, order: object, axes: object = None
+    ) -> np.ndarray:
         if not isinstance(dtype, Dtype) or dtype.value.kind == "O":
             raise ValueError("an array in it does not hold numbers")
         array = Array((0,), np.uint8)

@@ -1,9 +1,11 @@
-"""Reading of pickles without executing them: numbers, text, containers, arrays of NumPy, SciPy and chumpy.
+"""Reading of pickles without executing them: numbers, text, containers, arrays of NumPy, SciPy and
+chumpy.
 
-Captures of people and body templates are distributed as pickles of Python 2 and 3, of ``numpy.save`` and of joblib.
-The interpreter here knows the opcodes for such values (protocols 0 to 5) and none that could execute anything. Names of
-classes and functions are only looked up in ``pickled_arrays``. Time and memory are linear in the size of the file:
-reads never go beyond its end, and containers, keys and nesting are limited.
+Captures of people and body templates are distributed as pickles of Python 2 and 3, of
+``numpy.save`` and of joblib. The interpreter here knows the opcodes for such values (protocols 0 to
+5) and none that could execute anything. Names of classes and functions are only looked up in
+``pickled_arrays``. Time and memory are linear in the size of the file: reads never go beyond its
+end, and containers, keys and nesting are limited.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ _MOST_NUMBER_KEYS = 1 << 16
 _LARGEST_KEY = 1 << 31
 """Limit of keys that are numbers: a file can choose large ones whose hashes collide."""
 _MOST_ENTRIES = 1 << 20
-"""Entries, shared ones counted at each occurrence, next to two per byte of the file and those of sparse matrices."""
+"""Entries, shared ones counted at each occurrence, next to two per byte of the file and those of
+sparse matrices."""
 _DEEPEST = 100
 _LONGEST_KEY = 4096
 _LONGEST_LINE = 1000
@@ -37,10 +40,11 @@ _MOST_MARKS = 1000
 def read_pickle(path: Path) -> object:
     """Read a pickle of numbers, text, containers and arrays; nothing in the file is executed.
 
-    Pickles of Python 2 and uncompressed ones of joblib are read, too. Sparse matrices of SciPy and arrays of chumpy
-    become plain arrays; neither package is needed. The result never contains itself and is at most 100 containers deep.
-    With shared parts counted at each occurrence, it has at most two entries per byte of the file and a million more,
-    next to those of sparse matrices (``dyngs.files.limits``).
+    Pickles of Python 2 and uncompressed ones of joblib are read, too. Sparse matrices of SciPy and
+    arrays of chumpy become plain arrays; neither package is needed. The result never contains
+    itself and is at most 100 containers deep. With shared parts counted at each occurrence, it has
+    at most two entries per byte of the file and a million more, next to those of sparse matrices
+    (``dyngs.files.limits``).
 
     Raises:
         DyngsError: the file is missing or damaged, or holds anything else, or asks for too much.
@@ -49,10 +53,13 @@ def read_pickle(path: Path) -> object:
 
 
 def read_pickled_array(path: Path) -> object:
-    """Read the Python object that ``numpy.save`` wrapped into a 0-dimensional array, as ``read_pickle`` does."""
+    """Read the Python object that ``numpy.save`` wrapped into a 0-dimensional array, as
+    ``read_pickle`` does."""
     array = _unpickled(path, is_array=True)
     if not isinstance(array, np.ndarray) or array.shape != () or array.dtype.kind != "O":
-        raise DyngsError(f"{path}: must hold one dictionary, saved with numpy.save; export it again")
+        raise DyngsError(
+            f"{path}: must hold one dictionary, saved with numpy.save; export it again"
+        )
     return array.item()
 
 
@@ -75,7 +82,11 @@ def _unpickled(path: Path, is_array: bool) -> object:
 
 def _skip_array_header(file: BinaryIO) -> None:
     version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     if read(file)[2].kind != "O":
         raise ValueError("an array of Python objects was expected")
 
@@ -93,7 +104,8 @@ class Unpickler:
         self._containers = self._number_keys = 0
 
     def load(self) -> object:
-        """Return the contents of the pickle: a tree that may share parts but never contains itself."""
+        """Return the contents of the pickle: a tree that may share parts but never contains
+        itself."""
         while (code := self.read(1)) != b".":
             step = _STEPS.get(code)
             if step is None:
@@ -244,7 +256,8 @@ class Unpickler:
 
 
 def require_tree(where: Path, found: object, more: int = 0) -> None:
-    """Check that walking through the contents of a file ends soon; ``more`` than the usual number of entries may be.
+    """Check that walking through the contents of a file ends soon; ``more`` than the usual number
+    of entries may be.
 
     Raises:
         DyngsError: it has too many entries, shared ones counted at each occurrence.
@@ -263,7 +276,9 @@ def require_tree(where: Path, found: object, more: int = 0) -> None:
             if inside is None:
                 continue
             if id(value) in open_ids or len(path) > _DEEPEST:
-                raise ValueError("it contains itself" if id(value) in open_ids else "it is nested too deeply")
+                raise ValueError(
+                    "it contains itself" if id(value) in open_ids else "it is nested too deeply"
+                )
             open_ids.add(id(value))
             path.append((value, list(inside)))
             continue
@@ -272,7 +287,10 @@ def require_tree(where: Path, found: object, more: int = 0) -> None:
             open_ids.discard(id(owner))
             weights[id(owner)] = 1 + sum(_weight(part, weights) for part in _items(owner) or ())
             require_at_most(
-                where, max(weights[id(owner)] - more, 0), _MOST_ENTRIES, "entries (shared ones counted again)"
+                where,
+                max(weights[id(owner)] - more, 0),
+                _MOST_ENTRIES,
+                "entries (shared ones counted again)",
             )
 
 
@@ -281,7 +299,11 @@ def _items(value: Any) -> list[Any] | None:
         return [*value.keys(), *value.values()]
     if isinstance(value, (list, tuple)):
         return list(value)
-    return value.ravel(order="K").tolist() if isinstance(value, Array) and value.dtype.kind == "O" else None
+    return (
+        value.ravel(order="K").tolist()
+        if isinstance(value, Array) and value.dtype.kind == "O"
+        else None
+    )
 
 
 def _weight(part: object, weights: dict[int, int]) -> int:
@@ -296,7 +318,8 @@ def _is_key(key: object) -> bool:
     return key is None or (isinstance(key, (int, np.integer)) and abs(int(key)) < _LARGEST_KEY)
 
 
-# --- values -----------------------------------------------------------------------------------------------------------
+# --- values
+# -----------------------------------------------------------------------------------------------------------
 
 
 def _integer(text: str) -> int | bool:

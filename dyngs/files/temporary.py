@@ -1,4 +1,5 @@
-"""Files that may go: temporary ones next to their targets, those that killed processes left, and the user's cache."""
+"""Files that may go: temporary ones next to their targets, those that killed processes left, and
+the user's cache."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from dyngs.errors import DyngsError
 
 CACHE_VARIABLE = "DYNGS_CACHE_DIR"
 _NAME = re.compile(
-    r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})(-[0-9a-f]{12})?\.dyngs(?P<suffix>\.[^.]*)?", re.DOTALL
+    r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})(-[0-9a-f]{12})?\.dyngs(?P<suffix>\.[^.]*)?",
+    re.DOTALL,
 )
 
 
@@ -47,14 +49,18 @@ def temporary_folder_beside(path: Path) -> Path:
 def _unused_name(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_once(str(path.parent.absolute()), os.getpid())
-    return path.with_name(f".{path.stem}.{os.getpid()}-{_home()}-{secrets.token_hex(6)}.dyngs{path.suffix}")
+    return path.with_name(
+        f".{path.stem}.{os.getpid()}-{_home()}-{secrets.token_hex(6)}.dyngs{path.suffix}"
+    )
 
 
 def remove_leftovers(folder: Path, only_ours: Callable[[str], bool] | None = None) -> None:
-    """Remove the temporary files and folders directly in ``folder`` whose processes have ended; never through links.
+    """Remove the temporary files and folders directly in ``folder`` whose processes have ended;
+    never through links.
 
-    Processes are known to have ended where they ran under the same operating system as this one. ``only_ours``: whether
-    no other process writes a file of this name at present; then they go whatever process they are of.
+    Processes are known to have ended where they ran under the same operating system as this one.
+    ``only_ours``: whether no other process writes a file of this name at present; then they go
+    whatever process they are of.
     """
     try:
         entries = list(os.scandir(folder))
@@ -88,7 +94,8 @@ def _remove_once(folder: str, pid: int) -> None:  # pid: a forked process does t
 
 @lru_cache(maxsize=1)
 def _home() -> str:
-    """Return a name for the machine, and its container if there is one, within which process ids are unique."""
+    """Return a name for the machine, and its container if there is one, within which process ids
+    are unique."""
     try:
         namespace = os.readlink("/proc/self/ns/pid")
     except OSError:  # not on Linux
@@ -110,7 +117,8 @@ def _is_alive(pid: int) -> bool:
 
 
 def cache_folder(kind: Literal["frames", "poses", "bodies", "people", "captures"]) -> Path:
-    """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the user's cache."""
+    """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the user's
+    cache."""
     chosen = os.environ.get(CACHE_VARIABLE, "")
     if chosen:
         return Path(chosen).expanduser().absolute() / kind

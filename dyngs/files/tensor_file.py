@@ -1,4 +1,5 @@
-"""Files of named tensors with a header and a checksum, in the safetensors format: reading them runs no code."""
+"""Files of named tensors with a header and a checksum, in the safetensors format: reading them runs
+no code."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ from dyngs.files.write import atomic_file
 
 @dataclass(frozen=True)
 class FileKind:
-    """Key of the metadata that holds the header, name with its article, and the one version that is read."""
+    """Key of the metadata that holds the header, name with its article, and the one version that is
+    read."""
 
     key: str
     what: str
@@ -30,20 +32,30 @@ class FileKind:
 
 
 def write_tensors(
-    path: Path, kind: FileKind, tensors: Mapping[str, Tensor], header: Mapping[str, object], advice: str = ""
+    path: Path,
+    kind: FileKind,
+    tensors: Mapping[str, Tensor],
+    header: Mapping[str, object],
+    advice: str = "",
 ) -> None:
-    """Write contiguous tensors and values that JSON can hold, atomically; equal ones give equal bytes.
+    """Write contiguous tensors and values that JSON can hold, atomically; equal ones give equal
+    bytes.
 
     ``advice`` is the end of the message for a full disk.
     """
     full = {"format": kind.version, **header}
     full["digest"] = _digest(tensors, full)
     with atomic_file(path, durable=True) as temporary:
-        # The library writes to a temporary name of its own, which a kill would leave behind: so in a folder of ours.
+        # The library writes to a temporary name of its own, which a kill would leave behind: so in
+        # a folder of ours.
         folder = temporary_folder_beside(path.with_suffix(""))
         try:
             # One key only: the library writes several in random order.
-            save_file(dict(tensors), folder / path.name, metadata={kind.key: json.dumps(full, sort_keys=True)})
+            save_file(
+                dict(tensors),
+                folder / path.name,
+                metadata={kind.key: json.dumps(full, sort_keys=True)},
+            )
             # It makes files that only their owner can read; the folder has what the umask allows.
             os.chmod(folder / path.name, folder.stat().st_mode & 0o666)
             os.replace(folder / path.name, temporary)
@@ -53,7 +65,9 @@ def write_tensors(
             remove_quietly(folder)
 
 
-def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def read_tensors(
+    path: Path, kind: FileKind, advice: str
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read header and tensors of a file. Raises DyngsError."""
     require_regular(path)
     try:
@@ -61,14 +75,19 @@ def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any
             header = json.loads((file.metadata() or {}).get(kind.key, "null"))
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
     except Exception as error:  # the library does not document its exceptions
-        if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):  # not the file's fault
+        if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):
+            # not the file's fault
             is_there = not isinstance(error, FileNotFoundError)
             advice = "; the file itself may be whole: keep it, try again" if is_there else ""
-        raise DyngsError(f"{path}: cannot be read as {kind.what} ({reason(error)}){advice}") from error
+        raise DyngsError(
+            f"{path}: cannot be read as {kind.what} ({reason(error)}){advice}"
+        ) from error
     if not isinstance(header, dict) or "format" not in header:
         raise DyngsError(f"{path}: not {kind.what} of dyngs{advice}")
     if header["format"] != kind.version:
-        raise DyngsError(f"{path}: written by another version of dyngs; use that version or train anew")
+        raise DyngsError(
+            f"{path}: written by another version of dyngs; use that version or train anew"
+        )
     if header.pop("digest", None) != _digest(tensors, header):
         raise DyngsError(f"{path}: damaged or altered, its checksum differs{advice}")
     return header, tensors

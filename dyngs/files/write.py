@@ -1,4 +1,5 @@
-"""Atomic writing of files, text and images: a file appears complete or not at all. Error texts of OpenImageIO."""
+"""Atomic writing of files, text and images: a file appears complete or not at all. Error texts of
+OpenImageIO."""
 
 from __future__ import annotations
 
@@ -17,10 +18,12 @@ from dyngs.files.temporary import temporary_beside
 
 @contextmanager
 def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary path next to ``path``; it replaces ``path`` if the block succeeds and is removed otherwise.
+    """Yield a temporary path next to ``path``; it replaces ``path`` if the block succeeds and is
+    removed otherwise.
 
-    The folder is created if missing; the temporary name keeps the suffix, by which writers choose the format.
-    ``durable``: wait until it is on disk, so that a power cut leaves the old file or the new one, complete.
+    The folder is created if missing; the temporary name keeps the suffix, by which writers choose
+    the format. ``durable``: wait until it is on disk, so that a power cut leaves the old file or
+    the new one, complete.
     """
     require_replaceable(path)
     try:
@@ -42,9 +45,11 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def require_replaceable(path: Path) -> None:
-    """Check that a file may be written in the place of ``path``: there is nothing, a file or a folder.
+    """Check that a file may be written in the place of ``path``: there is nothing, a file or a
+    folder.
 
-    Raises DyngsError: a device, a pipe or the like; or a place in /dev or /proc, such as /dev/stdout.
+    Raises DyngsError: a device, a pipe or the like; or a place in /dev or /proc, such as
+    /dev/stdout.
     """
     parent = os.path.realpath(path.parent)
     is_file = parent != "/dev" and not parent.startswith("/proc/")
@@ -52,7 +57,9 @@ def require_replaceable(path: Path) -> None:
         mode = os.stat(path).st_mode
         is_file = is_file and (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
     if not is_file:
-        raise DyngsError(f"cannot write {path}: it is a device, a pipe or the like; give the name of a file")
+        raise DyngsError(
+            f"cannot write {path}: it is a device, a pipe or the like; give the name of a file"
+        )
 
 
 def _flush(path: Path, flags: int) -> None:
@@ -75,8 +82,9 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
 
     Args:
         path: ``.png`` or ``.jpg`` (8 bit), ``.exr`` (float32), or what else OpenImageIO writes.
-        pixels: (H, W) or (H, W, C); uint8 and uint16 as they are, or floats, which are clamped to [0, 1] for 8-bit
-            formats. A fourth channel is alpha: straight for PNG, premultiplied for EXR, as these formats want it.
+        pixels: (H, W) or (H, W, C); uint8 and uint16 as they are, or floats, which are clamped to
+            [0, 1] for 8-bit formats. A fourth channel is alpha: straight for PNG, premultiplied for
+                EXR, as these formats want it.
     """
     import OpenImageIO as oiio
 
@@ -84,11 +92,13 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     if pixels.ndim != 3 or 0 in pixels.shape:
         raise ValueError(f"pixels must be (H, W) or (H, W, C), got {pixels.shape}")
     if path.suffix.lower() == ".exr":
-        pixels, kind = pixels.astype(np.float32), oiio.FLOAT
+        pixels = pixels.astype(np.float32)
+        kind = oiio.FLOAT
     elif pixels.dtype == np.uint16:
         kind = oiio.UINT16
     else:
-        pixels, kind = to_uint8(pixels), oiio.UINT8
+        pixels = to_uint8(pixels)
+        kind = oiio.UINT8
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
@@ -96,11 +106,17 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
             image_error(oiio)  # must be fetched, or it is printed when the program ends
-            raise DyngsError(f"cannot write {path}: no format has the suffix '{path.suffix}' (use .png or .exr)")
-        written = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
+            raise DyngsError(
+                f"cannot write {path}: no format has the suffix '{path.suffix}' (use .png or .exr)"
+            )
+        written = output.open(str(temporary), spec) and output.write_image(
+            np.ascontiguousarray(pixels)
+        )
         problem = image_error(output)
         if not (output.close() and written):
-            raise DyngsError(f"cannot write {path}: {problem or image_error(output) or 'unknown error'}")
+            raise DyngsError(
+                f"cannot write {path}: {problem or image_error(output) or 'unknown error'}"
+            )
 
 
 def to_uint8(pixels: np.ndarray) -> np.ndarray:
@@ -124,7 +140,8 @@ def image_error(source: _HasErrors) -> str:
 
 
 def any_text(ask: Callable[[], str]) -> str:
-    """Return the text of ``ask``; bytes that are not UTF-8, at which OpenImageIO's binding raises, as escapes."""
+    """Return the text of ``ask``; bytes that are not UTF-8, at which OpenImageIO's binding raises,
+    as escapes."""
     try:
         return ask()
     except UnicodeDecodeError as error:

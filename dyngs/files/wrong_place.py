@@ -12,16 +12,26 @@ PHOTO_SUFFIXES = frozenset(
 )
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 _MOST_ENTRIES = 2000
-_CAPTURE = ("transforms.json", "transforms_train.json", "cameras.json", "poses_bounds.npy", "sparse", "dataset.json")
+_CAPTURE = (
+    "transforms.json",
+    "transforms_train.json",
+    "cameras.json",
+    "poses_bounds.npy",
+    "sparse",
+    "dataset.json",
+)
 
 
 def command_for(path: Path, *, captures: bool = True) -> str | None:
-    """Return what the path is and the command that takes it, in a few words; None for anything else.
+    """Return what the path is and the command that takes it, in a few words; None for anything
+    else.
 
     Only names are looked at, those directly in a folder and in ``images`` below it.
     """
     where = as_word(path)
-    static, dynamic = (f"`dyngs train {preset} data.root={where}`" for preset in ("static", "dynamic"))
+    static, dynamic = (
+        f"`dyngs train {preset} data.root={where}`" for preset in ("static", "dynamic")
+    )
     try:
         if path.is_file():
             if path.suffix.lower() not in VIDEO_SUFFIXES:
@@ -33,10 +43,13 @@ def command_for(path: Path, *, captures: bool = True) -> str | None:
             return f"it is a run, for `dyngs eval {where}`, `dyngs render {where}` or `dyngs train --resume {where}`"
         if captures and any((path / name).exists() for name in _CAPTURE):
             return f"it is a capture, make a scene of it with {static}, or {dynamic} if things move"
-        suffixes = [_suffix(entry) for folder in (path, path / "images") for entry in _entries(folder)]
+        suffixes = [
+            _suffix(entry) for folder in (path, path / "images") for entry in _entries(folder)
+        ]
     except OSError:
         return None
-    photos, videos = sum(x in PHOTO_SUFFIXES for x in suffixes), sum(x in VIDEO_SUFFIXES for x in suffixes)
+    photos = sum(x in PHOTO_SUFFIXES for x in suffixes)
+    videos = sum(x in VIDEO_SUFFIXES for x in suffixes)
     if photos >= 3:
         return f"it holds photos, make a scene of them with {static}"
     if videos > 1:

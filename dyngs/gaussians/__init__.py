@@ -34,7 +34,8 @@ class Gaussians:
 
     Attributes:
         means: (N, 3) centres in world units.
-        quats: (N, 4) rotations wxyz; normalised by the rasterizer, a zero quaternion means identity.
+        quats: (N, 4) rotations wxyz; normalised by the rasterizer, a zero quaternion means
+            identity.
         log_scales: (N, 3) natural logarithms of the standard deviations along the local axes.
         logit_opacities: (N,) opacities before the sigmoid.
         sh: (N, K, 3) spherical-harmonics coefficients, term 0 is the base colour.
@@ -61,13 +62,16 @@ class Gaussians:
 
         Raises:
             KeyError: a tensor is missing.
-            ValueError: one is not finite float32, or a size; they do not fit together, or no degree has so many terms.
+            ValueError: one is not finite float32, or a size; they do not fit together, or no degree
+                has so many terms.
         """
         found = Gaussians(**{f.name: tensors[f.name] for f in fields(Gaussians)})
         for name, x in found.tensors().items():
             require_tensor(name, x, x.shape)
         if bool((found.log_scales > LARGEST_LOG_SCALE).any()):
-            raise ValueError(f"'log_scales' holds sizes beyond e^{LARGEST_LOG_SCALE}, which no float32 can hold")
+            raise ValueError(
+                f"'log_scales' holds sizes beyond e^{LARGEST_LOG_SCALE}, which no float32 can hold"
+            )
         if found.sh.shape[1] not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
             raise ValueError(f"'sh' has {found.sh.shape[1]} terms, which no degree has")
         return found
@@ -110,16 +114,22 @@ class Gaussians:
         return Gaussians(**{name: x[index] for name, x in self.tensors().items()})
 
     def picked(self, rows: Tensor) -> Gaussians:
-        """Return the Gaussians at ``rows`` (long); its gradient costs less than that of ``select``."""
+        """Return the Gaussians at ``rows`` (long); its gradient costs less than that of
+        ``select``."""
         return Gaussians(**{name: x.index_select(0, rows) for name, x in self.tensors().items()})
 
     def edited(self, edit: TopologyEdit) -> Gaussians:
         """Return the Gaussians after ``edit``, without gradients."""
         return self.detach().select(edit.source)
 
-    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
-        """Return the same Gaussians on another device or in another precision; tensors that fit are shared."""
-        return Gaussians(**{name: x.to(device=device, dtype=dtype) for name, x in self.tensors().items()})
+    def to(
+        self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Gaussians:
+        """Return the same Gaussians on another device or in another precision; tensors that fit are
+        shared."""
+        return Gaussians(
+            **{name: x.to(device=device, dtype=dtype) for name, x in self.tensors().items()}
+        )
 
     def detach(self) -> Gaussians:
         """Return the same Gaussians without gradients."""
@@ -134,8 +144,8 @@ class Gaussians:
 class TopologyEdit:
     """Rearrangement by a densification step of everything that is stored per Gaussian.
 
-    Row ``i`` of the new set descends from row ``source[i]`` of the old one: clone, split, prune and relocate are all
-    ``x[source]``. Where ``is_new`` is set, optimizer moments start at zero.
+    Row ``i`` of the new set descends from row ``source[i]`` of the old one: clone, split, prune and
+    relocate are all ``x[source]``. Where ``is_new`` is set, optimizer moments start at zero.
     """
 
     source: Tensor  # (N_new,) long indices into the old set
@@ -169,5 +179,6 @@ class EditResult:
     edit: TopologyEdit | None  # how rows move; None where all stay in place
     # field name to its new values (N_new, ...), for the fields that are not just rows moved
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
-    zero_moments: frozenset[str] = frozenset()  # fields whose optimizer moments start anew in every row
+    # fields whose optimizer moments start anew in every row
+    zero_moments: frozenset[str] = frozenset()
     finding: str | None = None  # a line for people about why, or None

@@ -1,4 +1,5 @@
-"""Adding and removing Gaussians: clone, split and prune by the gradient of the 2D means (3DGS, AbsGS).
+"""Adding and removing Gaussians: clone, split and prune by the gradient of the 2D means (3DGS,
+AbsGS).
 
 ``Densifier`` is what a model asks of any strategy; the other one is in ``mcmc.py``.
 """
@@ -17,7 +18,8 @@ from dyngs.ops.quaternions import rotate
 from dyngs.tensor_checks import require_tensor
 
 DENSE_FRACTION = 0.01  # Scale, in reaches, up to which Gaussians are cloned; larger ones are split
-PRUNE_SCALE = 0.1  # Scale, in reaches, from which Gaussians are removed after the first opacity reset
+# Scale, in reaches, from which Gaussians are removed after the first opacity reset
+PRUNE_SCALE = 0.1
 FAR = 5.0  # Distance, in scene extents, from which a Gaussian is far
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
@@ -26,7 +28,8 @@ MAX_LOG_VARIANCE = 60.0  # Random offsets stay finite whatever the scales
 
 @dataclass(frozen=True)
 class DensifySchedule:
-    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with its length)."""
+    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with
+    its length)."""
 
     # start, stop: changes happen strictly between the two
     start: int
@@ -49,14 +52,20 @@ class Densifier:
         """Return whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
         return False
 
-    def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
-        """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of images of ``size`` (width, height)."""
+    def after_backward(
+        self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]
+    ) -> None:
+        """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of images of ``size`` (width,
+        height)."""
 
     def tallies(self, step: int, count: int) -> list[Tensor]:
-        """Return what ``step`` has taken in of N = ``count`` Gaussians; processes that share it sum it in place."""
+        """Return what ``step`` has taken in of N = ``count`` Gaussians; processes that share it sum
+        it in place."""
         return []
 
-    def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
+    def edit(
+        self, step: int, parameters: Gaussians, generator: torch.Generator
+    ) -> EditResult | None:
         """Return the edit after ``step``; None if nothing changes."""
         return None
 
@@ -81,34 +90,43 @@ class Densifier:
 
 
 class DefaultDensifier(Densifier):
-    """Clone, split and prune by the mean norm of the 2D mean's gradient over the views that saw a Gaussian (3DGS).
+    """Clone, split and prune by the mean norm of the 2D mean's gradient over the views that saw a
+    Gaussian (3DGS).
 
-    Small Gaussians with a large gradient are copied, large ones replaced by two samples of themselves, transparent and
-    (later) huge ones removed; opacities are lowered now and then. At least one Gaussian is always left. Where the cap
-    ``max_gaussians`` leaves no room for all, those with the largest gradients go first.
+    Small Gaussians with a large gradient are copied, large ones replaced by two samples of
+    themselves, transparent and (later) huge ones removed; opacities are lowered now and then. At
+    least one Gaussian is always left. Where the cap ``max_gaussians`` leaves no room for all, those
+    with the largest gradients go first.
 
-    What is large is judged by the reach of a Gaussian: the scene extent, or of what is ``FAR`` its distance from
-    ``center`` (3,), the mean of the cameras. 3DGS takes the extent for all, and so removes sky and far hills, which
-    need Gaussians as large as they are far.
+    What is large is judged by the reach of a Gaussian: the scene extent, or of what is ``FAR`` its
+    distance from ``center`` (3,), the mean of the cameras. 3DGS takes the extent for all, and so
+    removes sky and far hills, which need Gaussians as large as they are far.
     """
 
-    def __init__(self, options: DefaultStrategy, schedule: DensifySchedule, extent: float, center: Tensor) -> None:
+    def __init__(
+        self, options: DefaultStrategy, schedule: DensifySchedule, extent: float, center: Tensor
+    ) -> None:
         self.options, self.schedule, self.extent, self.center = options, schedule, extent, center
         self.grad_sum = torch.zeros(0, device="cpu")
         self.seen = torch.zeros(0, device="cpu")
-        self._step_grad_sum, self._step_seen = self.grad_sum, self.seen
+        self._step_grad_sum = self.grad_sum
+        self._step_seen = self.seen
 
     def wants_signal(self, step: int) -> bool:
         return step < self.schedule.stop
 
-    def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
+    def after_backward(
+        self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]
+    ) -> None:
         if not self.wants_signal(step):
             return
         self._begin_step(probe_grad.shape[1], probe_grad.device)
         grad = probe_grad[..., 2:] if self.options.absgrad else probe_grad[..., :2]
-        x, y = grad[..., 0] * (0.5 * size[0]), grad[..., 1] * (0.5 * size[1])
+        x = grad[..., 0] * (0.5 * size[0])
+        y = grad[..., 1] * (0.5 * size[1])
         length = torch.hypot(x, y)
-        counts = (radii > 0).all(-1) & length.isfinite()  # a view without a usable gradient says nothing
+        # a view without a usable gradient says nothing
+        counts = (radii > 0).all(-1) & length.isfinite()
         self._step_grad_sum += torch.where(counts, length, 0.0).sum(0)
         self._step_seen += counts.sum(0)
 
@@ -118,7 +136,9 @@ class DefaultDensifier(Densifier):
         self._begin_step(count, self._step_seen.device)
         return [self._step_grad_sum, self._step_seen]
 
-    def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
+    def edit(
+        self, step: int, parameters: Gaussians, generator: torch.Generator
+    ) -> EditResult | None:
         self._take_in_step()
         resets = step in self.schedule.resets
         parameters = parameters.detach()
@@ -146,12 +166,18 @@ class DefaultDensifier(Densifier):
         if not state:  # of a run that was edited after its end: counted anew from the next step on
             state = {"grad_sum": self.grad_sum[:0], "seen": self.seen[:0]}
         count = len(state["seen"])
-        self.grad_sum, self.seen = (require_tensor(x, state[x], (count,)).clone() for x in ("grad_sum", "seen"))
-        self._step_grad_sum, self._step_seen = (torch.zeros(0, device=self.seen.device) for _ in range(2))
+        self.grad_sum, self.seen = (
+            require_tensor(x, state[x], (count,)).clone() for x in ("grad_sum", "seen")
+        )
+        self._step_grad_sum, self._step_seen = (
+            torch.zeros(0, device=self.seen.device) for _ in range(2)
+        )
 
     def _begin_step(self, count: int, device: torch.device) -> None:
         if len(self._step_seen) != count:
-            self._step_grad_sum, self._step_seen = (torch.zeros(count, device=device) for _ in range(2))
+            self._step_grad_sum, self._step_seen = (
+                torch.zeros(count, device=device) for _ in range(2)
+            )
 
     def _take_in_step(self) -> None:
         """Add what the views of a step have said to what those before it have."""
@@ -161,21 +187,31 @@ class DefaultDensifier(Densifier):
             self.grad_sum, self.seen = (torch.zeros_like(self._step_seen) for _ in range(2))
         self.grad_sum += self._step_grad_sum
         self.seen += self._step_seen
-        self._step_grad_sum, self._step_seen = (torch.zeros(0, device=self.seen.device) for _ in range(2))
+        self._step_grad_sum, self._step_seen = (
+            torch.zeros(0, device=self.seen.device) for _ in range(2)
+        )
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         distance = (parameters.means - self.center).norm(dim=1)
         reach = torch.where(distance > FAR * self.extent, distance, self.extent)
         max_scale = PRUNE_SCALE * reach if step > self.schedule.prune_scale_after else math.inf
-        plan = plan_edit(parameters, self.grad_sum / self.seen.clamp_min(1), self.options, reach, max_scale)
-        kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split))
+        plan = plan_edit(
+            parameters, self.grad_sum / self.seen.clamp_min(1), self.options, reach, max_scale
+        )
+        kept, cloned, split = (
+            torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split)
+        )
         source = torch.cat([kept, cloned, split, split])
         is_new = torch.ones(len(source), dtype=torch.bool, device=source.device)
         is_new[: len(kept)] = False
-        means, log_scales = parameters.means[source], parameters.log_scales[source]
+        means = parameters.means[source]
+        log_scales = parameters.log_scales[source]
         children = slice(len(kept) + len(cloned), None)
         sizes = log_scales[children].clamp_max(MAX_LOG_VARIANCE / 2).exp()
-        noise = torch.randn((2 * len(split), 3), generator=generator, device="cpu").to(sizes.device) * sizes
+        noise = (
+            torch.randn((2 * len(split), 3), generator=generator, device="cpu").to(sizes.device)
+            * sizes
+        )
         means[children] += rotate(parameters.quats[source[children]], noise)
         log_scales[children] -= math.log(SPLIT_SHRINK)
         return EditResult(TopologyEdit(source, is_new), {"means": means, "log_scales": log_scales})
@@ -194,7 +230,11 @@ class EditPlan:
 
 
 def plan_edit(
-    parameters: Gaussians, score: Tensor, options: DefaultStrategy, reach: float | Tensor, max_scale: float | Tensor
+    parameters: Gaussians,
+    score: Tensor,
+    options: DefaultStrategy,
+    reach: float | Tensor,
+    max_scale: float | Tensor,
 ) -> EditPlan:
     """Return the plan of one densification.
 
@@ -213,7 +253,8 @@ def plan_edit(
     # A candidate adds one Gaussian; a split one that would otherwise have been removed adds two.
     cost = torch.where(split & ~survives, 2, 1)
     chosen = _best_within(split | cloned, score, cost, options.max_gaussians - int(survives.sum()))
-    split, cloned = split & chosen, cloned & chosen
+    split = split & chosen
+    cloned = cloned & chosen
     kept = survives & ~split
     if not bool((kept | split).any()):
         kept[parameters.logit_opacities.nan_to_num(nan=-math.inf).argmax()] = True
@@ -221,7 +262,8 @@ def plan_edit(
 
 
 def _best_within(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> Tensor:
-    """Return (N,) bool: the candidates of highest score whose costs add up to at most ``room``; ties by index."""
+    """Return (N,) bool: the candidates of highest score whose costs add up to at most ``room``;
+    ties by index."""
     indices = torch.nonzero(candidates)[:, 0]
     if int(cost[indices].sum()) <= room:
         return candidates
@@ -232,7 +274,8 @@ def _best_within(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> 
 
 
 def _with_lowered_opacities(result: EditResult, logit_opacities: Tensor) -> EditResult:
-    """Return ``result`` followed by an opacity reset: at most 0.01 everywhere, its moments at zero."""
+    """Return ``result`` followed by an opacity reset: at most 0.01 everywhere, its moments at
+    zero."""
     moved = logit_opacities if result.edit is None else result.edit.apply(logit_opacities)
     lowered = moved.clamp_max(math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     changes = {**result.changes, "logit_opacities": lowered}

@@ -1,4 +1,5 @@
-"""Mip-Splatting's 3D smoothing filter: no Gaussian is smaller than what the training cameras can resolve."""
+"""Mip-Splatting's 3D smoothing filter: no Gaussian is smaller than what the training cameras can
+resolve."""
 
 from __future__ import annotations
 
@@ -15,14 +16,17 @@ from dyngs.tensor_checks import require_tensor
 
 FILTER_VARIANCE = 0.2  # Variance of the filter in squared sampling intervals
 NEAR = 0.2
-MARGIN = 0.15  # Cameras count as seeing what lies within the image enlarged by this fraction on each side
+# Cameras count as seeing what lies within the image enlarged by this fraction on each side
+MARGIN = 0.15
 
 
 def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
-    """Return (N,) standard deviation of the 3D filter in world units: sqrt(0.2) * nearest depth / largest focal length.
+    """Return (N,) standard deviation of the 3D filter in world units: sqrt(0.2) * nearest depth /
+    largest focal length.
 
-    The nearest depth is over the cameras that see a Gaussian at depth > 0.2; a Gaussian that none sees gets the largest
-    nearest depth of the others (1 where there are no others). Constant with respect to gradients.
+    The nearest depth is over the cameras that see a Gaussian at depth > 0.2; a Gaussian that none
+    sees gets the largest nearest depth of the others (1 where there are no others). Constant with
+    respect to gradients.
     """
     means = means.detach()
     nearest = torch.full((len(means),), torch.inf, device=means.device)
@@ -37,29 +41,39 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
     return torch.where(seen, nearest, farthest) * (FILTER_VARIANCE**0.5 / focal)
 
 
-def _visible_depth(means: Tensor, pose: Tensor, intrinsics: Tensor, width: int, height: int) -> Tensor:
+def _visible_depth(
+    means: Tensor, pose: Tensor, intrinsics: Tensor, width: int, height: int
+) -> Tensor:
     """Return (N,) depth in one camera, infinite where it does not see the point."""
     # Not a matrix product, whose sums may depend on the number of threads.
-    rotation, translation = pose[:3, :3], pose[:3, 3]
-    x, y, z = ((means * row).sum(1) + shift for row, shift in zip(rotation, translation, strict=True))
+    rotation = pose[:3, :3]
+    translation = pose[:3, 3]
+    x, y, z = (
+        (means * row).sum(1) + shift for row, shift in zip(rotation, translation, strict=True)
+    )
     u = (intrinsics[0, 0] * x + intrinsics[0, 1] * y) / z + intrinsics[0, 2]
     v = intrinsics[1, 1] * y / z + intrinsics[1, 2]
     inside = (
-        (u >= -MARGIN * width) & (u <= (1 + MARGIN) * width) & (v >= -MARGIN * height) & (v <= (1 + MARGIN) * height)
+        (u >= -MARGIN * width)
+        & (u <= (1 + MARGIN) * width)
+        & (v >= -MARGIN * height)
+        & (v <= (1 + MARGIN) * height)
     )
     return torch.where(inside & (z > NEAR), z, torch.inf)
 
 
 def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
-    """Return Gaussians convolved with the filter: s' = sqrt(s^2 + f^2), o' = o * prod_k s_k / s'_k; differentiable.
+    """Return Gaussians convolved with the filter: s' = sqrt(s^2 + f^2), o' = o * prod_k s_k / s'_k;
+    differentiable.
 
-    All in logarithms, one axis at a time, because products of scales underflow: log o' / (1 - o') is taken from
-    log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive terms.
+    All in logarithms, one axis at a time, because products of scales underflow: log o' / (1 - o')
+    is taken from log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive terms.
     """
     log_scales = torch.logaddexp(2 * gaussians.log_scales, 2 * std.log()[:, None]) / 2
     log_ratio = (gaussians.log_scales - log_scales).sum(1).clamp_max(0)
     logits = gaussians.logit_opacities
-    log_opacity = logsigmoid(logits)  # and not sigmoid, whose last bit depends on the number of threads
+    # and not sigmoid, whose last bit depends on the number of threads
+    log_opacity = logsigmoid(logits)
     missing = logsigmoid(-logits).exp() - log_opacity.exp() * torch.expm1(log_ratio)
     fused = log_opacity + log_ratio - missing.clamp_min(torch.finfo(missing.dtype).tiny).log()
     return gaussians.replace(log_scales=log_scales, logit_opacities=fused)
@@ -76,7 +90,8 @@ def filter_state(std: Tensor | None) -> State:
 
 
 def stored_filter(tensors: Mapping[str, Tensor], count: int) -> Tensor | None:
-    """Return the 3D filter (N,) of a state, None without one. Raises ValueError for one that does not fit N."""
+    """Return the 3D filter (N,) of a state, None without one. Raises ValueError for one that does
+    not fit N."""
     std = tensors.get("filter_std")
     if std is not None and bool((require_tensor("filter_std", std, (count,)) < 0).any()):
         raise ValueError("'filter_std' holds negative numbers")

@@ -1,8 +1,8 @@
 """Depths of several views as one surface, and that as few triangles.
 
-Signed distances along the rays are averaged on a grid (Curless and Levoy 1996), the surface is where they change their
-sign (marching cubes, Lorensen and Cline 1987), and its vertices are joined, cell by cell of a coarser grid, where the
-planes of their faces meet (Lindstrom 2000).
+Signed distances along the rays are averaged on a grid (Curless and Levoy 1996), the surface is
+where they change their sign (marching cubes, Lorensen and Cline 1987), and its vertices are joined,
+cell by cell of a coarser grid, where the planes of their faces meet (Lindstrom 2000).
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ AT_ONCE = 1 << 21  # Points of the grid that are looked at together
 OPAQUE = 0.5  # Of a pixel that shows a surface
 TRIALS = 10  # Sizes of cells that are tried for a number of triangles
 FINEST = 1024.0  # Cells along the surface, at most
-STIFFNESS = 0.02  # Of a vertex towards the mean of those joined, where planes do not say where they meet
+# Of a vertex towards the mean of those joined, where planes do not say where they meet
+STIFFNESS = 0.02
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,15 @@ class Mesh:
     faces: np.ndarray  # (F, 3)
 
 
-def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen_is_solid: bool = True) -> Mesh | None:
+def fused(
+    seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen_is_solid: bool = True
+) -> Mesh | None:
     """Return the surface in the box from ``low`` to ``high`` (3,); None where there is none.
 
     Args:
         cells: along the longest side of the box.
-        unseen_is_solid: what no view sees into counts as inside, which closes the back of things; else the surface
-            ends where what is seen does.
+        unseen_is_solid: what no view sees into counts as inside, which closes the back of things;
+            else the surface ends where what is seen does.
     """
     from skimage.measure import marching_cubes
 
@@ -56,7 +59,9 @@ def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen
     counts = ((high - low) / size).ceil().long() + 1
     x, y, z = (low[i] + size * torch.arange(int(counts[i]), device="cpu") for i in range(3))
     slabs = x.split(max(AT_ONCE // (len(y) * len(z)), 1))
-    means, known = zip(*(_averages(seen, torch.cartesian_prod(slab, y, z), size) for slab in slabs), strict=True)
+    means, known = zip(
+        *(_averages(seen, torch.cartesian_prod(slab, y, z), size) for slab in slabs), strict=True
+    )
     shape = tuple(counts.tolist())
     grid = torch.cat(means).view(shape).numpy()
     mask = None if unseen_is_solid else _known_cells(torch.cat(known).view(shape).numpy())
@@ -64,12 +69,15 @@ def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen
     if not looked_at.size or not looked_at.min() < 0 < looked_at.max():
         return None
     vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=mask)
-    return Mesh(vertices * size + low.numpy(), np.ascontiguousarray(faces))  # its rows are stored backwards
+    # its rows are stored backwards
+    return Mesh(vertices * size + low.numpy(), np.ascontiguousarray(faces))
 
 
 def _averages(seen: Sequence[Seen], points: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return (N,) mean distances of the views that see ``points`` (N, 3), -1 without any, and (N,) bool: there are."""
-    total, weight = torch.zeros(len(points), device="cpu"), torch.zeros(len(points), device="cpu")
+    """Return (N,) mean distances of the views that see ``points`` (N, 3), -1 without any, and (N,)
+    bool: there are."""
+    total = torch.zeros(len(points), device="cpu")
+    weight = torch.zeros(len(points), device="cpu")
     for one in seen:
         distance, counted = _distances(one, points, size)
         total += torch.where(counted, distance, 0.0)
@@ -78,14 +86,16 @@ def _averages(seen: Sequence[Seen], points: Tensor, size: float) -> tuple[Tensor
 
 
 def _known_cells(known: np.ndarray) -> np.ndarray:
-    """Return whether all eight corners of a cell are known, at its last corner, where marching cubes asks."""
+    """Return whether all eight corners of a cell are known, at its last corner, where marching
+    cubes asks."""
     from scipy.ndimage import minimum_filter
 
     return minimum_filter(known, 2, mode="nearest")
 
 
 def _distances(one: Seen, points: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return (N,) signed distances before what a view shows, in cells, at most 1, and (N,) bool, where that counts."""
+    """Return (N,) signed distances before what a view shows, in cells, at most 1, and (N,) bool,
+    where that counts."""
     column, row, z, inside = _pixels(one.camera, points)
     opaque = one.opacity[row, column] > OPAQUE
     before = torch.where(opaque, (one.depth[row, column] - z) / (BEHIND * size), 1.0).clamp(max=1.0)
@@ -93,8 +103,10 @@ def _distances(one: Seen, points: Tensor, size: float) -> tuple[Tensor, Tensor]:
 
 
 def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return columns, rows, and z of ``points`` (N, 3), and which of them lie in the image; others have pixel 0."""
-    pose, inner = camera.cam_from_world[0], camera.intrinsics[0]
+    """Return columns, rows, and z of ``points`` (N, 3), and which of them lie in the image; others
+    have pixel 0."""
+    pose = camera.cam_from_world[0]
+    inner = camera.intrinsics[0]
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
     before = z > 0
     safe = torch.where(before, z, 1.0)
@@ -105,15 +117,19 @@ def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Te
 
 
 def colours_of(seen: Sequence[Seen], points: Tensor, tolerance: float) -> Tensor:
-    """Return (N, 3) mean colours of surface ``points`` (N, 3) in the views that show them; grey where none does.
+    """Return (N, 3) mean colours of surface ``points`` (N, 3) in the views that show them; grey
+    where none does.
 
     Args:
         tolerance: how far behind what a view shows a point may be, world units.
     """
-    total, weight = torch.full((len(points), 3), 5e-4, device="cpu"), torch.full((len(points), 1), 1e-3, device="cpu")
+    total = torch.full((len(points), 3), 5e-4, device="cpu")
+    weight = torch.full((len(points), 1), 1e-3, device="cpu")
     for one in seen:
         column, row, z, inside = _pixels(one.camera, points)
-        shown = inside & (one.opacity[row, column] > OPAQUE) & (z < one.depth[row, column] + tolerance)
+        shown = (
+            inside & (one.opacity[row, column] > OPAQUE) & (z < one.depth[row, column] + tolerance)
+        )
         total += torch.where(shown[:, None], one.colour[row, column], 0.0)
         weight += shown[:, None]
     return total / weight
@@ -138,28 +154,34 @@ def simplified(mesh: Mesh, most: int) -> Mesh:
 def _cells(mesh: Mesh, size: float) -> np.ndarray:
     """Return (V,) number of the cell that each vertex is in, of those that hold any."""
     cells = np.floor((mesh.vertices - mesh.vertices.min(0)) / size).astype(np.int64)
-    _, labels = np.unique((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2], return_inverse=True)
+    _, labels = np.unique(
+        (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2], return_inverse=True
+    )
     return labels.reshape(-1)
 
 
 def _joined_faces(mesh: Mesh, labels: np.ndarray) -> np.ndarray:
     """Return (F, 3) faces between joined vertices, each once."""
     faces = labels[mesh.faces]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    faces = faces[
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    ]
     a, b, c = np.sort(faces, axis=1).T
     _, first = np.unique((a << 42) + (b << 21) + c, return_index=True)
     return faces[np.sort(first)]
 
 
 def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
-    """Return (L, 3): per label of vertices where the planes of their faces meet, within ``size`` of their mean."""
+    """Return (L, 3): per label of vertices where the planes of their faces meet, within ``size`` of
+    their mean."""
     means = _sums(labels, mesh.vertices) / _sums(labels, np.ones((len(labels), 1)))
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.maximum(areas, 1e-30)
     squares = (normals[:, :, None] * normals[:, None]).reshape(-1, 9)
-    left, right = np.zeros((len(means), 9)), np.zeros((len(means), 3))
+    left = np.zeros((len(means), 9))
+    right = np.zeros((len(means), 3))
     for corner in range(3):
         label = labels[mesh.faces[:, corner]]
         heights = (normals * (a - means[label])).sum(1, keepdims=True)

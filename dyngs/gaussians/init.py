@@ -11,16 +11,32 @@ import torch
 from torch import Tensor
 
 from dyngs.capture.first_points import AROUND_ORIGIN
-from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, SceneInit, Strategy
+from dyngs.config import (
+    DefaultStrategy,
+    FixedStrategy,
+    McmcStrategy,
+    PointsInit,
+    RandomInit,
+    SceneInit,
+    Strategy,
+)
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import Capture, View
-from dyngs.data.scene_space import MIN_VIEWS, cube_half_side, extent_of, outside_of_cube, points_in_frusta
+from dyngs.data.scene_space import (
+    MIN_VIEWS,
+    cube_half_side,
+    extent_of,
+    outside_of_cube,
+    points_in_frusta,
+)
 from dyngs.gaussians import Gaussians
 
 START_OPACITY = 0.1
-MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with
+# Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with
+MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1
 MIN_SQUARED_DISTANCE = 1e-7
-CANDIDATES = 4  # Random points that are drawn per one that is taken, where what the cameras see decides
+# Random points that are drawn per one that is taken, where what the cameras see decides
+CANDIDATES = 4
 
 
 @dataclass(frozen=True)
@@ -63,7 +79,8 @@ class Surroundings:
     def extent(self) -> float:
         """1.1 x the largest distance of a camera's centre to the mean centre.
 
-        Learning rates and size thresholds are relative to it. Where all cameras share one centre it is 1.
+        Learning rates and size thresholds are relative to it. Where all cameras share one centre it
+        is 1.
         """
         return extent_of(self.camera_centers) or 1.0
 
@@ -87,18 +104,25 @@ def initial_gaussians(
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Return the first Gaussians of a run: isotropic, as large as the distance to the three nearest neighbours.
+    """Return the first Gaussians of a run: isotropic, as large as the distance to the three nearest
+    neighbours.
 
-    ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the scene's points; where
-    there are none it draws that cube if the scene may lie in it by convention, else what the cameras see together.
+    ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the
+    scene's points; where there are none it draws that cube if the scene may lie in it by
+    convention, else what the cameras see together.
     """
     if options.kind != "random" and scene.points is not None and scene.points_rgb is not None:
         finite = np.isfinite(scene.points).all(axis=1)
         xyz = torch.from_numpy(scene.points[finite].astype(np.float64))
         base = (torch.from_numpy(scene.points_rgb[finite].astype(np.float64)) / 255 - 0.5) / SH_C0
         if len(xyz) > start.max_gaussians:
-            chosen = torch.randperm(len(xyz), generator=generator, device="cpu")[: start.max_gaussians].sort().values
-            xyz, base = xyz[chosen], base[chosen]
+            chosen = (
+                torch.randperm(len(xyz), generator=generator, device="cpu")[: start.max_gaussians]
+                .sort()
+                .values
+            )
+            xyz = xyz[chosen]
+            base = base[chosen]
         if len(xyz) > 0:
             return _isotropic(xyz, base, start, sh_degree)
     xyz, base = _random_points(scene, options, start.max_gaussians, generator)
@@ -106,27 +130,39 @@ def initial_gaussians(
 
 
 def _random_points(
-    scene: Surroundings, options: PointsInit | RandomInit | SceneInit, max_points: int, generator: torch.Generator
+    scene: Surroundings,
+    options: PointsInit | RandomInit | SceneInit,
+    max_points: int,
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Positions (N, 3) float64, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
     count = min(options.num_random, max_points)
     half_extent = cube_half_side(options.half_extent, scene.views, scene.world_scale)
-    if options.kind == "random" or (scene.around_origin and outside_of_cube(scene.views, half_extent) is None):
-        xyz = (torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1) * half_extent
+    if options.kind == "random" or (
+        scene.around_origin and outside_of_cube(scene.views, half_extent) is None
+    ):
+        xyz = (
+            torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1
+        ) * half_extent
     else:
         xyz = _seen_together(scene.views, count, generator)
     return xyz, torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") / 255
 
 
 def _seen_together(views: Sequence[View], count: int, generator: torch.Generator) -> Tensor:
-    """Return ``count`` random points (N, 3) float64 in what the cameras see together, see ``points_in_frusta``.
+    """Return ``count`` random points (N, 3) float64 in what the cameras see together, see
+    ``points_in_frusta``.
 
-    A candidate is taken with a chance proportional to the square of the number of views that see it; those that fewer
-    than ``MIN_VIEWS`` see come last. So most points lie where most cameras look, some wherever depth can be told.
+    A candidate is taken with a chance proportional to the square of the number of views that see
+    it; those that fewer than ``MIN_VIEWS`` see come last. So most points lie where most cameras
+    look, some wherever depth can be told.
     """
-    unit = torch.rand((CANDIDATES * count, 5), generator=generator, dtype=torch.float64, device="cpu").numpy()
+    unit = torch.rand(
+        (CANDIDATES * count, 5), generator=generator, dtype=torch.float64, device="cpu"
+    ).numpy()
     xyz, seen = points_in_frusta(views, unit[:, :4])
-    # The largest of u^(1 / weight) are a weighted sample without replacement (Efraimidis and Spirakis 2006).
+    # The largest of u^(1 / weight) are a weighted sample without replacement (Efraimidis and
+    # Spirakis 2006).
     order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1) ** 2
     order[seen < min(MIN_VIEWS, len(views))] -= 1e6
     return torch.from_numpy(xyz[np.sort(np.argsort(-order, kind="stable")[:count])])
@@ -141,13 +177,16 @@ def _isotropic(xyz: Tensor, base: Tensor, start: StartValues, sh_degree: int) ->
         means=xyz.float(),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0], device="cpu").repeat(n, 1),
         log_scales=log_scale.float()[:, None].repeat(1, 3),
-        logit_opacities=torch.full((n,), math.log(start.opacity / (1 - start.opacity)), device="cpu"),
+        logit_opacities=torch.full(
+            (n,), math.log(start.opacity / (1 - start.opacity)), device="cpu"
+        ),
         sh=sh,
     )
 
 
 def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
-    """Return (N,) mean squared distance to the three nearest other points, at least 1e-7; ``xyz`` is (N, 3).
+    """Return (N,) mean squared distance to the three nearest other points, at least 1e-7; ``xyz``
+    is (N, 3).
 
     With fewer than four points the mean is over those there are; a single point gets 1e-2.
     """

@@ -1,8 +1,10 @@
-"""Levels of detail of still Gaussians: a tree of blocks, coarser ones of merged Gaussians, and what a camera needs.
+"""Levels of detail of still Gaussians: a tree of blocks, coarser ones of merged Gaussians, and what
+a camera needs.
 
-Gaussians are put into the order of a k-d tree of places and sizes (Bentley 1975). Four neighbours each are merged into
-one of the next level, and so on; ``BLOCK`` of them that follow each other are a block, whose children are the four
-blocks of the level below that it merges. A cut through this tree is a whole scene, as fine as a camera can see.
+Gaussians are put into the order of a k-d tree of places and sizes (Bentley 1975). Four neighbours
+each are merged into one of the next level, and so on; ``BLOCK`` of them that follow each other are
+a block, whose children are the four blocks of the level below that it merges. A cut through this
+tree is a whole scene, as fine as a camera can see.
 
 Local letters: N Gaussians, C that are merged into one, B blocks.
 """
@@ -23,10 +25,12 @@ from dyngs.ops.quaternions import quats_of, rotation_matrices
 
 MERGED = 4  # Gaussians in one of the next level, and blocks below one
 BLOCK = 4096  # Gaussians of a block; a power of ``MERGED``
-PIXELS = 0.5  # Standard deviation, on the image, of what a merged Gaussian stands for, up to which it does
+# Standard deviation, on the image, of what a merged Gaussian stands for, up to which it does
+PIXELS = 0.5
 LARGEST_OPACITY = 0.999
 _AT_ONCE = 1 << 16  # Merged Gaussians that are computed at once, for memory
-_ELLIPSOID = 1.6075  # Exponent of Thomsen's formula for the area of an ellipsoid (2004), good to 1.1 %
+# Exponent of Thomsen's formula for the area of an ellipsoid (2004), good to 1.1 %
+_ELLIPSOID = 1.6075
 
 Block = tuple[int, int]
 """Level, 0 being the finest, and place in it."""
@@ -37,10 +41,11 @@ class Levels:
     """Gaussians in several degrees of detail.
 
     Attributes:
-        levels: level 0 holds the Gaussians themselves, in the order of the tree; the last one at most ``BLOCK``.
-        blocks: by level (B, 5) float64: centre and radius of a ball around a block's Gaussians, to three standard
-            deviations; its spread: the standard deviation, in place and size, of what one of them stands for, root mean
-            square, world units; 0 at level 0.
+        levels: level 0 holds the Gaussians themselves, in the order of the tree; the last one at
+            most ``BLOCK``.
+        blocks: by level (B, 5) float64: centre and radius of a ball around a block's Gaussians, to
+            three standard deviations; its spread: the standard deviation, in place and size, of
+            what one of them stands for, root mean square, world units; 0 at level 0.
     """
 
     levels: tuple[Gaussians, ...]
@@ -50,7 +55,10 @@ class Levels:
         """Return the at most ``BLOCK`` Gaussians of a block."""
         level, place = block
         return Gaussians(
-            **{name: x[place * BLOCK : (place + 1) * BLOCK] for name, x in self.levels[level].tensors().items()}
+            **{
+                name: x[place * BLOCK : (place + 1) * BLOCK]
+                for name, x in self.levels[level].tensors().items()
+            }
         )
 
     def count(self, block: Block) -> int:
@@ -67,8 +75,9 @@ class Levels:
     def cut(self, camera: Cameras, most: int | None = None, pixels: float = PIXELS) -> list[Block]:
         """Return the blocks that show the scene to ``camera`` (one), in ascending order.
 
-        Blocks are replaced by their children, those first whose spread is largest on the image, until none is larger
-        than ``pixels``, or the next would make it more than ``most`` Gaussians. What is not in the image stays coarse.
+        Blocks are replaced by their children, those first whose spread is largest on the image,
+        until none is larger than ``pixels``, or the next would make it more than ``most``
+        Gaussians. What is not in the image stays coarse.
         """
         sizes = [sizes_on_image(balls, camera) for balls in self.blocks]
         top: Block = (len(self.levels) - 1, 0)
@@ -87,18 +96,24 @@ class Levels:
                 heapq.heappush(waiting, (-float(sizes[child[0]][child[1]]), child))
         return sorted(cut)
 
-    def seen_by(self, camera: Cameras, most: int | None = None, pixels: float = PIXELS) -> Gaussians:
+    def seen_by(
+        self, camera: Cameras, most: int | None = None, pixels: float = PIXELS
+    ) -> Gaussians:
         """Return the Gaussians of ``cut``."""
         return Gaussians.joined([self.of_block(block) for block in self.cut(camera, most, pixels)])
 
 
 def sizes_on_image(balls: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return (B,) spreads of blocks (B, 5) on an image, px, where they are nearest to it; -1 outside of it."""
+    """Return (B,) spreads of blocks (B, 5) on an image, px, where they are nearest to it; -1
+    outside of it."""
     pose, k = (x[0].double().cpu().numpy() for x in (camera.cam_from_world, camera.intrinsics))
-    places, radii = balls[:, :3] @ pose[:3, :3].T + pose[:3, 3], balls[:, 3]
-    depths, seen = places[:, 2], places[:, 2] > -radii
+    places = balls[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    radii = balls[:, 3]
+    depths = places[:, 2]
+    seen = places[:, 2] > -radii
     for axis, side in ((0, camera.width), (1, camera.height)):
-        focal, middle = k[axis, axis], k[axis, 2]
+        focal = k[axis, axis]
+        middle = k[axis, 2]
         for slope, offset in ((focal, middle), (-focal, side - middle)):
             seen &= slope * places[:, axis] + offset * depths > -radii * np.hypot(slope, offset)
     nearest = np.maximum(np.linalg.norm(places, axis=1) - radii, 1e-9)
@@ -106,7 +121,8 @@ def sizes_on_image(balls: np.ndarray, camera: Cameras) -> np.ndarray:
 
 
 def levels_of(gaussians: Gaussians) -> Levels:
-    """Return the tree of N Gaussians, equal ones for equal Gaussians. Raises DyngsError where there are none."""
+    """Return the tree of N Gaussians, equal ones for equal Gaussians. Raises DyngsError where there
+    are none."""
     if not len(gaussians):
         raise DyngsError("a scene without Gaussians has no levels of detail")
     gaussians = gaussians.detach().to(device="cpu", dtype=torch.float32)
@@ -114,9 +130,11 @@ def levels_of(gaussians: Gaussians) -> Levels:
     sizes = covariances.diagonal(dim1=1, dim2=2).sum(1).sqrt()
     points = torch.cat([gaussians.means.double(), sizes[:, None]], dim=1)
     order = torch.from_numpy(_tree_order(points.float().numpy()))
-    level, points = gaussians.select(order), points[order]
+    level = gaussians.select(order)
+    points = points[order]
     spreads = level.means.new_zeros(len(order), dtype=torch.float64)  # variances
-    levels, blocks = [level], [_balls(level, spreads)]
+    levels = [level]
+    blocks = [_balls(level, spreads)]
     while len(level) > BLOCK:
         level, points, spreads = _next_level(level, points, spreads)
         levels.append(level)
@@ -125,21 +143,27 @@ def levels_of(gaussians: Gaussians) -> Levels:
 
 
 def merged(gaussians: Gaussians, count: int) -> tuple[Gaussians, Tensor]:
-    """Return N Gaussians merged from ``count`` each, and the shares (N, count) in their masses, whose rows sum to 1.
+    """Return N Gaussians merged from ``count`` each, and the shares (N, count) in their masses,
+    whose rows sum to 1.
 
-    They keep mass, mean, covariance and mean colours of their mixtures. The mass of a Gaussian is its opacity times the
-    area of the ellipsoid of its standard deviations, four times what is seen of it on average (Cauchy 1841). More mass
-    than an opacity of ``LARGEST_OPACITY`` holds lies one behind the other, and is lost.
+    They keep mass, mean, covariance and mean colours of their mixtures. The mass of a Gaussian is
+    its opacity times the area of the ellipsoid of its standard deviations, four times what is seen
+    of it on average (Cauchy 1841). More mass than an opacity of ``LARGEST_OPACITY`` holds lies one
+    behind the other, and is lost.
 
     ``gaussians``: N * count of them, float64, those of one in turn.
     """
     mass = (gaussians.opacities * _areas(gaussians.log_scales)).clamp_min(1e-300).reshape(-1, count)
     shares = mass / mass.sum(1, keepdim=True)
     means, sh = (
-        torch.einsum("nc,nc...->n...", shares, x.unflatten(0, shares.shape)) for x in (gaussians.means, gaussians.sh)
+        torch.einsum("nc,nc...->n...", shares, x.unflatten(0, shares.shape))
+        for x in (gaussians.means, gaussians.sh)
     )
     apart = gaussians.means.unflatten(0, shares.shape) - means[:, None]
-    both = _covariances(gaussians).unflatten(0, shares.shape) + apart[..., :, None] * apart[..., None, :]
+    both = (
+        _covariances(gaussians).unflatten(0, shares.shape)
+        + apart[..., :, None] * apart[..., None, :]
+    )
     variances, axes = torch.linalg.eigh((shares[..., None, None] * both).sum(1))
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     log_scales = 0.5 * variances.clamp_min(1e-60).log()
@@ -147,8 +171,11 @@ def merged(gaussians: Gaussians, count: int) -> tuple[Gaussians, Tensor]:
     return Gaussians(means, quats_of(axes), log_scales, opacities.logit(), sh), shares
 
 
-def _next_level(level: Gaussians, points: Tensor, spreads: Tensor) -> tuple[Gaussians, Tensor, Tensor]:
-    """Return the next level, mean places and sizes (N, 4) of what its Gaussians stand for, and their variances (N,)."""
+def _next_level(
+    level: Gaussians, points: Tensor, spreads: Tensor
+) -> tuple[Gaussians, Tensor, Tensor]:
+    """Return the next level, mean places and sizes (N, 4) of what its Gaussians stand for, and
+    their variances (N,)."""
     parts: list[Gaussians] = []
     told: list[Tensor] = []
     count = -(-len(level) // MERGED)
@@ -192,9 +219,11 @@ def _balls(level: Gaussians, variances: Tensor) -> np.ndarray:
 
 
 def _tree_order(points: np.ndarray) -> np.ndarray:
-    """Return (N,) indices of ``points`` (N, D) of which each 2^k, from a multiple of 2^k on, are a box of a k-d tree.
+    """Return (N,) indices of ``points`` (N, D) of which each 2^k, from a multiple of 2^k on, are a
+    box of a k-d tree.
 
-    Boxes are halved at the median of their longest side, ties by index; the last box of each size may hold fewer.
+    Boxes are halved at the median of their longest side, ties by index; the last box of each size
+    may hold fewer.
     """
     count, _ = points.shape
     size = 1 << (count - 1).bit_length()

@@ -1,4 +1,5 @@
-"""Gaussians in training: the one owner of their values, of the state of Adam, and of what is stored per Gaussian."""
+"""Gaussians in training: the one owner of their values, of the state of Adam, and of what is stored
+per Gaussian."""
 
 from __future__ import annotations
 
@@ -34,10 +35,12 @@ S = TypeVar("S", bound=GaussianScene)
 
 
 class SceneTraining(Generic[S]):
-    """Training of a kind of scene: of all that it learns next to the Gaussians and their colours, here nothing.
+    """Training of a kind of scene: of all that it learns next to the Gaussians and their colours,
+    here nothing.
 
     Attributes:
-        moves_by: name of what moves the Gaussians and the configuration section of its learning rates, for messages.
+        moves_by: name of what moves the Gaussians and the configuration section of its learning
+            rates, for messages.
         colour_loss: how colours are compared with true ones; None: by L1 and D-SSIM.
     """
 
@@ -51,14 +54,16 @@ class SceneTraining(Generic[S]):
         return 0.0, 1.0
 
     def extend(self, scene: S, seen: tuple[float, float], step: int) -> None:
-        """Continue motion learned for the times in ``seen`` to those that are trained on at ``step``."""
+        """Continue motion learned for the times in ``seen`` to those that are trained on at
+        ``step``."""
 
     def time_step(self, scene: S, image: Image, step: int) -> GaussianTimeStep:
         """Return the Gaussians drawn for ``image`` in ``step``, with the penalties."""
         return scene.time_step(image.time)
 
     def optimize(self, scene: S, step: int) -> Count:
-        """Update, in place, what the scene learns; return the number of rows left out for bad gradients."""
+        """Update, in place, what the scene learns; return the number of rows left out for bad
+        gradients."""
         return 0
 
     def leaves(self, scene: S) -> Sequence[Tensor]:
@@ -66,7 +71,8 @@ class SceneTraining(Generic[S]):
         return ()
 
     def resting(self, scene: S) -> Tensor | None:
-        """Return the indices of the Gaussians that stay as they are in steps that do not show them; None: of none."""
+        """Return the indices of the Gaussians that stay as they are in steps that do not show them;
+        None: of none."""
         return None
 
     def still(self) -> Still | None:
@@ -74,11 +80,13 @@ class SceneTraining(Generic[S]):
         return None
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
-        """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen."""
+        """Return the scene for the next step: filters brought up to date, motion extended, static
+        Gaussians frozen."""
         return scene
 
     def revised(self, scene: S, step: int) -> tuple[S, EditResult] | None:
-        """Return the scene as its kind changes it after ``step``, and the edit of its Gaussians; None: it does not."""
+        """Return the scene as its kind changes it after ``step``, and the edit of its Gaussians;
+        None: it does not."""
         return None
 
     def all_moving(self, scene: S, extent: float) -> S:
@@ -119,13 +127,15 @@ class GaussianModel(Model[GaussianScene]):
     ) -> None:
         config = run.config
         self._config, self.densifier, self.colours = config, densifier, colours
-        self._run, self._generator = run, run.generator
+        self._run = run
+        self._generator = run.generator
         self._rates, self._course = learning_rates(config), rates_of(config)
         self.options = training_options(run)
         self.begin_with(scene, training)
 
     def begin_with(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
-        """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned yet."""
+        """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned
+        yet."""
         config = self._config
         self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, self._rates)
         behind = evaluation_background(config.data.background, self._run.capture.has_alpha)[1]
@@ -163,7 +173,8 @@ class GaussianModel(Model[GaussianScene]):
         return [*found, *self.training.leaves(self._scene)]
 
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
-        scene, densifier = self._scene, self.densifier
+        scene = self._scene
+        densifier = self.densifier
         now = self.training.time_step(scene, image, step)
         probe = (
             torch.zeros(1, len(scene), 4, requires_grad=True, device=scene.device)
@@ -172,7 +183,9 @@ class GaussianModel(Model[GaussianScene]):
         )
         options = self._options(step)
         options = replace(options, depth="expected") if depth else options
-        rendering = scene.render(image.cameras, now, options=options, background=background, probe=probe)
+        rendering = scene.render(
+            image.cameras, now, options=options, background=background, probe=probe
+        )
 
         def after_backward() -> None:
             if probe is not None and probe.grad is not None:
@@ -208,11 +221,16 @@ class GaussianModel(Model[GaussianScene]):
         self.training.extend(self._scene, seen, step)
 
     def update(self, step: int) -> Updated:
-        before, generator = self._optimizer.parameters, self._generator
+        before = self._optimizer.parameters
+        generator = self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
-        frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
-        resting, still = self.training.resting(self._scene), self.training.still()
-        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen, resting=resting, still=still)
+        frozen = self.colours.frozen_rest()
+        dense = self.densifier.touches_all
+        resting = self.training.resting(self._scene)
+        still = self.training.still()
+        bad = self._optimizer.step(
+            step, lr_means, dense=dense, frozen_rest=frozen, resting=resting, still=still
+        )
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:
@@ -232,7 +250,8 @@ class GaussianModel(Model[GaussianScene]):
 
     def _perturb(self, lr_means: float) -> None:
         """Let the strategy shake the Gaussians, but for those that stay as they are."""
-        still, means = self.training.still(), self._optimizer.parameters.means
+        still = self.training.still()
+        means = self._optimizer.parameters.means
         kept = None if still is None or still.rows is None else means.detach()[still.rows]
         self.densifier.perturb(self._optimizer.parameters, lr_means, self._generator)
         if still is not None and kept is not None:
@@ -254,7 +273,8 @@ class GaussianModel(Model[GaussianScene]):
         self.densifier = Densifier()
 
     def drop_harmonics(self, dropped: Tensor, offsets: Tensor) -> None:
-        """Replace the harmonics of the Gaussians ``dropped`` (N,) for good by their base, with ``offsets`` (N, 3)."""
+        """Replace the harmonics of the Gaussians ``dropped`` (N,) for good by their base, with
+        ``offsets`` (N, 3)."""
         base = self._scene.gaussians.sh.detach()[:, 0] + offsets / SH_C0
         self._optimizer.drop_rest(base, dropped)
         self.exchange(self._scene)
@@ -286,8 +306,11 @@ class GaussianModel(Model[GaussianScene]):
         if checkpoint.info.step >= self._config.train.steps:
             self.stop_growing()
         self.densifier.load_state(checkpoint.part("strategy"))
-        like, self._optimizer = self._scene, optimizer
-        self._scene = replace(scene, colour=self.colours.network, options=like.options, background=like.background)
+        like = self._scene
+        self._optimizer = optimizer
+        self._scene = replace(
+            scene, colour=self.colours.network, options=like.options, background=like.background
+        )
 
     def place(self, device: torch.device) -> None:
         if self._scene.device == device:
@@ -306,7 +329,8 @@ class GaussianModel(Model[GaussianScene]):
         return replace(self.options, sh_degree=degree)
 
     def _apply(self, result: EditResult, edited: GaussianScene | None = None) -> None:
-        """Change the set of Gaussians, and everything that is stored per Gaussian with it; ``edited``: is already."""
+        """Change the set of Gaussians, and everything that is stored per Gaussian with it;
+        ``edited``: is already."""
         self._optimizer.apply(result)
         if edited is None:
             edited = self._scene if result.edit is None else self._scene.edited(result.edit)
@@ -316,7 +340,8 @@ class GaussianModel(Model[GaussianScene]):
             self.training.follow(result.edit)
 
     def _in_memory_order(self, result: EditResult) -> EditResult:
-        """Return the same change with neighbours in space next to each other: kernels read rows that are in a cache."""
+        """Return the same change with neighbours in space next to each other: kernels read rows
+        that are in a cache."""
         edit = result.edit
         if edit is None:
             return result
@@ -326,7 +351,8 @@ class GaussianModel(Model[GaussianScene]):
         return replace(result, edit=edit.in_order(order), changes=changes)
 
     def _measured_harmonics(self, step: int) -> str | None:
-        """Drop harmonics that do not pay, if it is time to measure that; return a line about what was found."""
+        """Drop harmonics that do not pay, if it is time to measure that; return a line about what
+        was found."""
         if not self._scene.gaussians.sh_degree:
             return None
         found = self.colours.measured(step, lambda: self._looks(step))
@@ -335,14 +361,17 @@ class GaussianModel(Model[GaussianScene]):
         return None if found is None else found.text
 
     def _looks(self, step: int) -> TrainingLooks:
-        images, colour = self._run.images, background_colour(self._run.background).to(self._scene.device)
+        images = self._run.images
+        colour = background_colour(self._run.background).to(self._scene.device)
 
         def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
             for image in (images[i] for i in indices):
                 gaussians = self.training.time_step(self._scene, image, step).gaussians.detach()
                 yield MeasuredView(gaussians, image.cameras, image.composite(colour), image.mask)
 
-        may_train = [i for i, time in enumerate(images.times) if self.training.trains_on(time, step)]
+        may_train = [
+            i for i, time in enumerate(images.times) if self.training.trains_on(time, step)
+        ]
         return TrainingLooks(may_train, views, self._options(step), colour)
 
     def _render_options(self, model: SceneModel) -> RenderOptions:

@@ -1,4 +1,5 @@
-"""The order of Gaussians in memory and in files: neighbours in space are neighbours there, and predict each other."""
+"""The order of Gaussians in memory and in files: neighbours in space are neighbours there, and
+predict each other."""
 
 from __future__ import annotations
 
@@ -6,7 +7,8 @@ import numpy as np
 
 MORTON_BITS = 20  # Bits per coordinate; 60 in all
 INNER, OUTLYING = 0.01, 64.0
-"""Quantile and multiple of the box: points farther out than so many of its sides count as its edge."""
+"""Quantile and multiple of the box: points farther out than so many of its sides count as its
+edge."""
 SPREADING = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -18,7 +20,8 @@ SPREADING = (
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """Return (N,) indices of ``points`` (N, 3) along a Z-order curve through their box (Morton 1966); ties by index."""
+    """Return (N,) indices of ``points`` (N, 3) along a Z-order curve through their box (Morton
+    1966); ties by index."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     places = points.astype(np.float64)
@@ -36,8 +39,11 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 
 
 def storage_order(means: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return (N,) indices of ``means`` (N, 3): moving ones (``rows``, (M,)), then the others, both in Morton order."""
+    """Return (N,) indices of ``means`` (N, 3): moving ones (``rows``, (M,)), then the others, both
+    in Morton order."""
     still = np.ones(len(means), dtype=bool)
     still[rows] = False
     rest = np.flatnonzero(still)
-    return np.concatenate([rows[morton_order(means[rows])], rest[morton_order(means[rest])]]).astype(np.int64)
+    return np.concatenate(
+        [rows[morton_order(means[rows])], rest[morton_order(means[rest])]]
+    ).astype(np.int64)

@@ -1,4 +1,5 @@
-"""Named tensors trained by Adam, with their learning rates: fields, corrections of body fits, colour networks."""
+"""Named tensors trained by Adam, with their learning rates: fields, corrections of body fits,
+colour networks."""
 
 from __future__ import annotations
 
@@ -25,7 +26,11 @@ class Parameters:
     """
 
     def __init__(
-        self, tensors: Mapping[str, Tensor], rates: Mapping[str, float], decay: float = 1.0, roles: Roles = Role.SHARED
+        self,
+        tensors: Mapping[str, Tensor],
+        rates: Mapping[str, float],
+        decay: float = 1.0,
+        roles: Roles = Role.SHARED,
     ) -> None:
         self.decay, self.rates = decay, dict(rates)
         self._roles = dict.fromkeys(tensors, roles) if isinstance(roles, Role) else dict(roles)
@@ -50,7 +55,8 @@ class Parameters:
         return sum(x.numel() for x in self._tensors.values())
 
     def step(self, step: int, progress: float) -> Count:
-        """Update all tensors, drop the gradients, and return the number of rows left out for bad gradients.
+        """Update all tensors, drop the gradients, and return the number of rows left out for bad
+        gradients.
 
         Args:
             progress: 0 at the first update, 1 at the last; decides the rates.
@@ -60,7 +66,9 @@ class Parameters:
 
     def update(self, step: int, factor: float) -> Count:
         """As ``step``, with all rates multiplied by ``factor``."""
-        updates = [self._update_of(name, x, self.rates[name] * factor) for name, x in self._tensors.items()]
+        updates = [
+            self._update_of(name, x, self.rates[name] * factor) for name, x in self._tensors.items()
+        ]
         return self._adam.steps_(updates, step=step)
 
     def _update_of(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:
@@ -74,26 +82,36 @@ class Parameters:
         moved = {name: edit.apply(self._tensors[name].detach()) for name in names}
         return self._with(moved, edit.apply_moments) if names else self
 
-    def rearranged(self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor) -> Parameters:
-        """Return the parameters with other values for some tensors, and the moments of the old rows ``source``."""
+    def rearranged(
+        self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor
+    ) -> Parameters:
+        """Return the parameters with other values for some tensors, and the moments of the old rows
+        ``source``."""
         return self._with(values, lambda x: _moments_of(x, source, is_new))
 
     def values(self) -> dict[str, Tensor]:
         return {name: x.detach() for name, x in self._tensors.items()}
 
     def state(self) -> State:
-        return {name: StateTensor(x, self._roles[name]) for name, x in self.values().items()} | self._adam.state()
+        return {
+            name: StateTensor(x, self._roles[name]) for name, x in self.values().items()
+        } | self._adam.state()
 
-    def restored(self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None) -> Parameters:
+    def restored(
+        self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None
+    ) -> Parameters:
         """Return what ``state`` returned as parameters like these, on their device.
 
         Where no moments are stored, as in files for drawing, they are 0.
 
         Args:
-            rows: names of the tensors that have another number of rows than now, and what it must be.
+            rows: names of the tensors that have another number of rows than now, and what it must
+                be.
         """
         values = {
-            name: require_tensor(name, tensors[name], ((rows or {}).get(name, len(x)), *x.shape[1:]), x.dtype)
+            name: require_tensor(
+                name, tensors[name], ((rows or {}).get(name, len(x)), *x.shape[1:]), x.dtype
+            )
             .to(x.device)
             .clone()
             for name, x in self._tensors.items()
@@ -108,7 +126,9 @@ class Parameters:
         found._adam = self._adam.to(device)
         return found
 
-    def _with(self, values: Mapping[str, Tensor], moments: Callable[[Tensor], Tensor]) -> Parameters:
+    def _with(
+        self, values: Mapping[str, Tensor], moments: Callable[[Tensor], Tensor]
+    ) -> Parameters:
         """Return the parameters with other ``values``, and their moments changed by ``moments``."""
         found = Parameters({}, self.rates, self.decay, self._roles)
         found._tensors = self._tensors | {name: _leaf(x) for name, x in values.items()}
@@ -121,7 +141,8 @@ def _leaf(x: Tensor) -> Tensor:
 
 
 def _moments_of(x: Tensor, source: Tensor, is_new: Tensor) -> Tensor:
-    """Return the moments ``x`` of rows ``source``; those of new rows, whose source need not exist, are 0."""
+    """Return the moments ``x`` of rows ``source``; those of new rows, whose source need not exist,
+    are 0."""
     moved = x.new_zeros(len(source), *x.shape[1:])
     moved[~is_new] = x[source[~is_new]]
     return moved

@@ -20,8 +20,9 @@ from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import Blended, BlendOptions, Tally, blend_and_tally, rasterize, tally
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
-"""Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour models other than
-harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but must be finite."""
+"""Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour
+models other than harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but
+must be finite."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,13 @@ class RenderOptions(DrawOptions):
         sh_degree: highest degree used; None = that of the Gaussians.
         alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
         absgrad: fill the absolute part of the probe's gradient.
-        nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or it is not looked
-            for (``trust``; the trainer does this, because its optimizer never writes such values).
+        nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``),
+            or it is not looked for (``trust``; the trainer does this, because its optimizer never
+            writes such values).
 
     Raises:
-        DyngsError: a number that is negative, NaN or beyond its range, or a choice that does not exist.
+        DyngsError: a number that is negative, NaN or beyond its range, or a choice that does not
+            exist.
     """
 
     far: float = 1e10
@@ -69,7 +72,9 @@ class RenderOptions(DrawOptions):
     @property
     def projection(self) -> ProjectionOptions:
         antialiased = self.mode == RasterizeMode.ANTIALIASED
-        return ProjectionOptions(self.eps2d, self.near, self.far, self.alpha_min, antialiased=antialiased)
+        return ProjectionOptions(
+            self.eps2d, self.near, self.far, self.alpha_min, antialiased=antialiased
+        )
 
     @property
     def blending(self) -> BlendOptions:
@@ -94,8 +99,8 @@ def render(
 ) -> GaussianRendering:
     """Return images of the Gaussians from every camera (Kerbl et al. 2023).
 
-    Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the probe and what the
-    shader computes.
+    Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the
+    probe and what the shader computes.
 
     Example::
 
@@ -111,20 +116,23 @@ def render(
         image = dyngs.render(scene.gaussians, cameras).rgb[0]  # (48, 64, 3)
 
     Args:
-        gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).
+        gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in
+            float32).
         cameras: V cameras, on the device of the Gaussians.
         background: (3,) or (V, 3) colour; None = black.
         probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
         shader: gives the colours; None: the Gaussians' harmonics do.
 
     Raises:
-        DyngsError: NaN or infinite input (names the argument and the count), focal lengths that are not positive, a
-            background or probe of another shape, cameras on another device than the Gaussians, or a render too large
-            for memory.
+        DyngsError: NaN or infinite input (names the argument and the count), focal lengths that are
+            not positive, a background or probe of another shape, cameras on another device than the
+            Gaussians, or a render too large for memory.
     """
     gaussians, cameras = _checked(gaussians, cameras, background, options)
     if probe is not None and probe.shape != (len(cameras), len(gaussians), 4):
-        raise DyngsError(f"probe must be ({len(cameras)}, {len(gaussians)}, 4), got {tuple(probe.shape)}")
+        raise DyngsError(
+            f"probe must be ({len(cameras)}, {len(gaussians)}, 4), got {tuple(probe.shape)}"
+        )
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
     if options.nonfinite != "trust":
@@ -132,10 +140,18 @@ def render(
     if background is not None:
         background = background.to(colors).expand(len(cameras), 3)
     if options.depth != "none":
-        colors, background = _with_depth(colors, projection.depths, background, weights=_needs_weights(options))
+        colors, background = _with_depth(
+            colors, projection.depths, background, weights=_needs_weights(options)
+        )
     size = (cameras.width, cameras.height)
     blended = rasterize(
-        projection, opacities, colors, size, background=background, probe=probe, options=options.blending
+        projection,
+        opacities,
+        colors,
+        size,
+        background=background,
+        probe=probe,
+        options=options.blending,
     )
     depth = None
     if options.depth != "none":
@@ -147,7 +163,8 @@ def render(
 
 
 def _needs_weights(options: RenderOptions) -> bool:
-    """Return whether alpha is summed from the weights, one more channel to blend, instead of 1 - transmittance.
+    """Return whether alpha is summed from the weights, one more channel to blend, instead of 1 -
+    transmittance.
 
     Below 1/255 the latter has fewer than four digits left.
     """
@@ -157,15 +174,19 @@ def _needs_weights(options: RenderOptions) -> bool:
 def _with_depth(
     colors: Tensor, depths: Tensor, background: Tensor | None, *, weights: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Return channels (V, N, D) with depth appended, and 1 if the sum of ``weights`` is wanted, on backgrounds of 0."""
+    """Return channels (V, N, D) with depth appended, and 1 if the sum of ``weights`` is wanted, on
+    backgrounds of 0."""
     more = [depths[..., None]] + ([torch.ones_like(depths)[..., None]] if weights else [])
     if background is not None:
         background = torch.nn.functional.pad(background, (0, len(more)))
     return torch.cat([colors, *more], dim=-1), background
 
 
-def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:
-    """Return the (V, N) sums over pixels of each Gaussian's blending weight: its fraction of every image.
+def contributions(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()
+) -> Tensor:
+    """Return the (V, N) sums over pixels of each Gaussian's blending weight: its fraction of every
+    image.
 
     Example::
 
@@ -186,10 +207,12 @@ def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions
 def depths_and_contributions(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()
 ) -> tuple[Blended, Tensor]:
-    """Return images (V, H, W, 1) of the depth, summed times the weight, and the (V, N) ``contributions``."""
+    """Return images (V, H, W, 1) of the depth, summed times the weight, and the (V, N)
+    ``contributions``."""
     gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
     projection, opacities = _project(gaussians, cameras, options)
-    size, depths = (cameras.width, cameras.height), projection.depths[..., None]
+    size = (cameras.width, cameras.height)
+    depths = projection.depths[..., None]
     return blend_and_tally(projection, opacities, depths, size, Tally.WEIGHTS, options.blending)
 
 
@@ -210,30 +233,46 @@ def sensitivities(
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
     if background is not None:
         background = background.to(colors).expand(len(cameras), 3)
-    size, kind = (cameras.width, cameras.height), Tally.SQUARED_SLOPES
-    return tally(projection, opacities, size, kind, options.blending, colors=colors, background=background)
+    size = (cameras.width, cameras.height)
+    kind = Tally.SQUARED_SLOPES
+    return tally(
+        projection, opacities, size, kind, options.blending, colors=colors, background=background
+    )
 
 
 def _colors(
-    gaussians: Gaussians, cameras: Cameras, radii: Tensor, options: RenderOptions, shader: Shader | None
+    gaussians: Gaussians,
+    cameras: Cameras,
+    radii: Tensor,
+    options: RenderOptions,
+    shader: Shader | None,
 ) -> Tensor:
     if shader is not None:
         return shader(gaussians, cameras, radii)
-    degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
+    degree = (
+        gaussians.sh_degree
+        if options.sh_degree is None
+        else min(options.sh_degree, gaussians.sh_degree)
+    )
     return evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, radii, degree)
 
 
 def _finite_colors(colors: Tensor, policy: str) -> Tensor:
-    """Return ``colors`` with overflow dealt with: they may overflow though all that they come from is finite."""
+    """Return ``colors`` with overflow dealt with: they may overflow though all that they come from
+    is finite."""
     if policy == "error":
         check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
         return colors
     return torch.where(colors.isfinite(), colors, torch.zeros_like(colors))
 
 
-def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Projection, Tensor]:
+def _project(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions
+) -> tuple[Projection, Tensor]:
     opacities = gaussians.opacities
-    projection = project(gaussians.means, gaussians.quats, gaussians.scales, opacities, cameras, options.projection)
+    projection = project(
+        gaussians.means, gaussians.quats, gaussians.scales, opacities, cameras, options.projection
+    )
     per_view = opacities.expand(len(cameras), -1)
     if options.mode == RasterizeMode.ANTIALIASED:
         per_view = per_view * projection.compensations
@@ -243,7 +282,9 @@ def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> 
 def _one_dtype(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
     dtype = torch.float64 if gaussians.means.dtype == torch.float64 else torch.float32
     if any(x.dtype != dtype for x in gaussians.tensors().values()):
-        gaussians = gaussians.replace(**{name: x.to(dtype) for name, x in gaussians.tensors().items()})
+        gaussians = gaussians.replace(
+            **{name: x.to(dtype) for name, x in gaussians.tensors().items()}
+        )
     if cameras.cam_from_world.dtype != dtype or cameras.intrinsics.dtype != dtype:
         cameras = cameras.to(dtype=dtype)
     return gaussians, cameras
@@ -268,7 +309,9 @@ def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
     # log_scales can be finite and the scales not: from 88.8 in float32
     watched = {**gaussians.tensors(), "exp(log_scales)": gaussians.scales.detach()}
     if policy == "error":
-        check_finite(watched, 'clean the input, or render with nonfinite="skip" to leave these Gaussians out')
+        check_finite(
+            watched, 'clean the input, or render with nonfinite="skip" to leave these Gaussians out'
+        )
         return gaussians
     keep = finite_rows(list(watched.values()))
     if bool(keep.all()):
@@ -277,6 +320,7 @@ def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
     for name, x in gaussians.tensors().items():
         mask = keep.view(-1, *[1] * (x.ndim - 1))
         cleaned[name] = torch.where(mask, x, torch.zeros_like(x))
-    hidden = torch.full_like(gaussians.logit_opacities, -1e4)  # opacity exactly 0: culled, no gradient
+    # opacity exactly 0: culled, no gradient
+    hidden = torch.full_like(gaussians.logit_opacities, -1e4)
     cleaned["logit_opacities"] = torch.where(keep, cleaned["logit_opacities"], hidden)
     return Gaussians(**cleaned)

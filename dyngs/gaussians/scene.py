@@ -1,8 +1,8 @@
 """Scenes that can be trained and drawn: N Gaussians with their motion and colours.
 
-There is one class per kind of model: ``static.scene.StaticScene``, ``deform.scene.DynamicScene`` and
-``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the same class. How it is
-trained is the business of ``gaussians.model``.
+There is one class per kind of model: ``static.scene.StaticScene``, ``deform.scene.DynamicScene``
+and ``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the
+same class. How it is trained is the business of ``gaussians.model``.
 """
 
 from __future__ import annotations
@@ -55,9 +55,11 @@ class GaussianScene(Renderable):
         gaussians = scene.at(0.5)
 
     Attributes:
-        gaussians: as stored: canonical, or at rest. In training they are the optimizer's leaf tensors.
+        gaussians: as stored: canonical, or at rest. In training they are the optimizer's leaf
+            tensors.
         colour: network that colours them; None: their harmonics do.
-        masks: which Gaussians are seen around a time; None: all may be, at all times. Only where a field moves some.
+        masks: which Gaussians are seen around a time; None: all may be, at all times. Only where a
+            field moves some.
     """
 
     gaussians: Gaussians
@@ -76,7 +78,8 @@ class GaussianScene(Renderable):
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) box of the finite centres at the first time; of a point at the origin where there are none."""
+        """(2, 3) box of the finite centres at the first time; of a point at the origin where there
+        are none."""
         means = self.at(None).means
         means = means[means.isfinite().all(1)]
         return torch.stack([means.amin(0), means.amax(0)]) if len(means) else means.new_zeros(2, 3)
@@ -96,7 +99,8 @@ class GaussianScene(Renderable):
 
     @property
     def offset_rows(self) -> Tensor:
-        """(M',) ascending indices of the Gaussians whose axes or attributes a field changes one by one."""
+        """(M',) ascending indices of the Gaussians whose axes or attributes a field changes one by
+        one."""
         return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
 
     @property
@@ -106,7 +110,8 @@ class GaussianScene(Renderable):
 
     @property
     def num_colour_values(self) -> int:
-        """Number of values stored for colours: base, network, and the rest of Gaussians where it is not all zero."""
+        """Number of values stored for colours: base, network, and the rest of Gaussians where it is
+        not all zero."""
         sh = self.gaussians.sh
         with_rest = int((sh[:, 1:] != 0).flatten(1).any(1).sum())
         network = 0 if self.colour is None else self.colour.num_values
@@ -152,14 +157,18 @@ class GaussianScene(Renderable):
         """
         now = time if isinstance(time, GaussianTimeStep) else self.time_step(_number(time))
         behind = self.background if background is None else background
-        how, device = self.options if options is None else options, now.gaussians.means.device
+        how = self.options if options is None else options
+        device = now.gaussians.means.device
         if cameras.cam_from_world.device != device:
             cameras = cameras.to(device=device)
-        return render(now.gaussians, cameras, how, background=behind, probe=probe, shader=self.shader(now))
+        return render(
+            now.gaussians, cameras, how, background=behind, probe=probe, shader=self.shader(now)
+        )
 
     @abstractmethod
     def edited(self: S, edit: TopologyEdit) -> S:
-        """Return the scene after a change of the set of Gaussians; everything stored per Gaussian follows it."""
+        """Return the scene after a change of the set of Gaussians; everything stored per Gaussian
+        follows it."""
 
     def select(self: S, index: Tensor) -> S:
         """Return the scene with only the Gaussians at ``index`` (long or bool)."""
@@ -188,8 +197,12 @@ class GaussianScene(Renderable):
         self._derived.clear()
 
     def state(self) -> State:
-        return prefixed("gaussians", with_role(self.gaussians.detach().tensors(), Role.PER_GAUSSIAN)) | prefixed(
-            "model", self._model_state() | ({} if self.colour is None else prefixed("colour", self.colour.state()))
+        return prefixed(
+            "gaussians", with_role(self.gaussians.detach().tensors(), Role.PER_GAUSSIAN)
+        ) | prefixed(
+            "model",
+            self._model_state()
+            | ({} if self.colour is None else prefixed("colour", self.colour.state())),
         )
 
     @abstractmethod
@@ -200,7 +213,9 @@ class GaussianScene(Renderable):
 def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
     """Return ``scene`` if it is made of Gaussians."""
     if not isinstance(scene, GaussianScene):
-        raise DyngsError(f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed")
+        raise DyngsError(
+            f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed"
+        )
     return scene
 
 
@@ -213,10 +228,14 @@ def drawn_as_trained(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
     info = checkpoint.info
     colour = network_of(checkpoint.part("model.colour"))
     options = render_options(model, info.extent, info.world_scale)
-    return replace(scene, colour=colour, options=options, background=background_colour(info.background))
+    return replace(
+        scene, colour=colour, options=options, background=background_colour(info.background)
+    )
 
 
-def render_options(model: SceneModel, extent: float = TYPICAL_EXTENT, world_scale: float = 1.0) -> RenderOptions:
+def render_options(
+    model: SceneModel, extent: float = TYPICAL_EXTENT, world_scale: float = 1.0
+) -> RenderOptions:
     """Return how a model is drawn.
 
     Args:
@@ -234,9 +253,13 @@ def render_options(model: SceneModel, extent: float = TYPICAL_EXTENT, world_scal
 
 def times_state(times: tuple[float, ...]) -> State:
     """Return the state of the training times, empty without any."""
-    return with_role({"times": torch.tensor(times, dtype=torch.float64, device="cpu")} if times else {}, Role.SHARED)
+    return with_role(
+        {"times": torch.tensor(times, dtype=torch.float64, device="cpu")} if times else {},
+        Role.SHARED,
+    )
 
 
 def stored_times(tensors: Mapping[str, Tensor]) -> tuple[float, ...]:
-    """Return the training times of a state. Raises ValueError for times that do not ascend within [0, 1]."""
+    """Return the training times of a state. Raises ValueError for times that do not ascend within
+    [0, 1]."""
     return tuple(require_moments("times", tensors["times"]).tolist()) if "times" in tensors else ()

@@ -1,4 +1,5 @@
-"""The surface that Gaussians show: their depths in many views, averaged on a grid, cut by marching cubes."""
+"""The surface that Gaussians show: their depths in many views, averaged on a grid, cut by marching
+cubes."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from dyngs.models.surface import Surface
 
 CELLS = 192  # Along the longest side of the box, unless asked otherwise
 INNER = 0.005  # Fraction of the Gaussians on either side that does not count for where the scene is
-MARGIN, REACH = 0.02, 2.5  # Around the centres: of the scene's size, and in standard deviations of a usual Gaussian
+# Around the centres: of the scene's size, and in standard deviations of a usual Gaussian
+MARGIN, REACH = 0.02, 2.5
 SMALLEST_PIECE = 0.02  # Faces of a piece that is kept, as a fraction of those of the largest
 
 
@@ -31,10 +33,11 @@ def surface_of(
     *,
     cells: int | None = None,
 ) -> Surface:
-    """Return the surface at ``time`` that ``cameras``, one view each, see in ``box``, two corners (3,) in the world.
+    """Return the surface at ``time`` that ``cameras``, one view each, see in ``box``, two corners
+    (3,) in the world.
 
-    Where nothing is seen the surface ends, and pieces with less than a fiftieth of the faces of the largest are left
-    out.
+    Where nothing is seen the surface ends, and pieces with less than a fiftieth of the faces of the
+    largest are left out.
 
     Args:
         cells: along the longest side of the box; None: ``CELLS``.
@@ -46,7 +49,9 @@ def surface_of(
     seen = [seen_by(scene, camera, time) for camera in cameras]
     mesh = fused(seen, *box, cells, unseen_is_solid=False)
     if mesh is None:
-        raise DyngsError("no surface: none of the views shows anything solid where the Gaussians are")
+        raise DyngsError(
+            "no surface: none of the views shows anything solid where the Gaussians are"
+        )
     mesh = largest_pieces(mesh)
     size = float((box[1] - box[0]).max()) / cells
     colours = colours_of(seen, torch.from_numpy(mesh.vertices).float(), 2 * size)
@@ -54,12 +59,15 @@ def surface_of(
 
 
 def seen_by(scene: GaussianScene, camera: Cameras, time: float | None = None) -> Seen:
-    """Return what one camera sees of a scene; colours are those of what is there, without the background."""
+    """Return what one camera sees of a scene; colours are those of what is there, without the
+    background."""
     options = replace(scene.options, depth="expected")
     drawn = scene.render(camera, time, options=options, background=torch.zeros(3, device="cpu"))
     assert drawn.depth is not None
     opacity = 1 - drawn.transmittance[0]
-    return Seen(camera, drawn.depth[0], opacity, drawn.rgb[0] / opacity.clamp_min(OPAQUE)[..., None])
+    return Seen(
+        camera, drawn.depth[0], opacity, drawn.rgb[0] / opacity.clamp_min(OPAQUE)[..., None]
+    )
 
 
 def opaque_box(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
@@ -74,7 +82,8 @@ def opaque_box(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
 
 
 def _quantile(values: Tensor, fraction: float) -> Tensor:
-    """Return the (3,) quantile of ``values`` (N, 3), any N >= 1; torch's own takes 16 million at most."""
+    """Return the (3,) quantile of ``values`` (N, 3), any N >= 1; torch's own takes 16 million at
+    most."""
     return values.sort(dim=0).values[round(fraction * (len(values) - 1))]
 
 

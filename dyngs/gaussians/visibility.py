@@ -1,4 +1,5 @@
-"""Visibility of Gaussians over time: bits at key times (the temporal filter of 4DGS-1K, Yuan et al. 2025).
+"""Visibility of Gaussians over time: bits at key times (the temporal filter of 4DGS-1K, Yuan et al.
+2025).
 
 Local letters: K key times, A Gaussians active at a time.
 """
@@ -35,11 +36,13 @@ class VisibilityMasks:
         return _unpacked(self.bits, self.count)
 
     def interval(self, time: float) -> int:
-        """Return k with ``time`` between key times k and k + 1, the nearest two where it lies outside all."""
+        """Return k with ``time`` between key times k and k + 1, the nearest two where it lies
+        outside all."""
         return min(max(bisect_right(self.times, time) - 1, 0), len(self.times) - 2)
 
     def active(self, interval: int) -> Tensor:
-        """Return (A,) ascending indices of the Gaussians seen at one end of an interval at least."""
+        """Return (A,) ascending indices of the Gaussians seen at one end of an interval at
+        least."""
         either = self.bits[interval] | self.bits[interval + 1]
         return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
 
@@ -56,7 +59,8 @@ class VisibilityMasks:
         """Return the masks of a state that ``state()`` returned; None of an empty one."""
         if not state:
             return None
-        times, bits = state["times"], state["bits"]
+        times = state["times"]
+        bits = state["bits"]
         count = int(state["count"]) if count is None else count
         ascends = times.ndim == 1 and len(times) > 1 and bool((times[1:] > times[:-1]).all())
         of_all = bits.dtype == torch.uint8 and bits.shape == (times.numel(), -(-count // BITS))
@@ -66,7 +70,8 @@ class VisibilityMasks:
 
 
 def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the positions of common indices in ``rows`` and in ``active``, both ascending indices below ``count``."""
+    """Return the positions of common indices in ``rows`` and in ``active``, both ascending indices
+    below ``count``."""
     place = torch.full((count,), -1, device=rows.device)
     place[rows] = torch.arange(len(rows), device=rows.device)
     found = place[active]

@@ -25,7 +25,15 @@ from dyngs.gps.pairs import MAX_ANGLE, Pair, lessons, neighbours, well_spread
 from dyngs.gps.rectification import RectifiedPair, cropped, is_inside, rectified
 from dyngs.gps.surface import GpsNetwork, gaussians_of, offset_loss
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, of_moment, random_index
+from dyngs.models.prediction import (
+    Example,
+    Learner,
+    Predictor,
+    image_loss,
+    load_weights,
+    of_moment,
+    random_index,
+)
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
@@ -71,21 +79,31 @@ class GpsPredictor:
     def chosen(self, count: int) -> list[int]:
         return well_spread(self.views, count)
 
-    def adapt(self, views: Sequence[int], steps: int | None = None, report: ReportProgress = report_nothing) -> int:
+    def adapt(
+        self,
+        views: Sequence[int],
+        steps: int | None = None,
+        report: ReportProgress = report_nothing,
+    ) -> int:
         if steps:
-            raise DyngsError(f"--steps {steps}: gps is not trained on the images of one person; leave it out")
+            raise DyngsError(
+                f"--steps {steps}: gps is not trained on the images of one person; leave it out"
+            )
         return 0
 
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> StaticScene:
         pairs = neighbours(self.name, self.views, views)
         loader = ImageLoader(self.views, self.data)
-        images, found, centers = {i: loader[i] for i in views}, [], []
+        images = {i: loader[i] for i in views}
+        found = []
+        centers = []
         for pair in pairs:
             both = images[pair.left], images[pair.right]
             found.append(self._seen_in(*both))
             centers.append(torch.cat([image.cameras.centers for image in both]).mean(0))
-        gaussians, background = Gaussians.joined(found), evaluation_background(self.config.data.background, True)[1]
+        gaussians = Gaussians.joined(found)
+        background = evaluation_background(self.config.data.background, True)[1]
         if not len(gaussians):
             raise DyngsError(
                 f"{self.name}: no surface is found inside the silhouettes; is a mask or the calibration wrong?"
@@ -108,7 +126,9 @@ class GpsPredictor:
         preset = load_config(packaged_preset("static"), ["data.root=."])
         same = ("near", "eps2d", "rasterize_mode", "sh_degree")
         model = preset.model.model_copy(update={name: getattr(self.model, name) for name in same})
-        times = distinct_times(all_views({k: x for k, x in self.capture.splits.items() if k != "pose"}))
+        times = distinct_times(
+            all_views({k: x for k, x in self.capture.splits.items() if k != "pose"})
+        )
         data = of_moment(self.data, self.views[views[0]].time, times.values())
         return preset.model_copy(update={"data": data, "model": model})
 
@@ -117,13 +137,19 @@ class GpsPredictor:
 
 
 class GpsLearner(Learner[GpsNetwork]):
-    """See ``Learner``: at first only depth is learned, from depth maps, then also the images of views in between."""
+    """See ``Learner``: at first only depth is learned, from depth maps, then also the images of
+    views in between."""
 
     def __init__(
-        self, config: Config, network: GpsNetwork, people: Sequence[DataConfig], device: torch.device = CPU
+        self,
+        config: Config,
+        network: GpsNetwork,
+        people: Sequence[DataConfig],
+        device: torch.device = CPU,
     ) -> None:
         self.config, self.network, self.device = config, network, device
-        self.model, self._people = _section(config), people
+        self.model = _section(config)
+        self._people = people
         self.names = [person.root.name for person in people]
         chosen = config.data.background
         self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
@@ -135,7 +161,8 @@ class GpsLearner(Learner[GpsNetwork]):
         pair, between = lesson.pairs[random_index(len(lesson.pairs), generator)]
         target = between[random_index(len(between), generator)]
         background = sent(background_colour(self.background, generator), self.device)
-        left, right = lesson.images[pair.left], lesson.images[pair.right]
+        left = lesson.images[pair.left]
+        right = lesson.images[pair.right]
         both = fields_moved_to(rectified(left, right, self.model.person_px), self.device)
         only_depth = step <= round(self.model.depth_fraction * self.config.train.steps)
         surface = self.network(both, with_gaussians=not only_depth)
@@ -146,9 +173,14 @@ class GpsLearner(Learner[GpsNetwork]):
         gaussians = gaussians_of(both, surface)
         image = cropped(lesson.images[target], _AROUND).to(self.device)
         options = replace(render_options(self.model), nonfinite="trust")
-        drawn = StaticScene(gaussians=gaussians).render(image.cameras, options=options, background=background)
+        drawn = StaticScene(gaussians=gaussians).render(
+            image.cameras, options=options, background=background
+        )
         truth = image.composite(background)
-        loss = image_loss(drawn.rgb[0], drawn.alpha[0], image, truth, self.config.train) + DEPTH_WEIGHT * depth_loss
+        loss = (
+            image_loss(drawn.rgb[0], drawn.alpha[0], image, truth, self.config.train)
+            + DEPTH_WEIGHT * depth_loss
+        )
         return Example(loss, image, drawn.rgb[0].detach(), truth, len(gaussians))
 
     def _open_person(self, person: int) -> Lessons:
@@ -178,12 +210,15 @@ def _lessons(data: DataConfig) -> Lessons:
 def _usable(capture: Capture, data: DataConfig) -> Capture:
     """Return ``capture``. Raises DyngsError: it has no silhouettes."""
     if not capture.has_alpha:
-        raise DyngsError(f"{data.root}: the images have no silhouettes; give them alpha, see docs/human.md")
+        raise DyngsError(
+            f"{data.root}: the images have no silhouettes; give them alpha, see docs/human.md"
+        )
     return capture
 
 
 def _picture(pair: RectifiedPair, offsets: Tensor | None) -> Tensor:
-    """Return (H, W, 3) offsets of the left view as a picture, grey in the middle, black outside of the person."""
+    """Return (H, W, 3) offsets of the left view as a picture, grey in the middle, black outside of
+    the person."""
     assert offsets is not None
     grey = (0.5 + offsets[0, 0] / pair.shift).nan_to_num(0.0).clamp(0, 1) * pair.solid[0, 0]
     return grey[..., None].expand(-1, -1, 3)

@@ -27,12 +27,16 @@ class Pair:
 
 
 def neighbours(name: str, views: Sequence[View], chosen: Sequence[int]) -> list[Pair]:
-    """Return pairs of the ``chosen`` views that are next to each other on their ring, all around where it is closed.
+    """Return pairs of the ``chosen`` views that are next to each other on their ring, all around
+    where it is closed.
 
-    Raises DyngsError, for the capture ``name``: fewer than two views, or one without a neighbour that suits.
+    Raises DyngsError, for the capture ``name``: fewer than two views, or one without a neighbour
+    that suits.
     """
     if len(chosen) < 2:
-        raise DyngsError(f"{name}: depth comes from two neighbouring views at least, not one; give --views A,B")
+        raise DyngsError(
+            f"{name}: depth comes from two neighbouring views at least, not one; give --views A,B"
+        )
     ordered = around(views, chosen)
     steps = [*pairwise(ordered), *([(ordered[-1], ordered[0])] if len(ordered) > 2 else [])]
     faults = {step: fault(views[step[0]], views[step[1]]) for step in steps}
@@ -63,11 +67,16 @@ def fault(one: View, other: View) -> str | None:
 
 def angle(one: View, other: View) -> float:
     """Return the angle between the view axes, degrees."""
-    return float(np.degrees(np.arccos(np.clip(one.cam_from_world[2, :3] @ other.cam_from_world[2, :3], -1, 1))))
+    return float(
+        np.degrees(
+            np.arccos(np.clip(one.cam_from_world[2, :3] @ other.cam_from_world[2, :3], -1, 1))
+        )
+    )
 
 
 def around(views: Sequence[View], chosen: Sequence[int]) -> list[int]:
-    """Return the ``chosen`` views in their order around the vertical, which is the mean of what is up in the images."""
+    """Return the ``chosen`` views in their order around the vertical, which is the mean of what is
+    up in the images."""
     poses = np.stack([views[i].cam_from_world for i in chosen])
     up = -poses[:, 1, :3].mean(0)
     up = up / max(np.linalg.norm(up), 1e-12)
@@ -78,22 +87,30 @@ def around(views: Sequence[View], chosen: Sequence[int]) -> list[int]:
 
 
 def well_spread(views: Sequence[View], count: int) -> list[int]:
-    """Return ``count`` views of the moment that most views show: two neighbours, or some evenly around the ring."""
+    """Return ``count`` views of the moment that most views show: two neighbours, or some evenly
+    around the ring."""
     moments = [(view.frame, view.time) for view in views]
     same = max(dict.fromkeys(moments), key=moments.count)
     ordered = around(views, [i for i, moment in enumerate(moments) if moment == same])
     if count != 2:
-        return sorted({ordered[round(i * len(ordered) / count) % len(ordered)] for i in range(count)})
+        return sorted(
+            {ordered[round(i * len(ordered) / count) % len(ordered)] for i in range(count)}
+        )
     pairs = [(a, b) for a, b in combinations(ordered, 2) if fault(views[a], views[b]) is None]
-    by_angle = sorted(pairs, key=lambda pair: abs(angle(views[pair[0]], views[pair[1]]) - _BEST_ANGLE))
+    by_angle = sorted(
+        pairs, key=lambda pair: abs(angle(views[pair[0]], views[pair[1]]) - _BEST_ANGLE)
+    )
     return list(by_angle[0]) if by_angle else ordered[:2]
 
 
 def lessons(views: Sequence[View]) -> list[tuple[Pair, list[int]]]:
-    """Return the pairs to train on, each with the views that stand between its two, of which there is at least one."""
+    """Return the pairs to train on, each with the views that stand between its two, of which there
+    is at least one."""
     found: list[tuple[Pair, list[int]]] = []
     for moment in dict.fromkeys((view.frame, view.time) for view in views):
-        ring = around(views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment])
+        ring = around(
+            views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment]
+        )
         for start, first in enumerate(ring):
             for step in range(2, len(ring)):
                 last = ring[(start + step) % len(ring)]

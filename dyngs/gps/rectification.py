@@ -1,10 +1,12 @@
-"""Two views of a person turned so that rows correspond, and the depth that a shift along a row means.
+"""Two views of a person turned so that rows correspond, and the depth that a shift along a row
+means.
 
-Both cameras are turned, in place, to look at right angles to the line between them (Fusiello et al. 2000), and get a
-window each of the same focal length, around the person. A point at depth z is seen in the left window at x0 = f X / z +
-cx0, in the right one at x1 = f (X - B) / z + cx1, B the distance of the cameras. Its disparity f B / z is ``shift`` + d
-with shift = cx1 - cx0, which is that of the middle of the person; d, the offset, is what the network finds. It is
-positive where the surface is nearer than the middle, in both views: x1 = x0 - d, x0 = x1 + d.
+Both cameras are turned, in place, to look at right angles to the line between them (Fusiello et al.
+2000), and get a window each of the same focal length, around the person. A point at depth z is seen
+in the left window at x0 = f X / z + cx0, in the right one at x1 = f (X - B) / z + cx1, B the
+distance of the cameras. Its disparity f B / z is ``shift`` + d with shift = cx1 - cx0, which is
+that of the middle of the person; d, the offset, is what the network finds. It is positive where the
+surface is nearer than the middle, in both views: x1 = x0 - d, x0 = x1 + d.
 
 Local letters: two views, left and right; windows of H x W pixels.
 """
@@ -28,8 +30,10 @@ SOLID = 0.5  # Alpha from which a pixel belongs to the person
 _REACHED = 0.1  # Alpha from which a point may be part of the person: outlines are not cut off
 _MARGIN = 8  # px around the person
 _FEWEST = 16  # Pixels of a person that can be rectified
-_SAME_HEIGHT = 0.08  # Largest difference of the rows where the person begins or ends, relative to the person's height
-_EDGE = 0.01  # Difference of depth, relative, from which neighbouring pixels belong to different surfaces
+# Largest difference of the rows where the person begins or ends, relative to the person's height
+_SAME_HEIGHT = 0.08
+# Difference of depth, relative, from which neighbouring pixels belong to different surfaces
+_EDGE = 0.01
 _LARGEST = 4.0  # Largest width of a window, relative to the person's height
 
 
@@ -40,11 +44,13 @@ class RectifiedPair:
     Attributes:
         rgb: (2, 3, H, W) colours, not multiplied by alpha.
         alpha: (2, 1, H, W).
-        offsets: (2, 1, H, W) true offset d in px, NaN where no depth map knows it; None without depth maps.
+        offsets: (2, 1, H, W) true offset d in px, NaN where no depth map knows it; None without
+            depth maps.
         rect_from_world: (3, 3) rotation of both windows.
         centers: (2, 3) of the cameras in the world.
         focal: focal length of both windows, px.
-        principal: (2, 2) cx and cy of the windows, px; the first pixel's centre is (0.5, 0.5); cy is the same.
+        principal: (2, 2) cx and cy of the windows, px; the first pixel's centre is (0.5, 0.5); cy
+            is the same.
         baseline: distance of the cameras, world units.
     """
 
@@ -68,11 +74,13 @@ class RectifiedPair:
         return self.principal[1, 0] - self.principal[0, 0]
 
     def depth(self, offsets: Tensor) -> Tensor:
-        """Return the depth of ``offsets`` of any shape, px, in the axes of the windows, world units."""
+        """Return the depth of ``offsets`` of any shape, px, in the axes of the windows, world
+        units."""
         return self.focal * self.baseline / (self.shift + offsets)
 
     def seen_by_other(self, offsets: Tensor) -> Tensor:
-        """Return the alpha (2, 1, H, W) of the other window where it shows what is at ``offsets``; differentiable."""
+        """Return the alpha (2, 1, H, W) of the other window where it shows what is at ``offsets``;
+        differentiable."""
         height, width = offsets.shape[2:]
         sides = offsets.new_tensor([1.0, -1.0])[:, None, None]
         column = torch.arange(width, device=offsets.device) + 0.5 - sides * offsets[:, 0]
@@ -89,7 +97,8 @@ class RectifiedPair:
 def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
     """Return the windows of two images in which the person is ``person_px`` pixels high.
 
-    Raises DyngsError: no silhouettes, or views that do not show the same person from where their cameras say.
+    Raises DyngsError: no silhouettes, or views that do not show the same person from where their
+    cameras say.
     """
     images = [_at_size(image, person_px) for image in (left, right)]
     poses = [image.cameras.cam_from_world[0].double() for image in images]
@@ -99,9 +108,14 @@ def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
     _require_same_person(boxes, left.name, right.name)
     height = float(boxes[:, 1, 1].max() - boxes[:, 1, 0].min())
     focal = person_px / height
-    size = [_rounded(focal * height), _rounded(focal * float((boxes[:, 0, 1] - boxes[:, 0, 0]).max()))]
+    size = [
+        _rounded(focal * height),
+        _rounded(focal * float((boxes[:, 0, 1] - boxes[:, 0, 0]).max())),
+    ]
     middle = torch.stack([boxes[:, 0].mean(1), boxes[:, 1].mean().expand(2)], dim=1)
-    principal = torch.tensor([size[1] / 2, size[0] / 2], dtype=torch.float64, device="cpu") - focal * middle
+    principal = (
+        torch.tensor([size[1] / 2, size[0] / 2], dtype=torch.float64, device="cpu") - focal * middle
+    )
     rays = _rays(principal, focal, (size[0], size[1]))
     baseline = float((centers[1] - centers[0]).norm())
     windows = [_window(image, turn, ray) for image, ray in zip(images, rays, strict=True)]
@@ -120,7 +134,8 @@ def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
 
 
 def _at_size(image: Image, person_px: int) -> Image:
-    """Return the image shrunk by a whole number where the person is at least twice as high as ``person_px``."""
+    """Return the image shrunk by a whole number where the person is at least twice as high as
+    ``person_px``."""
     if image.alpha is None or int((image.alpha > SOLID).sum()) < _FEWEST:
         raise DyngsError(
             f"{image.name}: shows no silhouette of a person; give it alpha or a mask of the person, see docs/human.md"
@@ -130,14 +145,16 @@ def _at_size(image: Image, person_px: int) -> Image:
 
 
 def _turn(centers: Tensor, forward: Tensor) -> Tensor:
-    """Return the rotation (3, 3) to axes along the line from left to right ``centers`` (2, 3), down and forward."""
+    """Return the rotation (3, 3) to axes along the line from left to right ``centers`` (2, 3), down
+    and forward."""
     across = torch.nn.functional.normalize(centers[1] - centers[0], dim=0)
     down = torch.nn.functional.normalize(torch.linalg.cross(forward, across), dim=0)
     return torch.stack([across, down, torch.linalg.cross(across, down)])
 
 
 def _box(image: Image, turn: Tensor) -> Tensor:
-    """Return the lowest and highest x and y (2, 2) of the person in the turned camera, at depth 1."""
+    """Return the lowest and highest x and y (2, 2) of the person in the turned camera, at depth
+    1."""
     assert image.alpha is not None
     rows, columns = (image.alpha > SOLID).nonzero(as_tuple=True)
     pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=1).double()
@@ -145,7 +162,9 @@ def _box(image: Image, turn: Tensor) -> Tensor:
     inverse = torch.linalg.inv(camera.intrinsics[0].double())
     seen = pixels @ inverse.T @ camera.cam_from_world[0, :3, :3].double() @ turn.T
     if bool((seen[:, 2] <= 0).any()):
-        raise DyngsError(f"{image.name}: looks along the line to the other camera; give two that look the same way")
+        raise DyngsError(
+            f"{image.name}: looks along the line to the other camera; give two that look the same way"
+        )
     flat = seen[:, :2] / seen[:, 2:]
     return torch.stack([flat.amin(0), flat.amax(0)], dim=1)
 
@@ -165,15 +184,24 @@ def _require_same_person(boxes: Tensor, left: str, right: str) -> None:
             "they do not show the same"
         )
     if float((boxes[:, 0, 1] - boxes[:, 0, 0]).max()) > _LARGEST * float(height):
-        raise DyngsError(f"{left} and {right}: the person is {_LARGEST:g} times as wide as high; is a mask wrong?")
+        raise DyngsError(
+            f"{left} and {right}: the person is {_LARGEST:g} times as wide as high; is a mask wrong?"
+        )
 
 
 def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return colours (3, H, W), alpha (1, H, W) and depth (1, H, W; NaN unknown) along ``rays`` (H, W, 3)."""
+    """Return colours (3, H, W), alpha (1, H, W) and depth (1, H, W; NaN unknown) along ``rays`` (H,
+    W, 3)."""
     camera = image.cameras
     seen = rays @ turn @ camera.cam_from_world[0, :3, :3].double().T
     projected = seen @ camera.intrinsics[0].double().T
-    grid = 2 * projected[..., :2] / projected[..., 2:] / projected.new_tensor([camera.width, camera.height]) - 1
+    grid = (
+        2
+        * projected[..., :2]
+        / projected[..., 2:]
+        / projected.new_tensor([camera.width, camera.height])
+        - 1
+    )
     grid = grid.float()[None]
     alpha = torch.ones_like(image.rgb_premultiplied[..., 0]) if image.alpha is None else image.alpha
     layers = torch.cat([image.rgb_premultiplied, alpha[..., None]], dim=2).permute(2, 0, 1)[None]
@@ -186,10 +214,11 @@ def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _depth_at(depth: Tensor, grid: Tensor) -> Tensor:
-    """Return a depth map (h, w) at the places ``grid`` (1, H, W, 2) as (1, H, W); NaN where it is unknown.
+    """Return a depth map (h, w) at the places ``grid`` (1, H, W, 2) as (1, H, W); NaN where it is
+    unknown.
 
-    Inverse depth is linear on planes, and is interpolated; at edges, where that would lie on neither side, the nearest
-    pixel counts.
+    Inverse depth is linear on planes, and is interpolated; at edges, where that would lie on
+    neither side, the nearest pixel counts.
     """
     known = depth > 0
     layers = torch.stack([torch.where(known, 1 / depth, 0), known.float()])[None]
@@ -214,19 +243,25 @@ def _rounded(pixels: float) -> int:
 
 
 def is_inside(image: Image, points: Tensor) -> Tensor:
-    """Return (N,) bool: whether an image shows the person, or reaches not, where ``points`` (N, 3) in the world are."""
+    """Return (N,) bool: whether an image shows the person, or reaches not, where ``points`` (N, 3)
+    in the world are."""
     assert image.alpha is not None
     camera = image.cameras
     pose = camera.cam_from_world[0]
     flat = (points @ pose[:3, :3].T + pose[:3, 3]) @ camera.intrinsics[0].T
-    place = flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / flat.new_tensor([camera.width, camera.height])
+    place = (
+        flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / flat.new_tensor([camera.width, camera.height])
+    )
     beyond = (flat[:, 2] <= 0) | ((place < 0) | (place > 1)).any(1)
-    alpha = grid_sample(image.alpha[None, None], (2 * place - 1)[None, None], align_corners=False)[0, 0, 0]
+    alpha = grid_sample(image.alpha[None, None], (2 * place - 1)[None, None], align_corners=False)[
+        0, 0, 0
+    ]
     return beyond | (alpha > _REACHED)
 
 
 def cropped(image: Image, margin: int) -> Image:
-    """Return the part of an image, with its camera, that shows what is not transparent, and ``margin`` px around it."""
+    """Return the part of an image, with its camera, that shows what is not transparent, and
+    ``margin`` px around it."""
     assert image.alpha is not None
     rows, columns = ((image.alpha > 0).any(side).nonzero()[:, 0] for side in (1, 0))
     if not len(rows):

@@ -1,4 +1,5 @@
-"""A Gaussian for every pixel of the person in two rectified views (GPS-Gaussian, Zheng et al. 2024).
+"""A Gaussian for every pixel of the person in two rectified views (GPS-Gaussian, Zheng et al.
+2024).
 
 Local letters: two views; windows of H x W pixels, N pixels of the person.
 """
@@ -23,8 +24,10 @@ from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
 HEADS = {"rotation": 4, "scale": 3, "opacity": 1}
 """Outputs per pixel and their number of channels."""
 LARGEST = 4.0
-"""Largest standard deviation, in pixels of the window at the depth of the pixel: 2 cm for a person of 256 px images."""
-_SCALE_LOGIT, _OPACITY_LOGIT = -1.95, 4.0  # Of an untrained network: half a pixel, nearly opaque
+"""Largest standard deviation, in pixels of the window at the depth of the pixel: 2 cm for a person
+of 256 px images."""
+_SCALE_LOGIT = -1.95
+_OPACITY_LOGIT = 4.0  # Of an untrained network: half a pixel, nearly opaque
 _DEPTH_WIDTHS = (16, 24, 32)  # Channels of the features of depth
 _LAST = 32  # Channels of the features that Gaussians are made from
 _RANGE = 64.0  # px; offsets are divided by it before they enter a network
@@ -42,7 +45,8 @@ class Surface:
 class GpsNetwork(nn.Module):
     """Depth and Gaussians of two rectified views; features of the images are shared by both tasks.
 
-    It works at half the resolution of the windows, of which it is given four pixels as one, and returns four as one.
+    It works at half the resolution of the windows, of which it is given four pixels as one, and
+    returns four as one.
     """
 
     def __init__(self, model: GpsModel, generator: torch.Generator) -> None:
@@ -82,11 +86,12 @@ class GpsNetwork(nn.Module):
 
 
 def gaussians_of(pair: RectifiedPair, surface: Surface) -> Gaussians:
-    """Return the Gaussians of the pixels of the person in both views, differentiable in ``surface``.
+    """Return the Gaussians of the pixels of the person in both views, differentiable in
+    ``surface``.
 
-    Means lie on the rays through the pixels, rotations are relative to the axes of the windows, colours are those of
-    the images. Outlines are as transparent as in the images; what the other view would show beside the person, wholly
-    (visual hull).
+    Means lie on the rays through the pixels, rotations are relative to the axes of the windows,
+    colours are those of the images. Outlines are as transparent as in the images; what the other
+    view would show beside the person, wholly (visual hull).
     """
     assert surface.raw is not None
     least = (_LEAST - 1) * pair.shift
@@ -119,7 +124,8 @@ def offset_loss(pair: RectifiedPair, offsets: Sequence[Tensor], decay: float) ->
     """
     assert pair.offsets is not None
     known = pair.solid & pair.offsets.isfinite()
-    truth, total = pair.offsets[known], torch.zeros((), device=pair.rgb.device)
+    truth = pair.offsets[known]
+    total = torch.zeros((), device=pair.rgb.device)
     for i, found in enumerate(reversed(offsets)):
         total = total + decay**i * (found[known] - truth).abs().mean()
     return total

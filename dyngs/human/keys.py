@@ -15,16 +15,24 @@ class _OnTemplate(SceneModel):
 
     is_posed: ClassVar[bool] = True
 
-    body: Path | None = Field(default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template")
-    uv: Path | None = Field(default=None, description=".obj with the texture coordinates of body; null: its own")
-    resolution: int = Field(default=128, ge=8, le=1024, description="texels per side of the template's texture atlas")
+    body: Path | None = Field(
+        default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template"
+    )
+    uv: Path | None = Field(
+        default=None, description=".obj with the texture coordinates of body; null: its own"
+    )
+    resolution: int = Field(
+        default=128, ge=8, le=1024, description="texels per side of the template's texture atlas"
+    )
 
 
 class HumanModel(_OnTemplate):
-    """A person: Gaussians on the texels of a body template, moved by its skeleton (docs/human.md)."""
+    """A person: Gaussians on the texels of a body template, moved by its skeleton
+    (docs/human.md)."""
 
     kind: Literal["human"] = Field(
-        default="human", description="one person: Gaussians on a body template, moved by its skeleton (docs/human.md)"
+        default="human",
+        description="one person: Gaussians on a body template, moved by its skeleton (docs/human.md)",
     )
     fit: bool = Field(
         default=True,
@@ -32,9 +40,12 @@ class HumanModel(_OnTemplate):
         "body parameters always is",
     )
     refine: bool = Field(
-        default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
+        default=True,
+        description="learn corrections of poses, skeleton and skinning weights with the Gaussians",
     )
-    refine_from: Fraction = Field(default=0.1, description="fraction of the run after which these are learned")
+    refine_from: Fraction = Field(
+        default=0.1, description="fraction of the run after which these are learned"
+    )
     light: bool = Field(
         default=True,
         description="learn light that is fixed in the world: colours depend on where the surface faces (with "
@@ -53,18 +64,25 @@ class HumanModel(_OnTemplate):
         default=2e-4, ge=0, description="weight of the squared distances from the scaffold, cm^2"
     )
     scale_weight: float = Field(
-        default=1e-2, ge=0, description="weight of the squared excess of log-scales over the texel's size"
+        default=1e-2,
+        ge=0,
+        description="weight of the squared excess of log-scales over the texel's size",
     )
     rigidity: float = Field(
-        default=1e-2, ge=0, description="weight of the squared change, by posing, of distances between neighbours, cm^2"
+        default=1e-2,
+        ge=0,
+        description="weight of the squared change, by posing, of distances between neighbours, cm^2",
     )
     smoothness: float = Field(
-        default=1e-3, ge=0, description="weight of the squared difference between neighbours' offsets, cm^2"
+        default=1e-3,
+        ge=0,
+        description="weight of the squared difference between neighbours' offsets, cm^2",
     )
 
 
 class HumanPredictorModel(_OnTemplate):
-    """A network that predicts people from a few images, trained on others (docs/people_network.md)."""
+    """A network that predicts people from a few images, trained on others
+    (docs/people_network.md)."""
 
     made_of_gaussians: ClassVar[bool] = False
     is_network: ClassVar[bool] = True
@@ -90,10 +108,14 @@ class HumanPredictorModel(_OnTemplate):
         description="images of a person that it is predicted from, at most; every other training example has fewer",
     )
     source_sets: int = Field(
-        default=6, ge=1, description="different choices of source views per person in training; their maps are cached"
+        default=6,
+        ge=1,
+        description="different choices of source views per person in training; their maps are cached",
     )
     target_views: int = Field(
-        default=2, ge=1, description="images of one time step that a prediction is compared with in each step"
+        default=2,
+        ge=1,
+        description="images of one time step that a prediction is compared with in each step",
     )
     widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
         default=(24, 32, 48, 64),

@@ -1,4 +1,5 @@
-"""What images show at points: features of their pixels, colours and silhouettes; and small networks.
+"""What images show at points: features of their pixels, colours and silhouettes; and small
+networks.
 
 Local letters: V images, M points, C features of a pixel, h x w and H x W pixels.
 """
@@ -38,12 +39,15 @@ class Perceptron(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Features of images (V, 4, H, W): ``features`` (V, C, H/4, W/4) that know their surroundings, and fine ones."""
+    """Features of images (V, 4, H, W): ``features`` (V, C, H/4, W/4) that know their surroundings,
+    and fine ones."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
         self.levels = Encoder(4, (16, 32, 48))
-        self.fuse = nn.Sequential(nn.Conv2d(80, features, 3, padding=1), nn.SiLU(), nn.Conv2d(features, features, 1))
+        self.fuse = nn.Sequential(
+            nn.Conv2d(80, features, 3, padding=1), nn.SiLU(), nn.Conv2d(features, features, 1)
+        )
         self.fine = nn.Conv2d(16, FINE, 3, padding=1)
 
     def forward(self, rgba: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,7 +100,8 @@ class Seen:
 
 
 def at_pixels(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
-    """Return (V, M, D) values of maps (V, D, h, w) at places (V, M, 2) in [-1, 1], 0 beside them."""
+    """Return (V, M, D) values of maps (V, D, h, w) at places (V, M, 2) in [-1, 1], 0 beside
+    them."""
     found = grid_sample(maps, grid[:, None], mode=mode, padding_mode="zeros", align_corners=False)
     return found[:, :, 0].mT
 
@@ -112,14 +117,20 @@ def begin(network: nn.Module, generator: torch.Generator) -> None:
 
 
 def mean_and_variance(values: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return (M, 2 D): mean and variance over views of values (V, M, D) with weights (V, M) that sum to 1."""
-    share = values.new_full((len(values), 1, 1), 1 / len(values)) if weights is None else weights[..., None]
+    """Return (M, 2 D): mean and variance over views of values (V, M, D) with weights (V, M) that
+    sum to 1."""
+    share = (
+        values.new_full((len(values), 1, 1), 1 / len(values))
+        if weights is None
+        else weights[..., None]
+    )
     mean = (share * values).sum(0)
     return torch.cat([mean, (share * (values - mean).square()).sum(0)], -1)
 
 
 def between(directions: Tensor, points: Tensor, centers: Tensor) -> Tensor:
-    """Return (V, M, 4): how the directions (M, 3) of rays differ from those of the images to points (M, 3).
+    """Return (V, M, 4): how the directions (M, 3) of rays differ from those of the images to points
+    (M, 3).
 
     The difference of the two unit vectors, and their product. ``centers`` (V, 3) of the cameras.
     """

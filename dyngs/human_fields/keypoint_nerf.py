@@ -1,8 +1,10 @@
-"""KeypointNeRF (Mihajlovic et al. 2022): a field whose points are placed by their depth relative to key points.
+"""KeypointNeRF (Mihajlovic et al. 2022): a field whose points are placed by their depth relative to
+key points.
 
-Samples lie where all images show the person. Per image, the network knows a sample by how much nearer or farther it is
-to that camera than each key point nearby, and by the features of the pixel; mean and variance over images give the
-density, and weights by which the colours of the images are blended.
+Samples lie where all images show the person. Per image, the network knows a sample by how much
+nearer or farther it is to that camera than each key point nearby, and by the features of the pixel;
+mean and variance over images give the density, and weights by which the colours of the images are
+blended.
 
 Local letters: V images, M samples, J key points, R rays.
 """
@@ -20,7 +22,15 @@ from dyngs.camera import Cameras
 from dyngs.fields.space import rays_of
 from dyngs.fields.thinning import kept_samples, reached_samples, thinned_samples
 from dyngs.human.template.joints import JOINT_PARENTS
-from dyngs.human_fields.features import FINE, Perceptron, Seen, begin, between, blended, mean_and_variance
+from dyngs.human_fields.features import (
+    FINE,
+    Perceptron,
+    Seen,
+    begin,
+    between,
+    blended,
+    mean_and_variance,
+)
 from dyngs.human_fields.keys import KeypointNerfModel
 from dyngs.human_fields.network import CHUNK, NEAR, FieldNetwork, Known, Picture
 from dyngs.human_fields.people import KEY_POINTS, Body, Sources
@@ -52,7 +62,8 @@ class KeypointNerf(FieldNetwork):
 
     def __init__(self, model: KeypointNerfModel, generator: torch.Generator) -> None:
         super().__init__(model.features)
-        width, colours = model.width, 3 + FINE + GEOMETRY
+        width = model.width
+        colours = 3 + FINE + GEOMETRY
         self.step = model.step
         self.per_image = Perceptron(CODE + model.features + FINE, width, width, POOLED)
         self.geometry = Perceptron(2 * POOLED + HINTS, width, width, 1 + GEOMETRY)
@@ -62,14 +73,17 @@ class KeypointNerf(FieldNetwork):
     def prepared(self, seen: Seen, body: Body) -> Hull:
         return hull(seen, body.key_points)
 
-    def picture(self, known: Known, camera: Cameras, generator: torch.Generator | None = None) -> Picture:
+    def picture(
+        self, known: Known, camera: Cameras, generator: torch.Generator | None = None
+    ) -> Picture:
         rays, _ = rays_of(camera)
         if generator is None:
             shifts = rays.origins.new_full((len(rays),), 0.5)
         else:
             shifts = torch.rand(len(rays), generator=generator, device="cpu").to(rays.origins)
         pieces = [len(rays)] if torch.is_grad_enabled() else [CHUNK] * -(-len(rays) // CHUNK)
-        found, first = [], 0
+        found = []
+        first = 0
         for size in pieces:
             some = slice(first, first + size)
             found.append(self._along(known, rays[some], shifts[some]))
@@ -79,12 +93,16 @@ class KeypointNerf(FieldNetwork):
         return Picture(colour.view(*shape, 3), through.view(shape), depth.view(shape))
 
     def _along(self, known: Known, rays: Rays, shifts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colours before black (R, 3), transmittance (R,), and sums of weight times distance (R,)."""
-        seen, own = known.seen, known.own
+        """Return colours before black (R, 3), transmittance (R,), and sums of weight times distance
+        (R,)."""
+        seen = known.seen
+        own = known.own
         samples = march(rays, shifts, own.space, own.occupied, Steps(NEAR, self.step))
         learns = torch.is_grad_enabled()
         with torch.no_grad():  # which samples are worth it takes their densities alone
-            samples = kept_samples(samples, (seen.alpha(places(samples, own.space)) > VISIBLE).all(0))[0]
+            samples = kept_samples(
+                samples, (seen.alpha(places(samples, own.space)) > VISIBLE).all(0)
+            )[0]
             points = places(samples, own.space)
             code = spatial_code(points, known.body.key_points, seen.sources)
             geometry = self._geometry(known, points, code)
@@ -92,7 +110,8 @@ class KeypointNerf(FieldNetwork):
                 samples, which = thinned_samples(density(geometry), samples, shifts)
             else:
                 samples, which = reached_samples(density(geometry), samples)
-            points, geometry = points[which], geometry[which]
+            points = points[which]
+            geometry = geometry[which]
         if learns:
             geometry = self._geometry(known, points, code[:, which])
         densities = density(geometry)
@@ -101,11 +120,13 @@ class KeypointNerf(FieldNetwork):
         return drawn.colour, drawn.transmittance, drawn.depth
 
     def _geometry(self, known: Known, points: Tensor, code: Tensor) -> Tensor:
-        """Return (M, 1 + GEOMETRY): raw densities, and what is known of the surface at points (M, 3).
+        """Return (M, 1 + GEOMETRY): raw densities, and what is known of the surface at points (M,
+        3).
 
         Densities begin with those of limbs of one thickness.
         """
-        looked, bone = known.seen.look(points), from_bones(points, known.body.key_points)[:, None]
+        looked = known.seen.look(points)
+        bone = from_bones(points, known.body.key_points)[:, None]
         per_image = self.per_image(torch.cat([code, looked.features], -1))
         held = torch.stack([looked.alpha.amin(0), looked.alpha.mean(0)], -1)
         hints = torch.cat([bone / REACH, (bone / REACH).square(), held], -1)
@@ -114,8 +135,11 @@ class KeypointNerf(FieldNetwork):
 
     def _colours(self, seen: Seen, geometry: Tensor, points: Tensor, directions: Tensor) -> Tensor:
         """Return (M, 3) colours: of the images, blended."""
-        looked, count = seen.look(points), len(seen.sources)
-        own = torch.cat([looked.rgb, looked.features[..., -FINE:], geometry[:, 1:].expand(count, -1, -1)], -1)
+        looked = seen.look(points)
+        count = len(seen.sources)
+        own = torch.cat(
+            [looked.rgb, looked.features[..., -FINE:], geometry[:, 1:].expand(count, -1, -1)], -1
+        )
         both = mean_and_variance(own).expand(count, -1, -1)
         apart = between(directions, points, seen.sources.centers)
         logits = self.blend(torch.cat([own, both, apart], -1))[..., 0]
@@ -129,15 +153,18 @@ def density(geometry: Tensor) -> Tensor:
 
 @torch.no_grad()
 def spatial_code(points: Tensor, key_points: Tensor, sources: Sources) -> Tensor:
-    """Return the code (V, M, CODE) of points (M, 3): their depths relative to each key point (J, 3), in each camera.
+    """Return the code (V, M, CODE) of points (M, 3): their depths relative to each key point (J,
+    3), in each camera.
 
-    dz, then sine and cosine of pi 2^l dz of each octave l, all times exp(-d^2 / (2 REACH^2)) with the distance d in m.
+    dz, then sine and cosine of pi 2^l dz of each octave l, all times exp(-d^2 / (2 REACH^2)) with
+    the distance d in m.
     """
     apart = points[:, None] - key_points
     weight = (-apart.square().sum(-1) / (2 * REACH**2)).exp()[None]
     axes = sources.cam_from_world[:, 2, :3]
     dz = (axes @ apart.view(-1, 3).T).view(len(axes), *apart.shape[:2])
-    sine, cosine = (math.pi * dz).sin(), (math.pi * dz).cos()
+    sine = (math.pi * dz).sin()
+    cosine = (math.pi * dz).cos()
     parts = [dz]
     for octave in range(OCTAVES):
         if octave:
@@ -152,7 +179,8 @@ def hull(seen: Seen, key_points: Tensor) -> Hull:
 
     They are no further than ``AROUND`` from the bones between the key points (J, 3).
     """
-    low, high = key_points.amin(0), key_points.amax(0)
+    low = key_points.amin(0)
+    high = key_points.amax(0)
     half = float((high - low).max()) / 2 + AROUND
     x, y, z = ((low + high) / 2).tolist()
     space = Space((x, y, z), half, 1, CELLS)
@@ -160,14 +188,19 @@ def hull(seen: Seen, key_points: Tensor) -> Hull:
     z, y, x = torch.meshgrid(*(axis + middle for middle in reversed(space.centre)), indexing="ij")
     middles = torch.stack([x, y, z], -1).view(-1, 3)
     grid, depth = seen.projected(middles)
-    sources, reach = seen.sources, half / CELLS * math.sqrt(3)
+    sources = seen.sources
+    reach = half / CELLS * math.sqrt(3)
     occupied = torch.ones(len(middles), dtype=torch.bool, device=low.device)
     for i in range(len(sources)):
         nearest = max(float(depth[i].min()), NEAR)
-        pixels = math.ceil(reach * float(sources.intrinsics[i, 0, 0]) / nearest) + 1  # that a cell may reach over
+        # that a cell may reach over
+        pixels = math.ceil(reach * float(sources.intrinsics[i, 0, 0]) / nearest) + 1
         alpha = max_pool2d(sources.rgba[i : i + 1, 3:], (2 * pixels + 1, 1), 1, (pixels, 0))
         alpha = max_pool2d(alpha, (1, 2 * pixels + 1), 1, (0, pixels))
-        occupied &= grid_sample(alpha, grid[i][None, None], mode="nearest", align_corners=False)[0, 0, 0] > VISIBLE
+        occupied &= (
+            grid_sample(alpha, grid[i][None, None], mode="nearest", align_corners=False)[0, 0, 0]
+            > VISIBLE
+        )
     where = occupied.nonzero()[:, 0]
     occupied[where] = from_bones(middles[where], key_points) < AROUND
     return Hull(space, occupied.view(space.shape))
@@ -177,7 +210,8 @@ def from_bones(points: Tensor, key_points: Tensor) -> Tensor:
     """Return the distance (M,) of points (M, 3) to the nearest bone, m; ``key_points`` (J, 3)."""
     nearest = (points - key_points[0]).norm(dim=1)
     for joint, parent in enumerate(JOINT_PARENTS[1 : len(key_points)], start=1):
-        start, along = key_points[parent], key_points[joint] - key_points[parent]
+        start = key_points[parent]
+        along = key_points[joint] - key_points[parent]
         at = ((points - start) @ along / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
         nearest = torch.minimum(nearest, (points - start - at[:, None] * along).norm(dim=1))
     return nearest

@@ -1,4 +1,5 @@
-"""Training of networks that predict fields of people on captures of several, and what they predict of one."""
+"""Training of networks that predict fields of people on captures of several, and what they predict
+of one."""
 
 from __future__ import annotations
 
@@ -21,10 +22,27 @@ from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human_fields.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human_fields.network import FieldNetwork
-from dyngs.human_fields.people import Person, metric, moments, person_of, require_shown, sources_of, spread, window
+from dyngs.human_fields.people import (
+    Person,
+    metric,
+    moments,
+    person_of,
+    require_shown,
+    sources_of,
+    spread,
+    window,
+)
 from dyngs.human_fields.scene import PredictedField, network_of
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, of_moment, random_index
+from dyngs.models.prediction import (
+    Example,
+    Learner,
+    Predictor,
+    image_loss,
+    load_weights,
+    of_moment,
+    random_index,
+)
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
@@ -53,22 +71,34 @@ class FieldPredictor:
         return self.person.views
 
     def chosen(self, count: int) -> list[int]:
-        """See ``Predictor``: evenly around the person, at the first of the moments that most views show."""
+        """See ``Predictor``: evenly around the person, at the first of the moments that most views
+        show."""
         rings = moments(self.views)
         ring = max(rings.values(), key=len)
         return sorted(set(spread(ring, min(count, len(ring)))))
 
-    def adapt(self, views: Sequence[int], steps: int | None = None, report: ReportProgress = report_nothing) -> int:
+    def adapt(
+        self,
+        views: Sequence[int],
+        steps: int | None = None,
+        report: ReportProgress = report_nothing,
+    ) -> int:
         if steps:
             kind = self.config.model.kind
-            raise DyngsError(f"--steps {steps}: {kind} is not trained on the images of one person; leave it out")
+            raise DyngsError(
+                f"--steps {steps}: {kind} is not trained on the images of one person; leave it out"
+            )
         return 0
 
     def predict(self, views: Sequence[int]) -> PredictedField:
         shown = [self.views[i] for i in views]
         if len(views) < FEWEST_VIEWS:
-            raise DyngsError(f"{self.name}: a field is predicted from two views at least, not one; give --views A,B")
-        other = next((x for x in shown if (x.frame, x.time) != (shown[0].frame, shown[0].time)), None)
+            raise DyngsError(
+                f"{self.name}: a field is predicted from two views at least, not one; give --views A,B"
+            )
+        other = next(
+            (x for x in shown if (x.frame, x.time) != (shown[0].frame, shown[0].time)), None
+        )
         if other is not None:
             raise DyngsError(
                 f"{self.name}: {shown[0].name} and {other.name} show two moments; give views of the same one"
@@ -83,7 +113,9 @@ class FieldPredictor:
             require_shown(self.name, image, body, scale)
         sources = sources_of(images, scale)
         background = evaluation_background(self.config.data.background, True)[1]
-        return PredictedField(section_of(self.config), self.network, sources, body, scale, background=background)
+        return PredictedField(
+            section_of(self.config), self.network, sources, body, scale, background=background
+        )
 
     def run_config(self, views: Sequence[int]) -> Config:
         data = of_moment(self.data, self.views[views[0]].time, distinct_times(self.views).values())
@@ -98,10 +130,15 @@ class FieldLearner(Learner[FieldNetwork]):
     """See ``Learner``: a part of an image of a person, predicted from others of the same moment."""
 
     def __init__(
-        self, config: Config, network: FieldNetwork, people: Sequence[DataConfig], device: torch.device = CPU
+        self,
+        config: Config,
+        network: FieldNetwork,
+        people: Sequence[DataConfig],
+        device: torch.device = CPU,
     ) -> None:
         self.config, self.network, self.device = config, network, device
-        self.model, self._people = section_of(config), people
+        self.model = section_of(config)
+        self._people = people
         self.names = [person.root.name for person in people]
         self._template = template_of(self.model)
         chosen = config.data.background
@@ -126,7 +163,8 @@ class FieldLearner(Learner[FieldNetwork]):
         return Example(loss, image, rendered.detach(), truth)
 
     def _views(self, person: Person, generator: torch.Generator) -> tuple[list[int], int]:
-        """Return views of a moment to predict from, every other time evenly around the person, and another view."""
+        """Return views of a moment to predict from, every other time evenly around the person, and
+        another view."""
         rings = [ring for ring in moments(person.views).values() if len(ring) > FEWEST_VIEWS]
         ring = rings[random_index(len(rings), generator)]
         most = min(self.model.source_views, len(ring) - 1)
@@ -142,7 +180,8 @@ class FieldLearner(Learner[FieldNetwork]):
     def _part(self, image: Image, generator: torch.Generator) -> Image:
         """Return the part of an image around a pixel of the person."""
         assert image.alpha is not None
-        side, where = self.model.patch, (image.alpha > _SOLID).nonzero()
+        side = self.model.patch
+        where = (image.alpha > _SOLID).nonzero()
         if not len(where):
             return window(image, 0, 0, side)
         row, column = where[random_index(len(where), generator)].tolist()
@@ -155,7 +194,9 @@ class FieldLearner(Learner[FieldNetwork]):
                 self._open.pop(next(iter(self._open)))
             found = person_of(self._people[person], self._template)
             if all(len(ring) <= FEWEST_VIEWS for ring in moments(found.views).values()):
-                raise DyngsError(f"{self._people[person].root}: shows no moment in three views or more to learn from")
+                raise DyngsError(
+                    f"{self._people[person].root}: shows no moment in three views or more to learn from"
+                )
             if self.network.needs_depth and any(view.depth_path is None for view in found.views):
                 raise DyngsError(
                     f"{self._people[person].root}: has no depth maps, from which {self.model.kind} learns where the "
@@ -173,7 +214,8 @@ def learner(config: Config, generator: torch.Generator) -> FieldLearner:
 
 
 def predictor(config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any) -> Predictor:
-    """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a body is fitted.
+    """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
+    body is fitted.
 
     ``told``: ``say`` and ``report`` of that fit.
     """

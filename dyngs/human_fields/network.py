@@ -1,4 +1,5 @@
-"""What networks that predict fields of people have in common: they draw a person that they have seen in images."""
+"""What networks that predict fields of people have in common: they draw a person that they have
+seen in images."""
 
 from __future__ import annotations
 
@@ -60,8 +61,11 @@ class FieldNetwork(nn.Module, ABC):
         """Return ``Known.own``."""
 
     @abstractmethod
-    def picture(self, known: Known, camera: Cameras, generator: torch.Generator | None = None) -> Picture:
-        """Return what one camera sees, in a world of metres; differentiable where gradients are enabled.
+    def picture(
+        self, known: Known, camera: Cameras, generator: torch.Generator | None = None
+    ) -> Picture:
+        """Return what one camera sees, in a world of metres; differentiable where gradients are
+        enabled.
 
         ``generator`` places samples at random, as in training; None: evenly.
         """

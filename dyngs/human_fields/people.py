@@ -1,4 +1,5 @@
-"""Captured people with their bodies and images, as networks that predict fields see them: in metres of the body.
+"""Captured people with their bodies and images, as networks that predict fields see them: in metres
+of the body.
 
 Local letters: V images of H x W pixels, J key points, M vertices, T triangles.
 """
@@ -43,7 +44,8 @@ class Body:
 
 @dataclass(frozen=True)
 class Sources:
-    """The images that a person is predicted from, cut around the silhouettes and padded to one size."""
+    """The images that a person is predicted from, cut around the silhouettes and padded to one
+    size."""
 
     rgba: Tensor  # (V, 4, H, W), colours times alpha
     cam_from_world: Tensor  # (V, 4, 4), m
@@ -55,12 +57,15 @@ class Sources:
     @property
     def centers(self) -> Tensor:
         """(V, 3) camera centres, m."""
-        rotation, translation = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
+        rotation = self.cam_from_world[:, :3, :3]
+        translation = self.cam_from_world[:, :3, 3]
         return -(rotation * translation[..., None]).sum(1)
 
     def camera(self, index: int) -> Cameras:
         height, width = self.rgba.shape[2:]
-        return Cameras(self.cam_from_world[index][None], self.intrinsics[index][None], width, height)
+        return Cameras(
+            self.cam_from_world[index][None], self.intrinsics[index][None], width, height
+        )
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,9 @@ class Person:
         return self.images.views
 
     def pose_in(self, view: View) -> BodyPose:
-        return frame_pose(self.motion.clip, self.motion.rows[-1 if view.frame is None else view.frame])
+        return frame_pose(
+            self.motion.clip, self.motion.rows[-1 if view.frame is None else view.frame]
+        )
 
     def body_in(self, view: View) -> tuple[Body, float]:
         """Return the body in the pose of ``view``, and how many world units are a metre; kept."""
@@ -87,12 +94,14 @@ class Person:
         return self._bodies[view.frame]
 
     def _posed(self, view: View) -> tuple[Body, float]:
-        pose, body = self.pose_in(view), self.template
+        pose = self.pose_in(view)
+        body = self.template
         vertices = body.vertices
         if body.pose_dirs is not None:
             features = (pose.rotations[1:] - torch.eye(3, device=vertices.device)).flatten()
             vertices = vertices + (features @ body.pose_dirs).unflatten(0, (-1, 3))
-        moves, shift = joint_transforms(body.joints, body.parents, pose.rotations), pose.trans / pose.scale
+        moves = joint_transforms(body.joints, body.parents, pose.rotations)
+        shift = pose.trans / pose.scale
         joints = apply_transforms(moves, body.joints)[:KEY_POINTS] + shift
         posed = apply_transforms(blend_transforms(body.weights, moves), vertices) + shift
         return Body(joints, posed, body.faces), float(pose.scale)
@@ -109,8 +118,11 @@ def person_of(data: DataConfig, template: BodyTemplate) -> Person:
             f"{data.root}: has no body parameters, which say where the key points are; `dyngs data fit` finds them"
         )
     if not capture.has_alpha:
-        raise DyngsError(f"{data.root}: the images have no silhouettes; give them alpha, see docs/human.md")
-    given, views = capture.body["train"], capture.splits["train"]
+        raise DyngsError(
+            f"{data.root}: the images have no silhouettes; give them alpha, see docs/human.md"
+        )
+    given = capture.body["train"]
+    views = capture.splits["train"]
     vertices, joints = rest_shape(template, given)
     motion = captured_motion(capture.root, given, views, joints)
     return Person(
@@ -121,11 +133,17 @@ def person_of(data: DataConfig, template: BodyTemplate) -> Person:
     )
 
 
-_NO_SHAPES = {"shape_dirs": None, "joint_shape_dirs": None, "expression_dirs": None, "joint_expression_dirs": None}
+_NO_SHAPES = {
+    "shape_dirs": None,
+    "joint_shape_dirs": None,
+    "expression_dirs": None,
+    "joint_expression_dirs": None,
+}
 
 
 def metric(cameras: Cameras, scale: float) -> Cameras:
-    """Return cameras of a world of which ``scale`` units are a metre in metres: they see the same."""
+    """Return cameras of a world of which ``scale`` units are a metre in metres: they see the
+    same."""
     pose = cameras.cam_from_world.clone()
     pose[:, :3, 3] /= scale
     return replace(cameras, cam_from_world=pose)
@@ -135,30 +153,36 @@ def sources_of(images: Sequence[Image], scale: float) -> Sources:
     """Return images of a world of which ``scale`` units are a metre."""
     parts = [cropped(image, MARGIN) for image in images]
     height, width = (
-        -(-max(getattr(part.cameras, side) for part in parts) // MULTIPLE) * MULTIPLE for side in ("height", "width")
+        -(-max(getattr(part.cameras, side) for part in parts) // MULTIPLE) * MULTIPLE
+        for side in ("height", "width")
     )
     rgba = torch.zeros((len(parts), 4, height, width), device=parts[0].rgb_premultiplied.device)
     for own, part in zip(rgba, parts, strict=True):
         assert part.alpha is not None
         rows, columns = part.alpha.shape
-        own[:3, :rows, :columns], own[3, :rows, :columns] = part.rgb_premultiplied.permute(2, 0, 1), part.alpha
+        own[:3, :rows, :columns] = part.rgb_premultiplied.permute(2, 0, 1)
+        own[3, :rows, :columns] = part.alpha
     cameras = [metric(part.cameras, scale) for part in parts]
     poses, intrinsics = (
-        torch.cat([getattr(x, name) for x in cameras]).to(rgba) for name in ("cam_from_world", "intrinsics")
+        torch.cat([getattr(x, name) for x in cameras]).to(rgba)
+        for name in ("cam_from_world", "intrinsics")
     )
     return Sources(rgba, poses, intrinsics)
 
 
 def require_shown(name: str, image: Image, body: Body, scale: float) -> None:
-    """Raise DyngsError, for the capture ``name``, unless an image shows a person where the body is (world units in m).
+    """Raise DyngsError, for the capture ``name``, unless an image shows a person where the body is
+    (world units in m).
 
-    The box of its silhouette must be that of the body, to ``MISFIT`` of its longer side: clothes and hair stand out
-    less, and cameras that are wrong rarely do.
+    The box of its silhouette must be that of the body, to ``MISFIT`` of its longer side: clothes
+    and hair stand out less, and cameras that are wrong rarely do.
     """
     assert image.alpha is not None
     rows, columns = ((image.alpha > 0.5).any(side).nonzero()[:, 0] for side in (1, 0))
     if not len(rows):
-        raise DyngsError(f"{name}: {image.name} shows no silhouette of a person; give its mask, or other views")
+        raise DyngsError(
+            f"{name}: {image.name} shows no silhouette of a person; give its mask, or other views"
+        )
     camera = metric(image.cameras.to(dtype=torch.float32), scale)
     local = body.vertices @ camera.cam_from_world[0, :3, :3].T + camera.cam_from_world[0, :3, 3]
     if bool((local[:, 2] <= 0).any()):
@@ -177,13 +201,16 @@ def require_shown(name: str, image: Image, body: Body, scale: float) -> None:
 
 
 def window(image: Image, left: int, top: int, side: int) -> Image:
-    """Return the square of ``side`` px of an image, with its camera and depth, that begins at a column and row.
+    """Return the square of ``side`` px of an image, with its camera and depth, that begins at a
+    column and row.
 
     It is moved into the image, and is smaller only where the image is.
     """
     camera = image.cameras
-    width, height = min(side, camera.width), min(side, camera.height)
-    left, top = min(max(left, 0), camera.width - width), min(max(top, 0), camera.height - height)
+    width = min(side, camera.width)
+    height = min(side, camera.height)
+    left = min(max(left, 0), camera.width - width)
+    top = min(max(top, 0), camera.height - height)
     intrinsics = camera.intrinsics.clone()
     intrinsics[:, 0, 2] -= left
     intrinsics[:, 1, 2] -= top
@@ -196,7 +223,10 @@ def window(image: Image, left: int, top: int, side: int) -> Image:
         image,
         cameras=Cameras(camera.cam_from_world, intrinsics, width, height),
         rgb_premultiplied=rgb,
-        **{name: part(getattr(image, name)) for name in ("alpha", "mask", "depth", "moves", "labels", "flow")},
+        **{
+            name: part(getattr(image, name))
+            for name in ("alpha", "mask", "depth", "moves", "labels", "flow")
+        },
     )
 
 

@@ -1,4 +1,5 @@
-"""What a network has predicted of a person, as something to draw and to store; it is not trained."""
+"""What a network has predicted of a person, as something to draw and to store; it is not
+trained."""
 
 from __future__ import annotations
 
@@ -16,19 +17,35 @@ from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.human_fields.eg_human_nerf import EgHumanNerf
 from dyngs.human_fields.keypoint_nerf import AROUND, KeypointNerf
-from dyngs.human_fields.keys import EgHumanNerfModel, FieldPredictorModel, KeypointNerfModel, PredictedFieldModel
+from dyngs.human_fields.keys import (
+    EgHumanNerfModel,
+    FieldPredictorModel,
+    KeypointNerfModel,
+    PredictedFieldModel,
+)
 from dyngs.human_fields.network import FieldNetwork, Known
 from dyngs.human_fields.people import MULTIPLE, Body, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
-from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep, composited, fixed_cameras
+from dyngs.models.renderable import (
+    DrawOptions,
+    Renderable,
+    Rendering,
+    TimeStep,
+    composited,
+    fixed_cameras,
+)
 from dyngs.models.views import evaluation_background
 from dyngs.state import Role, State, prefixed, with_role
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
-SECTIONS: dict[str, type[FieldPredictorModel]] = {"keypoint_nerf": KeypointNerfModel, "eg_human_nerf": EgHumanNerfModel}
-_MOST_VIEWS, _MOST_PIXELS = 1024, 1 << 26  # Of stored images
+SECTIONS: dict[str, type[FieldPredictorModel]] = {
+    "keypoint_nerf": KeypointNerfModel,
+    "eg_human_nerf": EgHumanNerfModel,
+}
+_MOST_VIEWS = 1024
+_MOST_PIXELS = 1 << 26  # Of stored images
 
 
 def network_of(model: FieldPredictorModel, generator: torch.Generator) -> FieldNetwork:
@@ -79,7 +96,10 @@ class PredictedField(Renderable):
         tensors = {f"network.{name}": x.detach() for name, x in self.network.state_dict().items()}
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
         tensors |= {f"body.{name}": x for name, x in vars(self.body).items()}
-        numbers = [self.scale, *(float(getattr(self.model, name)) for name in numbers_of(type(self.model)))]
+        numbers = [
+            self.scale,
+            *(float(getattr(self.model, name)) for name in numbers_of(type(self.model))),
+        ]
         tensors["numbers"] = torch.tensor(numbers, dtype=torch.float64, device="cpu")
         return prefixed("field", with_role(tensors, Role.SHARED))
 
@@ -100,14 +120,20 @@ class PredictedField(Renderable):
 
     @torch.no_grad()
     def _view(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z (H, W)."""
-        shape, like = (camera.height, camera.width), self.sources.rgba
-        colour, depth, through = like.new_zeros(*shape, 3), like.new_zeros(shape), like.new_ones(shape)
+        """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z
+        (H, W)."""
+        shape = (camera.height, camera.width)
+        like = self.sources.rgba
+        colour = like.new_zeros(*shape, 3)
+        depth = like.new_zeros(shape)
+        through = like.new_ones(shape)
         part = around_in(metric(camera, self.scale), self._around)
         if part is not None:
             seen, (top, left) = self.network.picture(self.known, part.camera), part.corner
             own = slice(top, top + part.camera.height), slice(left, left + part.camera.width)
-            colour[own], through[own], depth[own] = seen.colour, seen.transmittance, self.scale * seen.depth
+            colour[own] = seen.colour
+            through[own] = seen.transmittance
+            depth[own] = self.scale * seen.depth
         return colour, through, depth
 
 
@@ -122,18 +148,20 @@ class Part:
 def around_in(camera: Cameras, box: Tensor) -> Part | None:
     """Return the part of an image that shows a box, of corners (2, 3); None: no part does.
 
-    Its sides are multiples of ``MULTIPLE`` where the image is as large. All of the image where the box reaches behind
-    the camera.
+    Its sides are multiples of ``MULTIPLE`` where the image is as large. All of the image where the
+    box reaches behind the camera.
     """
     corners = torch.cartesian_prod(*box.T)
-    pose, k = camera.cam_from_world[0], camera.intrinsics[0]
+    pose = camera.cam_from_world[0]
+    k = camera.intrinsics[0]
     local = corners @ pose[:3, :3].T + pose[:3, 3]
     if bool((local[:, 2] <= 0).all()):
         return None
     if bool((local[:, 2] <= 1e-3).any()):
         return Part(camera, (0, 0))
     pixels = local[:, :2] / local[:, 2:] * torch.stack([k[0, 0], k[1, 1]]) + k[:2, 2]
-    first, last = pixels.amin(0).floor().tolist(), pixels.amax(0).ceil().tolist()
+    first = pixels.amin(0).floor().tolist()
+    last = pixels.amax(0).ceil().tolist()
     (left, width), (top, height) = (
         _within(int(begin), int(end), size)
         for begin, end, size in zip(first, last, (camera.width, camera.height), strict=True)
@@ -148,7 +176,8 @@ def around_in(camera: Cameras, box: Tensor) -> Part | None:
 
 def _within(begin: int, end: int, size: int) -> tuple[int, int]:
     """Return where a part of an image's side begins, and how long it is."""
-    begin, end = max(begin, 0), min(end, size)
+    begin = max(begin, 0)
+    end = min(end, size)
     length = min(-(-(end - begin) // MULTIPLE) * MULTIPLE, size)
     return min(begin, size - length), length
 
@@ -160,8 +189,10 @@ def numbers_of(section: type[FieldPredictorModel]) -> list[str]:
 
 
 def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
-    """Return what the network ``name`` has predicted. Raises KeyError or ValueError where tensors do not fit."""
-    stored, section = checkpoint.part("field"), SECTIONS[name]
+    """Return what the network ``name`` has predicted. Raises KeyError or ValueError where tensors
+    do not fit."""
+    stored = checkpoint.part("field")
+    section = SECTIONS[name]
     keys = numbers_of(section)
     numbers = require_tensor("numbers", stored["numbers"], (1 + len(keys),), torch.float64)
     require_positive("scale", numbers[:1])
@@ -169,20 +200,30 @@ def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
     network = network_of(model, torch.Generator())
     own = network.state_dict()
     weights = {
-        key: require_tensor(key, stored[f"network.{key}"], tuple(x.shape), x.dtype).clone() for key, x in own.items()
+        key: require_tensor(key, stored[f"network.{key}"], tuple(x.shape), x.dtype).clone()
+        for key, x in own.items()
     }
     network.load_state_dict(weights)
     behind = evaluation_background(checkpoint.info.background, False)[1]
-    return PredictedField(model, network, _sources(stored), _body(stored), float(numbers[0]), background=behind)
+    return PredictedField(
+        model, network, _sources(stored), _body(stored), float(numbers[0]), background=behind
+    )
 
 
 def _sources(stored: Mapping[str, Tensor]) -> Sources:
     rgba = require_tensor("rgba", stored["sources.rgba"], (None, 4, None, None))
     count, _, height, width = rgba.shape
-    if not 1 <= count <= _MOST_VIEWS or height % MULTIPLE or width % MULTIPLE or not 0 < height * width <= _MOST_PIXELS:
+    if (
+        not 1 <= count <= _MOST_VIEWS
+        or height % MULTIPLE
+        or width % MULTIPLE
+        or not 0 < height * width <= _MOST_PIXELS
+    ):
         raise ValueError(f"'rgba' is no set of images: {tuple(rgba.shape)}")
     poses = require_tensor("cam_from_world", stored["sources.cam_from_world"], (count, 4, 4))
-    return Sources(rgba, poses, require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3)))
+    return Sources(
+        rgba, poses, require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3))
+    )
 
 
 def _body(stored: Mapping[str, Tensor]) -> Body:

@@ -1,6 +1,6 @@
 """The seam between what is trained and drawn, and what trains, measures, draws and shows it.
 
-``renderable``: what can be drawn from anywhere at any time. ``model``: what a trainer steps, loss terms.
-``prediction``: networks that predict scenes, ``convolution``: what they share. ``kind``: a section of the
-configuration, and what begins and restores its model.
+``renderable``: what can be drawn from anywhere at any time. ``model``: what a trainer steps, loss
+terms. ``prediction``: networks that predict scenes, ``convolution``: what they share. ``kind``: a
+section of the configuration, and what begins and restores its model.
 """

@@ -24,7 +24,8 @@ _SETTINGS += ("camera.refine", "train.robust", "train.exposure")
 
 
 def settings_of(config: Config) -> dict[str, Any]:
-    """Return the settings that decide what a checkpoint holds, by dotted key; None where a section has no such key."""
+    """Return the settings that decide what a checkpoint holds, by dotted key; None where a section
+    has no such key."""
     found = {}
     for name in _SETTINGS:
         value: Any = config
@@ -49,7 +50,8 @@ class CheckpointInfo:
 def read_capture_of(data: DataConfig, info: CheckpointInfo) -> Capture:
     """Return the capture of a run in the scene coordinates that the run was trained in.
 
-    Those of ``read_capture`` may differ: the capture has changed since, or another version of dyngs trained the run.
+    Those of ``read_capture`` may differ: the capture has changed since, or another version of dyngs
+    trained the run.
     """
     return change_coordinates(read_capture(data), info.world_scale, info.world_offset)
 
@@ -60,15 +62,18 @@ class Checkpoint:
 
     info: CheckpointInfo
     tensors: dict[str, Tensor]
-    path: Path | None = field(default=None, compare=False)  # of the file that it was read from; None: of none
-    settings: dict[str, Any] = field(default_factory=dict)  # ``settings_of`` its trainer; empty: not known
+    # of the file that it was read from; None: of none
+    path: Path | None = field(default=None, compare=False)
+    # ``settings_of`` its trainer; empty: not known
+    settings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
 
     def require_settings(self, config: Config) -> None:
-        """Raise where ``config`` has another value of a setting that decided what the checkpoint holds."""
+        """Raise where ``config`` has another value of a setting that decided what the checkpoint
+        holds."""
         for name, now in settings_of(config).items():
             before = self.settings.get(name, now)
             if before != now:

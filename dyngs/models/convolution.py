@@ -10,7 +10,8 @@ GROUPS = 8
 
 
 class ResidualBlock(nn.Module):
-    """Residual block of two convolutions (B, ``width``, H, W), normalised before each (He et al. 2016)."""
+    """Residual block of two convolutions (B, ``width``, H, W), normalised before each (He et al.
+    2016)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -29,7 +30,8 @@ def upsampled(features: Tensor) -> Tensor:
 
 
 def begin_weights(network: nn.Module, generator: torch.Generator) -> None:
-    """Draw the weights of all convolutions (He et al. 2015) from ``generator``, on the CPU; biases are 0."""
+    """Draw the weights of all convolutions (He et al. 2015) from ``generator``, on the CPU; biases
+    are 0."""
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)

@@ -1,4 +1,5 @@
-"""The kinds of model: one line each in ``KINDS``, of which the configuration makes the choices of ``model.kind``."""
+"""The kinds of model: one line each in ``KINDS``, of which the configuration makes the choices of
+``model.kind``."""
 
 from __future__ import annotations
 
@@ -33,13 +34,15 @@ class RunStart:
     """What a model begins with."""
 
     config: Config
-    asked: Config  # the same without limits: a run may begin with more Gaussians than it may end with
+    # the same without limits: a run may begin with more Gaussians than it may end with
+    asked: Config
     capture: Capture  # that is trained on, with its first points
     images: ImageLoader
     background: str
     extent: float
     generator: torch.Generator
-    first: Any = None  # ``FirstGaussians`` that it goes on from; None: it begins as ``config.init`` says
+    # ``FirstGaussians`` that it goes on from; None: it begins as ``config.init`` says
+    first: Any = None
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,9 @@ class Kind:
     """A kind of model."""
 
     section: type[ModelSection]  # class of its configuration
-    # module with its ``start`` and ``restore``, and ``refusal`` where it cannot take every capture; that of a network
-    # has ``learner`` and ``predictor`` instead, see ``dyngs.models.prediction``. It is imported when first needed, so
-    # that reading a configuration imports no model
+    # module with its ``start`` and ``restore``, and ``refusal`` where it cannot take every capture;
+    # that of a network has ``learner`` and ``predictor`` instead, see ``dyngs.models.prediction``.
+    # It is imported when first needed, so that reading a configuration imports no model
     home: str
 
     def start(self, start: RunStart) -> Model[Any]:
@@ -57,7 +60,8 @@ class Kind:
         return import_module(self.home).start(start)
 
     def restore(self, model: ModelSection, checkpoint: Checkpoint) -> Renderable:
-        """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
+        """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
+        fit."""
         if model.is_network:
             raise DyngsError(
                 f"{checkpoint.name}: a network, not a scene; `dyngs predict RUN CAPTURE --out RUN` makes one"
@@ -65,7 +69,8 @@ class Kind:
         return import_module(self.home).restore(model, checkpoint)
 
     def refusal(self, capture: Capture) -> str | None:
-        """Return why it cannot be trained on ``capture``, to follow its folder and a colon; None: it can."""
+        """Return why it cannot be trained on ``capture``, to follow its folder and a colon; None:
+        it can."""
         refusal = getattr(import_module(self.home), "refusal", None)
         return None if refusal is None else refusal(capture)
 
@@ -73,8 +78,11 @@ class Kind:
         """Return a network in training, before the first step."""
         return import_module(self.home).learner(config, generator)
 
-    def predictor(self, config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any) -> Predictor:
-        """Return a trained network with the capture of ``data``; ``told``: ``say``, ``report`` of what takes long."""
+    def predictor(
+        self, config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any
+    ) -> Predictor:
+        """Return a trained network with the capture of ``data``; ``told``: ``say``, ``report`` of
+        what takes long."""
         return import_module(self.home).predictor(config, checkpoint, data, **told)
 
 

@@ -31,11 +31,12 @@ class Drawn:
     rendering: Rendering  # of the image's camera
     # differentiable regularizers of what was drawn, weighted, by name
     penalties: Mapping[str, Tensor] = field(default_factory=dict)
-    # tensors that something learned has moved, by name: one that is not finite would not be drawn, so that a diverging
-    # field could go unseen; empty: nothing was
+    # tensors that something learned has moved, by name: one that is not finite would not be drawn,
+    # so that a diverging field could go unseen; empty: nothing was
     moved: Mapping[str, Tensor] = field(default_factory=dict)
     after_backward: Callable[[], None] = nothing  # takes in gradients once they are there
-    # what the rendering is compared with where that is only some pixels of the image; None: the whole image
+    # what the rendering is compared with where that is only some pixels of the image; None: the
+    # whole image
     image: Image | None = None
 
 
@@ -45,14 +46,16 @@ class Updated:
 
     bad: Count = 0  # number of rows left out because their gradient was not finite
     finding: str | None = None  # lines about what was found out, or None
-    is_rearranged: bool = False  # there are other rows now: several processes must have come to the same
+    # there are other rows now: several processes must have come to the same
+    is_rearranged: bool = False
 
 
 class Model(ABC, Generic[S_co]):
     """A model in training: its scene and everything that training it keeps.
 
     Attributes:
-        moves_by: name of what moves the scene, and the configuration section of its learning rates, for messages.
+        moves_by: name of what moves the scene, and the configuration section of its learning rates,
+            for messages.
     """
 
     moves_by: tuple[str, str] = ("", "")
@@ -100,7 +103,8 @@ class Model(ABC, Generic[S_co]):
         return ()
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return whether an image of ``time`` may be trained on in ``step``; at each step some may."""
+        """Return whether an image of ``time`` may be trained on in ``step``; at each step some
+        may."""
         return True
 
     def holds_out(self, index: int, step: int) -> bool:
@@ -112,7 +116,8 @@ class Model(ABC, Generic[S_co]):
         return 0.0, 1.0
 
     def extend(self, seen: tuple[float, float], step: int) -> None:
-        """Continue what was learned for the times in ``seen`` to those that are trained on at ``step``."""
+        """Continue what was learned for the times in ``seen`` to those that are trained on at
+        ``step``."""
 
     @property
     def rasterize_mode(self) -> RasterizeMode:

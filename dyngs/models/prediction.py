@@ -1,9 +1,9 @@
 """Networks that predict scenes from a few images: what each of them is, in training and at work.
 
-A kind of network has a module with ``learner(config, generator)``, which returns its ``Learner``, and
-``predictor(config, checkpoint, data)``, which returns its ``Predictor`` for one capture. One trainer
-(``dyngs.training.prediction``) and one command (``dyngs.api.predict``) serve all kinds. What is predicted is any
-``Renderable``: Gaussians, an avatar, a field.
+A kind of network has a module with ``learner(config, generator)``, which returns its ``Learner``,
+and ``predictor(config, checkpoint, data)``, which returns its ``Predictor`` for one capture. One
+trainer (``dyngs.training.prediction``) and one command (``dyngs.api.predict``) serve all kinds.
+What is predicted is any ``Renderable``: Gaussians, an avatar, a field.
 """
 
 from __future__ import annotations
@@ -51,11 +51,13 @@ class Predictor(Protocol):
         ...
 
     def adapt(self, views: Sequence[int], steps: int | None, report: ReportProgress) -> int:
-        """Train the network for ``steps`` on these images alone, None: as many as usual; return how many these were."""
+        """Train the network for ``steps`` on these images alone, None: as many as usual; return how
+        many these were."""
         ...
 
     def predict(self, views: Sequence[int]) -> Renderable:
-        """Return the scene that these views show. Raises DyngsError: they do not suit, one line that says why."""
+        """Return the scene that these views show. Raises DyngsError: they do not suit, one line
+        that says why."""
         ...
 
     def run_config(self, views: Sequence[int]) -> Config:
@@ -94,7 +96,8 @@ class Learner(ABC, Generic[N]):
 
     @abstractmethod
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        """Return a prediction of a person; what is random is drawn from ``generator``, on the CPU."""
+        """Return a prediction of a person; what is random is drawn from ``generator``, on the
+        CPU."""
 
     def kept(self) -> dict[str, Tensor]:
         """Return what is stored next to the weights."""
@@ -106,12 +109,14 @@ class Learner(ABC, Generic[N]):
 
 
 def random_index(count: int, generator: torch.Generator) -> int:
-    """Return a random whole number below ``count``, the same on every device; ``generator`` is of the CPU."""
+    """Return a random whole number below ``count``, the same on every device; ``generator`` is of
+    the CPU."""
     return int(torch.randint(count, (1,), generator=generator, device="cpu"))
 
 
 def of_moment(data: DataConfig, time: float | None, times: Collection[float]) -> DataConfig:
-    """Return the options with the time step of a capture at ``times`` that is nearest to ``time``; None: as given."""
+    """Return the options with the time step of a capture at ``times`` that is nearest to ``time``;
+    None: as given."""
     moments = sorted(set(times))
     if time is None or len(moments) < 2:
         return data
@@ -120,8 +125,10 @@ def of_moment(data: DataConfig, time: float | None, times: Collection[float]) ->
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
-    """Let ``network`` take the weights of a checkpoint. Raises DyngsError: of another network, or damaged."""
-    weights, own = checkpoint.part("model.network"), network.state_dict()
+    """Let ``network`` take the weights of a checkpoint. Raises DyngsError: of another network, or
+    damaged."""
+    weights = checkpoint.part("model.network")
+    own = network.state_dict()
     if {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
         raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
     with reading(checkpoint.name, OTHER_CONFIG):
@@ -130,16 +137,22 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
         network.load_state_dict(weights)
 
 
-def image_loss(rendered: Tensor, alpha: Tensor, image: Image, truth: Tensor, options: TrainConfig) -> Tensor:
-    """Return L1 and D-SSIM of ``rendered`` (H, W, 3) against ``truth``, and the weighted error of ``alpha`` (H, W)."""
+def image_loss(
+    rendered: Tensor, alpha: Tensor, image: Image, truth: Tensor, options: TrainConfig
+) -> Tensor:
+    """Return L1 and D-SSIM of ``rendered`` (H, W, 3) against ``truth``, and the weighted error of
+    ``alpha`` (H, W)."""
     loss = l1_ssim_loss(rendered, truth, options.ssim_weight, image.mask)
     if options.alpha_weight and image.alpha is not None:
         loss = loss + options.alpha_weight * (alpha - image.alpha).abs().mean()
     return loss
 
 
-def updated(optimizer: torch.optim.Optimizer, network: nn.Module, loss: Tensor, rate: float) -> bool:
-    """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are not finite."""
+def updated(
+    optimizer: torch.optim.Optimizer, network: nn.Module, loss: Tensor, rate: float
+) -> bool:
+    """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are
+    not finite."""
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     if not bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT).isfinite()):
@@ -156,10 +169,16 @@ def optimizer_state(optimizer: torch.optim.Optimizer, network: nn.Module) -> dic
     return {f"{key}.{name}": x for name, state in states.items() for key, x in state.items()}
 
 
-def load_optimizer(optimizer: torch.optim.Optimizer, network: nn.Module, state: dict[str, Tensor]) -> None:
+def load_optimizer(
+    optimizer: torch.optim.Optimizer, network: nn.Module, state: dict[str, Tensor]
+) -> None:
     """Take over the moments of Adam. Raises KeyError or ValueError: a state that does not fit."""
     for name, parameter in network.named_parameters():
-        shapes = {"step": (), "exp_avg": tuple(parameter.shape), "exp_avg_sq": tuple(parameter.shape)}
+        shapes = {
+            "step": (),
+            "exp_avg": tuple(parameter.shape),
+            "exp_avg_sq": tuple(parameter.shape),
+        }
         if not any(f"{key}.{name}" in state for key in shapes):
             continue
         optimizer.state[parameter] = {
@@ -180,7 +199,9 @@ def named_views(capture: str, views: Sequence[View], names: Sequence[str]) -> li
     known |= {view.name: i for i, view in enumerate(views)}
     for name in names:
         if name not in known:
-            raise DyngsError(f"{capture}: no training view is named {name!r}; the first is {views[0].name!r}")
+            raise DyngsError(
+                f"{capture}: no training view is named {name!r}; the first is {views[0].name!r}"
+            )
     found = [known[name] for name in names]
     if len(set(found)) < len(found):
         raise DyngsError(f"{capture}: a view is named twice; name each once")

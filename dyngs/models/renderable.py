@@ -25,9 +25,10 @@ Images = TypeVar("Images", bound="Rendering")
 
 
 NEAR_FRACTION = 0.01
-"""Distance of the near plane, in extents of the scene, as in gsplat; 3DGS has 0.2 units, 0.04 extents of its scenes.
-Long walks show things at 0.02 extents. Held-out PSNR does not tell 0.01 from 0.04 (cup 29.6 and 29.1 dB, fox 32.2 and
-32.0, lego 32.6 and 32.6; two seeds of the cup differ by 0.5)."""
+"""Distance of the near plane, in extents of the scene, as in gsplat; 3DGS has 0.2 units, 0.04
+extents of its scenes. Long walks show things at 0.02 extents. Held-out PSNR does not tell 0.01 from
+0.04 (cup 29.6 and 29.1 dB, fox 32.2 and 32.0, lego 32.6 and 32.6; two seeds of the cup differ by
+0.5)."""
 
 
 def near_plane(extent: float) -> float:
@@ -35,18 +36,23 @@ def near_plane(extent: float) -> float:
     return NEAR_FRACTION * extent
 
 
-FOCAL_LENGTHS = (1e-6, 1e12)  # Smallest and largest allowed, px; beyond them gradients leave the range of float32
+# Smallest and largest allowed, px; beyond them gradients leave the range of float32
+FOCAL_LENGTHS = (1e-6, 1e12)
 _TINY = 1e-9
 ROTATION_TOLERANCE = 0.01
-"""Largest entry of ``R^T R - I`` of a pose that is drawn; half precision rounds by a tenth of that."""
+"""Largest entry of ``R^T R - I`` of a pose that is drawn; half precision rounds by a tenth of
+that."""
 
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """How any scene is drawn. Raises DyngsError: a number beyond its range, or a choice that does not exist."""
+    """How any scene is drawn. Raises DyngsError: a number beyond its range, or a choice that does
+    not exist."""
 
-    near: float = 0.2  # what is nearer to the camera is not drawn, in the unit of the scene (3DGS: 0.2)
-    # none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha)
+    # what is nearer to the camera is not drawn, in the unit of the scene (3DGS: 0.2)
+    near: float = 0.2
+    # none, accumulated (sum of weight times depth) or expected (that, divided by the sum of
+    # weights: alpha)
     depth: Literal["none", "accumulated", "expected"] = "none"
 
     def __post_init__(self) -> None:
@@ -87,16 +93,22 @@ class Rendering:
         """Return (V, H, W) opacities of the images, in [0, 1]."""
         return 1 - self.transmittance
 
-    def to(self: T, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> T:
-        """Return the same images on another device or in another precision; integers stay integers."""
+    def to(
+        self: T, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> T:
+        """Return the same images on another device or in another precision; integers stay
+        integers."""
         return fields_moved_to(self, device, dtype)
 
 
 def joined_renderings(found: Sequence[Images]) -> Images:
-    """Return the images of renderings of the same size, of any number of views each, as one rendering."""
+    """Return the images of renderings of the same size, of any number of views each, as one
+    rendering."""
     first = found[0]
     parts = {f.name: [getattr(x, f.name) for x in found] for f in fields(first)}
-    return replace(first, **{name: None if x[0] is None else torch.cat(x) for name, x in parts.items()})
+    return replace(
+        first, **{name: None if x[0] is None else torch.cat(x) for name, x in parts.items()}
+    )
 
 
 class TimeStep:
@@ -110,7 +122,8 @@ class Renderable(ABC):
     """What evaluation, rendering, viewer and videos need of a scene.
 
     Attributes:
-        options: ``DrawOptions``, or more than that: how it is drawn unless ``render`` is told otherwise.
+        options: ``DrawOptions``, or more than that: how it is drawn unless ``render`` is told
+            otherwise.
         background: (3,) colour behind it unless ``render`` is told otherwise; None is black.
     """
 
@@ -120,7 +133,8 @@ class Renderable(ABC):
     @property
     @abstractmethod
     def times(self) -> tuple[float, ...]:
-        """Distinct times of training, or of the motion that is played, in [0, 1], ascending; empty without times."""
+        """Distinct times of training, or of the motion that is played, in [0, 1], ascending; empty
+        without times."""
 
     @property
     def is_static(self) -> bool:
@@ -153,7 +167,8 @@ class Renderable(ABC):
             time: in [0, 1], or what ``time_step`` returned; None is the first.
 
         Raises:
-            DyngsError: as ``check_views``; or gradients by cameras, of a scene that is not made of Gaussians.
+            DyngsError: as ``check_views``; or gradients by cameras, of a scene that is not made of
+                Gaussians.
         """
 
     def time_step(self, time: float | None) -> TimeStep:
@@ -165,7 +180,8 @@ class Renderable(ABC):
         """Return everything that is stored, by name, with its role."""
 
     def drawing_state(self) -> State:
-        """Return the part of ``state`` that drawing needs, in an equivalent form where that is smaller."""
+        """Return the part of ``state`` that drawing needs, in an equivalent form where that is
+        smaller."""
         return {name: x for name, x in self.state().items() if x.role is not Role.TRAINING}
 
     def on_background(self: R, colour: Tensor) -> R:
@@ -179,18 +195,24 @@ class Renderable(ABC):
         return fields_moved_to(self, device)
 
 
-def single_views(cameras: Cameras, background: Tensor | None) -> list[tuple[Cameras, Tensor | None]]:
+def single_views(
+    cameras: Cameras, background: Tensor | None
+) -> list[tuple[Cameras, Tensor | None]]:
     """Return each camera with its own background. Raises DyngsError: as ``check_views``."""
     check_views(cameras, background)
-    each = [background] * len(cameras) if background is None or background.ndim == 1 else list(background)
+    each = (
+        [background] * len(cameras)
+        if background is None or background.ndim == 1
+        else list(background)
+    )
     return [(cameras.select(i), behind) for i, behind in enumerate(each)]
 
 
 def check_views(cameras: Cameras, background: Tensor | None) -> None:
     """Check what any scene is rendered from, and before which colour.
 
-    Raises DyngsError: no cameras, poses that are not rigid, focal lengths that are not positive, NaN or infinity, or a
-    background of another shape than (3,) or (V, 3).
+    Raises DyngsError: no cameras, poses that are not rigid, focal lengths that are not positive,
+    NaN or infinity, or a background of another shape than (3,) or (V, 3).
     """
     if not len(cameras):
         raise DyngsError("cameras: there is none to render from; give at least one")
@@ -204,21 +226,31 @@ def check_views(cameras: Cameras, background: Tensor | None) -> None:
 
 
 def fixed_cameras(cameras: Cameras, background: Tensor | None, like: Tensor) -> Cameras:
-    """Return the cameras of a scene without gradients by them, on the device and in the dtype of ``like``.
+    """Return the cameras of a scene without gradients by them, on the device and in the dtype of
+    ``like``.
 
     Raises DyngsError: as ``check_views``; or the poses or intrinsics require gradients.
     """
     cameras = cameras.to(device=like.device, dtype=like.dtype)
     check_views(cameras, background)
-    if torch.is_grad_enabled() and (cameras.cam_from_world.requires_grad or cameras.intrinsics.requires_grad):
-        raise DyngsError("cameras: only scenes of Gaussians have gradients by poses and intrinsics; detach these")
+    if torch.is_grad_enabled() and (
+        cameras.cam_from_world.requires_grad or cameras.intrinsics.requires_grad
+    ):
+        raise DyngsError(
+            "cameras: only scenes of Gaussians have gradients by poses and intrinsics; detach these"
+        )
     return cameras
 
 
 def composited(
-    rgb: Tensor, transmittance: Tensor, depth: Tensor | None, options: DrawOptions, background: Tensor | None
+    rgb: Tensor,
+    transmittance: Tensor,
+    depth: Tensor | None,
+    options: DrawOptions,
+    background: Tensor | None,
 ) -> Rendering:
-    """Return images (V, H, W, 3) before a background, of colours before black and the sums of weight times depth."""
+    """Return images (V, H, W, 3) before a background, of colours before black and the sums of
+    weight times depth."""
     if background is not None:
         rgb = rgb + transmittance[..., None] * background.to(rgb).view(-1, 1, 1, 3)
     if depth is not None and options.depth == "expected":
@@ -243,23 +275,35 @@ def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
 
 
 def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
-    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``."""
+    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within
+    ``ROTATION_TOLERANCE``."""
     poses: NDArray[np.float64] = _numbers(cam_from_world).astype(np.float64)
     rotations = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # NaN and infinity are what is looked for
-        error: NDArray[np.float64] = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max((1, 2))
+        error: NDArray[np.float64] = np.abs(
+            np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)
+        ).max((1, 2))
         is_mirrored = np.linalg.det(rotations) < 0
-    bad = np.flatnonzero(~((error <= ROTATION_TOLERANCE) & ~is_mirrored & np.isfinite(poses).all((1, 2))))
+    bad = np.flatnonzero(
+        ~((error <= ROTATION_TOLERANCE) & ~is_mirrored & np.isfinite(poses).all((1, 2)))
+    )
     if not len(bad):
         return
     check_finite({name: cam_from_world})
     row = bad[0]
-    fault = "is mirrored" if is_mirrored[row] else f"differs from a rotation by {error[row]:.2g} (R^T R - I)"
-    raise DyngsError(f"{name}: the matrix of camera {row} {fault}; only the position may be scaled: export it again")
+    fault = (
+        "is mirrored"
+        if is_mirrored[row]
+        else f"differs from a rotation by {error[row]:.2g} (R^T R - I)"
+    )
+    raise DyngsError(
+        f"{name}: the matrix of camera {row} {fault}; only the position may be scaled: export it again"
+    )
 
 
 def _numbers(x: Tensor) -> NDArray[Any]:
-    """Return a few numbers for NumPy, whose operators take a seventh of the time of torch's on the CPU."""
+    """Return a few numbers for NumPy, whose operators take a seventh of the time of torch's on the
+    CPU."""
     return x.detach().cpu().numpy()
 
 

@@ -13,8 +13,12 @@ def scaled(step: int, steps: int) -> int:
 
 
 def image_divisor(options: TrainConfig, step: int) -> int:
-    """Return the divisor of the images' sides at ``step``: ``initial_downscale``, halved evenly until it is 1."""
+    """Return the divisor of the images' sides at ``step``: ``initial_downscale``, halved evenly
+    until it is 1."""
     halvings = options.initial_downscale.bit_length() - 1
-    first, last = options.resolution_grows_from, max(options.resolution_grows_from, options.resolution_full_at)
+    first = options.resolution_grows_from
+    last = max(options.resolution_grows_from, options.resolution_full_at)
     fractions = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
-    return options.initial_downscale >> sum(step / options.steps >= fraction for fraction in fractions)
+    return options.initial_downscale >> sum(
+        step / options.steps >= fraction for fraction in fractions
+    )

@@ -20,7 +20,8 @@ ALIKE = 0.1  # Largest difference of a channel up to which a colour counts as th
 
 
 def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
-    """Return the fraction of the opaque pixels whose channels all differ from ``background`` (3,) by ``ALIKE`` or less.
+    """Return the fraction of the opaque pixels whose channels all differ from ``background`` (3,)
+    by ``ALIKE`` or less.
 
     None where there are no opaque pixels next to a background. Masked pixels do not count.
     """
@@ -39,33 +40,39 @@ def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
 
 
 def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
-    """Return the name and (3,) colour of the background to evaluate on: black where that of training was random."""
+    """Return the name and (3,) colour of the background to evaluate on: black where that of
+    training was random."""
     resolved = {"auto": "white" if has_alpha else "black", "random": "black"}.get(choice, choice)
     return resolved, torch.full((3,), _BACKGROUNDS[resolved], device="cpu")
 
 
 def background_colour(name: str, generator: torch.Generator | None = None) -> Tensor:
-    """Return the (3,) colour of a "white", "black" or "random" background; a random one without generator is black."""
+    """Return the (3,) colour of a "white", "black" or "random" background; a random one without
+    generator is black."""
     if name == "random" and generator is not None:
         return torch.rand(3, generator=generator, device="cpu")
     return torch.full((3,), _BACKGROUNDS["black" if name == "random" else name], device="cpu")
 
 
 def resolved_background(config: Config, capture: Capture) -> str:
-    """Return "white", "black" or "random"; "auto" is white where images have alpha, as in 3DGS, else black."""
+    """Return "white", "black" or "random"; "auto" is white where images have alpha, as in 3DGS,
+    else black."""
     if config.data.background == "auto":
         return "white" if capture.has_alpha else "black"
     return config.data.background
 
 
 def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras]:
-    """Return the cameras of ``views`` as images of their training size, one each; no image is read."""
+    """Return the cameras of ``views`` as images of their training size, one each; no image is
+    read."""
     cameras = []
     for view in views:
         width, height = view_size(view, options)
         intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
         pose = torch.from_numpy(view.cam_from_world).float()
-        cameras.append(Cameras(pose[None], torch.from_numpy(intrinsics).float()[None], width, height))
+        cameras.append(
+            Cameras(pose[None], torch.from_numpy(intrinsics).float()[None], width, height)
+        )
     return cameras
 
 

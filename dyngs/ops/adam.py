@@ -1,4 +1,5 @@
-"""Adam in place on arrays of rows, for all rows or only some: in float32 on the CPU one native pass over the memory."""
+"""Adam in place on arrays of rows, for all rows or only some: in float32 on the CPU one native pass
+over the memory."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from dyngs.ops.device import sent
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
 
-Count: TypeAlias = int | Tensor  # a number, or a tensor () of one that may still be on a GPU, where int waits for it
+# a number, or a tensor () of one that may still be on a GPU, where int waits for it
+Count: TypeAlias = int | Tensor
 _ARRAYS = "param", "grad", "exp_avg", "exp_avg_sq"
 
 
@@ -43,7 +45,8 @@ def _adam_steps(
 
 
 adam_steps_op = register("adam_steps_", _adam_steps, mutates=("params", "exp_avgs", "exp_avg_sqs"))
-"""Update arrays in place, each with rates (C,) and rows (size / C,) bool; returns the number () of rows skipped."""
+"""Update arrays in place, each with rates (C,) and rows (size / C,) bool; returns the number () of
+rows skipped."""
 
 
 def _seen_rows(grads: Tensor) -> Tensor:
@@ -59,8 +62,8 @@ seen_rows_op = register("seen_rows", _seen_rows)
 class AdamUpdate:
     """An update of ``param`` (N, ...): N rows of C numbers.
 
-    ``grad`` and the moments have its shape; ``lr``: a rate, or (C,) rates, better on the CPU; ``rows`` (N,) bool: the
-    rows to update, None: all. All but ``grad`` contiguous.
+    ``grad`` and the moments have its shape; ``lr``: a rate, or (C,) rates, better on the CPU;
+    ``rows`` (N,) bool: the rows to update, None: all. All but ``grad`` contiguous.
     """
 
     param: Tensor
@@ -84,19 +87,27 @@ def adam_step_(
     rows: Tensor | None = None,
 ) -> Tensor:
     """As ``adam_steps_`` of one array."""
-    return adam_steps_([AdamUpdate(param, grad, exp_avg, exp_avg_sq, lr, rows)], step=step, eps=eps, betas=betas)
+    return adam_steps_(
+        [AdamUpdate(param, grad, exp_avg, exp_avg_sq, lr, rows)], step=step, eps=eps, betas=betas
+    )
 
 
 @torch.no_grad()
 def adam_steps_(
-    updates: Sequence[AdamUpdate], *, step: int, eps: float = 1e-15, betas: tuple[float, float] = (0.9, 0.999)
+    updates: Sequence[AdamUpdate],
+    *,
+    step: int,
+    eps: float = 1e-15,
+    betas: tuple[float, float] = (0.9, 0.999),
 ) -> Tensor:
-    """Update arrays of one dtype and device in place; return the number () int64 of rows skipped for a bad gradient.
+    """Update arrays of one dtype and device in place; return the number () int64 of rows skipped
+    for a bad gradient.
 
-    Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step`` (from 1) also for
-    rows skipped before. A gradient is bad if it is NaN, infinite, or so large that its square is not safely finite
-    (2^63 in float32, 2^511 in float64). At least one update. Raises DyngsError: shapes or dtypes that do not fit, or
-    constants out of range; then nothing is updated.
+    Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global
+    ``step`` (from 1) also for rows skipped before. A gradient is bad if it is NaN, infinite, or so
+    large that its square is not safely finite (2^63 in float32, 2^511 in float64). At least one
+    update. Raises DyngsError: shapes or dtypes that do not fit, or constants out of range; then
+    nothing is updated.
     """
     like = updates[0].param
     for update in updates:
@@ -104,26 +115,35 @@ def adam_steps_(
     if step < 1:
         raise DyngsError(f"Adam: step counts from 1, got {step}")
     if not torch.finfo(like.dtype).tiny <= eps < math.inf:
-        raise DyngsError(f"Adam: eps must be at least {torch.finfo(like.dtype).tiny:.3g} and finite, got {eps}")
+        raise DyngsError(
+            f"Adam: eps must be at least {torch.finfo(like.dtype).tiny:.3g} and finite, got {eps}"
+        )
     if not all(0 <= beta < 1 for beta in betas):
         raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
     chosen = [x for x in updates if x.param.numel()]
     rates = [_column_rates(x.lr, x.param.numel() // len(x.param), x.param) for x in chosen]
     if not chosen:
         return torch.zeros((), dtype=torch.int64, device=like.device)
-    params, grads, exp_avgs, exp_avg_sqs = ([getattr(x, n).detach() for x in chosen] for n in _ARRAYS)
+    params, grads, exp_avgs, exp_avg_sqs = (
+        [getattr(x, n).detach() for x in chosen] for n in _ARRAYS
+    )
     rows = [x.rows for x in chosen]
     if like.dtype == torch.float32 and has_kernel("adam_steps_", like.device):
-        return adam_steps_op(params, grads, exp_avgs, exp_avg_sqs, rates, rows, list(betas), eps, step)
+        return adam_steps_op(
+            params, grads, exp_avgs, exp_avg_sqs, rates, rows, list(betas), eps, step
+        )
     skipped = torch.zeros((), dtype=torch.int64, device=like.device)
-    for p, g, m, v, rate, row in zip(params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True):
+    for p, g, m, v, rate, row in zip(
+        params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True
+    ):
         skipped += _torch_adam_step(p, g, m, v, rate, row, betas, eps, step)
     return skipped
 
 
 @torch.no_grad()
 def seen_rows(grads: Tensor) -> Tensor:
-    """Return (N,) bool: the rows of ``grads`` (N, ...) with an element other than zero; NaN counts as one."""
+    """Return (N,) bool: the rows of ``grads`` (N, ...) with an element other than zero; NaN counts
+    as one."""
     if grads.numel() == 0:
         return torch.zeros(len(grads), dtype=torch.bool, device=grads.device)
     flat = grads.detach().reshape(len(grads), -1)
@@ -142,8 +162,11 @@ def _torch_adam_step(
     eps: float,
     step: int,
 ) -> Tensor:
-    """Return the number of rows skipped, as ``adam_steps_op``, in plain torch: for other dtypes and devices."""
-    param, grad, exp_avg, exp_avg_sq = (x.reshape(len(x), -1) for x in (param, grad, exp_avg, exp_avg_sq))
+    """Return the number of rows skipped, as ``adam_steps_op``, in plain torch: for other dtypes and
+    devices."""
+    param, grad, exp_avg, exp_avg_sq = (
+        x.reshape(len(x), -1) for x in (param, grad, exp_avg, exp_avg_sq)
+    )
     too_large = 2.0 ** (math.frexp(torch.finfo(grad.dtype).max)[1] // 2 - 1)
     usable = (grad.abs() < too_large).all(dim=1)  # NaN is not
     wanted = torch.ones_like(usable) if rows is None else rows
@@ -162,27 +185,43 @@ def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     if not isinstance(lr, Tensor):
         return _rates((lr,), row_size, param.dtype, param.device)
     if lr.ndim > 0 and lr.shape != (row_size,):
-        raise DyngsError(f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(lr.shape)}")
-    return _rates(tuple(lr.detach().reshape(-1).cpu().numpy().tolist()), row_size, param.dtype, param.device)
+        raise DyngsError(
+            f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(lr.shape)}"
+        )
+    return _rates(
+        tuple(lr.detach().reshape(-1).cpu().numpy().tolist()), row_size, param.dtype, param.device
+    )
 
 
 @lru_cache(maxsize=256)  # most rates are those of the last step, and lie on the GPU by then
-def _rates(values: tuple[float, ...], row_size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _rates(
+    values: tuple[float, ...], row_size: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     if not all(map(math.isfinite, values)):
         raise DyngsError("Adam: lr must be finite")
-    return sent(torch.tensor(values, dtype=dtype, device="cpu"), device).expand(row_size).contiguous()
+    return (
+        sent(torch.tensor(values, dtype=dtype, device="cpu"), device).expand(row_size).contiguous()
+    )
 
 
 def _check(update: AdamUpdate, like: Tensor) -> None:
-    param, rows = update.param, update.rows
+    param = update.param
+    rows = update.rows
     if param.ndim == 0:
         raise DyngsError("Adam: the parameter must have at least one dimension, got a scalar")
-    shape, dtype = param.shape, like.dtype
+    shape = param.shape
+    dtype = like.dtype
     for name in _ARRAYS:
         x: Tensor = getattr(update, name)
         if x.shape != shape or x.dtype != dtype:
-            raise DyngsError(f"Adam: {name} is {tuple(x.shape)} {x.dtype}, but the parameter {tuple(shape)} {dtype}")
+            raise DyngsError(
+                f"Adam: {name} is {tuple(x.shape)} {x.dtype}, but the parameter {tuple(shape)} {dtype}"
+            )
         if name != "grad" and not x.is_contiguous():
-            raise DyngsError(f"Adam: {name} must be contiguous, as it is updated in place; call .contiguous() first")
+            raise DyngsError(
+                f"Adam: {name} must be contiguous, as it is updated in place; call .contiguous() first"
+            )
     if rows is not None and (rows.shape != shape[:1] or rows.dtype != torch.bool):
-        raise DyngsError(f"Adam: rows must be ({len(param)},) bool, got {tuple(rows.shape)} {rows.dtype}")
+        raise DyngsError(
+            f"Adam: rows must be ({len(param)},) bool, got {tuple(rows.shape)} {rows.dtype}"
+        )

@@ -1,4 +1,5 @@
-"""Checks of what callers give: numbers in range, finite tensors, and images that kernels can count and memory holds."""
+"""Checks of what callers give: numbers in range, finite tensors, and images that kernels can count
+and memory holds."""
 
 from __future__ import annotations
 
@@ -25,12 +26,19 @@ REMEDY = "lower the resolution, the scales or the number of views"
 def check_number(name: str, value: object, low: float, high: float = LARGEST) -> None:
     """Raise an error unless ``value`` is a number from ``low`` to ``high``."""
     if not isinstance(value, (int, float)) or not low <= value <= high:
-        upto = "" if high == math.inf else " and finite" if high == LARGEST else f" and at most {high:g}"
+        upto = (
+            ""
+            if high == math.inf
+            else " and finite"
+            if high == LARGEST
+            else f" and at most {high:g}"
+        )
         raise DyngsError(f"{name} must be a number of at least {low:g}{upto}, got {value!r}")
 
 
 def check_tensors(op: str, tensors: Mapping[str, tuple[Tensor, tuple[int, ...]]]) -> None:
-    """Raise an error unless the ``tensors`` of ``op`` have these shapes, are floating point and on one device."""
+    """Raise an error unless the ``tensors`` of ``op`` have these shapes, are floating point and on
+    one device."""
     first, device = next((name, x.device) for name, (x, _) in tensors.items())
     for name, (x, shape) in tensors.items():
         if tuple(x.shape) != shape:
@@ -63,21 +71,27 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 def check_size(width: int, height: int) -> None:
     """Raise an error unless images of this size can be drawn."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise DyngsError(f"render refused: an image of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px")
+        raise DyngsError(
+            f"render refused: an image of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px"
+        )
 
 
 def check_memory(size: int, what: str, like: Tensor) -> None:
-    """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and RLIMIT_AS leave free.
+    """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and
+    RLIMIT_AS leave free.
 
-    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit. Raises DyngsError:
-    with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
+    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit.
+    Raises DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once
+    is refused.)
     """
     if shapes_only() or like.device.type != "cpu" or size <= UNASKED:
         return
     available = core.available_memory()
     if size > available:
         needed, left = (f"{x / 1e9:.1f} GB" for x in (size, available))
-        raise DyngsError(f"render refused: {what} take {needed}; {left} of memory are available; {REMEDY}")
+        raise DyngsError(
+            f"render refused: {what} take {needed}; {left} of memory are available; {REMEDY}"
+        )
 
 
 def _count_nonfinite(tensors: list[Tensor]) -> Tensor:
@@ -92,7 +106,8 @@ count_nonfinite_op = register("count_nonfinite", _count_nonfinite)
 
 
 def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
-    """Raise an error unless every element of the ``tensors`` (float32 or float64, on one device) is finite."""
+    """Raise an error unless every element of the ``tensors`` (float32 or float64, on one device) is
+    finite."""
     given = [x.detach() for x in tensors.values()]
     if has_kernel("count_nonfinite", given[0].device):
         counts = count_nonfinite_op(given)
@@ -101,7 +116,9 @@ def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input")
     for (name, x), count in zip(tensors.items(), counts.cpu().numpy().tolist(), strict=True):
         if count:
             rows = int((~finite_rows([x])).sum())
-            raise DyngsError(f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}")
+            raise DyngsError(
+                f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}"
+            )
 
 
 def finite_rows(tensors: Sequence[Tensor]) -> Tensor:

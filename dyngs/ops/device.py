@@ -1,4 +1,5 @@
-"""Which device computes, the CPU or a CUDA GPU that torch, driver and compiled core can use; its memory and copies."""
+"""Which device computes, the CPU or a CUDA GPU that torch, driver and compiled core can use; its
+memory and copies."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ _BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, whic
 
 
 def device_for(choice: str) -> torch.device:
-    """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a GPU where one can be used, else the CPU."""
+    """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a GPU where one can be used,
+    else the CPU."""
     check_choice("device", choice, CHOICES)
     if choice == "cpu":
         return CPU
@@ -39,7 +41,8 @@ def device_for(choice: str) -> torch.device:
 
 
 def why_on_cpu(choice: str) -> str | None:
-    """Return a line on why ``choice`` means the CPU although the machine seems to have a GPU; None otherwise."""
+    """Return a line on why ``choice`` means the CPU although the machine seems to have a GPU; None
+    otherwise."""
     if choice != "auto" or not has_driver():
         return None
     reason = why_no_gpu()
@@ -47,7 +50,8 @@ def why_on_cpu(choice: str) -> str | None:
 
 
 def gpu_memory(device: torch.device) -> tuple[int, int] | None:
-    """Return the bytes of a GPU's memory that nobody has taken, and all that it has; None where it is no GPU."""
+    """Return the bytes of a GPU's memory that nobody has taken, and all that it has; None where it
+    is no GPU."""
     return torch.cuda.mem_get_info(device) if device.type == "cuda" else None
 
 
@@ -58,15 +62,20 @@ def num_gpus() -> int:
 
 @contextmanager
 def deterministic(device: torch.device, wanted: bool = True) -> Generator[None]:
-    """Let torch's operators on a GPU give the same bytes every time, inside this context; ours always do.
+    """Let torch's operators on a GPU give the same bytes every time, inside this context; ours
+    always do.
 
     Where torch has no such operator it warns. The CPU's need nothing of this.
     """
     if device.type != "cuda" or not wanted:
         yield
         return
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # what cuBLAS needs for it, before it begins
-    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    # what cuBLAS needs for it, before it begins
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    before = (
+        torch.are_deterministic_algorithms_enabled(),
+        torch.is_deterministic_algorithms_warn_only_enabled(),
+    )
     memory: Any = torch.utils.deterministic
     filled = memory.fill_uninitialized_memory
     torch.use_deterministic_algorithms(True, warn_only=True)
@@ -79,12 +88,13 @@ def deterministic(device: torch.device, wanted: bool = True) -> Generator[None]:
 
 
 def keep_freed_memory() -> bool:
-    """Keep freed blocks for reuse from now on; return whether that worked. Call it once, before training.
+    """Keep freed blocks for reuse from now on; return whether that worked. Call it once, before
+    training.
 
-    By default glibc takes blocks of 32 MiB or more from the system at each allocation, and the kernel clears their
-    pages again: much of a training step goes into page faults. Memory once used then stays with the process; the first
-    steps take large temporary blocks two or three times over. Results do not change. Without glibc nothing happens:
-    False.
+    By default glibc takes blocks of 32 MiB or more from the system at each allocation, and the
+    kernel clears their pages again: much of a training step goes into page faults. Memory once used
+    then stays with the process; the first steps take large temporary blocks two or three times
+    over. Results do not change. Without glibc nothing happens: False.
     """
     return core.keep_freed_memory()
 
@@ -102,7 +112,8 @@ def has_driver() -> bool:
 
 @cache
 def why_no_gpu() -> str | None:
-    """Return why no GPU can be used and what to do, beginning with a small letter; None where one can be."""
+    """Return why no GPU can be used and what to do, beginning with a small letter; None where one
+    can be."""
     if torch.version.cuda is None:
         return f"this torch ({torch.__version__}) is built without CUDA: {_TORCH}"
     if not torch.cuda.is_available():
@@ -115,7 +126,8 @@ def why_no_gpu() -> str | None:
 def _why_torch_has_none() -> str:
     try:
         torch.cuda.init()
-    except Exception as error:  # of torch: RuntimeError, or an AssertionError where it was built otherwise
+    except Exception as error:
+        # of torch: RuntimeError, or an AssertionError where it was built otherwise
         found = str(error).splitlines()[0].rstrip(".").partition(" Please ")[0].rstrip(".")
         if "too old" in found:
             return f"{found}: update the driver of the GPU, or {_TORCH.replace('CUDA', 'an older CUDA')}"
@@ -130,7 +142,8 @@ def _why_kernels_fail() -> str | None:
         kernels = cuda_core()
     except DyngsError as error:
         return str(error)
-    built, driver = kernels.runtime_version(), kernels.driver_version()
+    built = kernels.runtime_version()
+    driver = kernels.driver_version()
     if driver < built // 1000 * 1000:  # CUDA's minor versions are compatible
         versions = f"the kernels were built with CUDA {_said(built)}, but the driver knows {_said(driver)} at most"
         return f"{versions}: update the driver, or build dyngs with an older nvcc"
@@ -142,7 +155,8 @@ def _why_kernels_fail() -> str | None:
 
 
 def findings() -> Mapping[str, str]:
-    """Return what there is of torch's CUDA, driver, GPU and compiled core, by name; for ``dyngs doctor``."""
+    """Return what there is of torch's CUDA, driver, GPU and compiled core, by name; for ``dyngs
+    doctor``."""
     version = torch.version.cuda
     found = {"torch for": "the CPU alone" if version is None else f"CUDA {version}"}
     if has_cuda_core():
@@ -174,13 +188,15 @@ def _said(version: int) -> str:
 def sent(x: Tensor, device: torch.device | str) -> Tensor:
     """Return ``x`` on ``device``; the copy of a tensor of the CPU is queued.
 
-    The driver has taken a copy of pageable memory before the call returns, so that ``x`` may change at once.
+    The driver has taken a copy of pageable memory before the call returns, so that ``x`` may change
+    at once.
     """
     return x.to(device, non_blocking=x.device.type == "cpu")
 
 
 class ReadBack:
-    """Numbers of a tensor, which a GPU copies to the CPU as soon as it has them, while more work is queued."""
+    """Numbers of a tensor, which a GPU copies to the CPU as soon as it has them, while more work is
+    queued."""
 
     def __init__(self, x: Tensor) -> None:
         self._ready: torch.cuda.Event | None = None
@@ -193,14 +209,16 @@ class ReadBack:
         self._ready.record(torch.cuda.current_stream(x.device))
 
     def numbers(self) -> Tensor:
-        """Return them on the CPU; waits until the GPU has come to them, not for what was queued later."""
+        """Return them on the CPU; waits until the GPU has come to them, not for what was queued
+        later."""
         if self._ready is not None:
             self._ready.synchronize()
         return self._numbers
 
 
 class Upload:
-    """Arrays of the CPU that are copied to a GPU next to its work: by a stream of their own, from pinned memory.
+    """Arrays of the CPU that are copied to a GPU next to its work: by a stream of their own, from
+    pinned memory.
 
     May be made in any thread. What has no such streams gets them when they are asked for.
     """
@@ -217,7 +235,8 @@ class Upload:
             self._done.record(stream)
 
     def arrays(self) -> list[Tensor]:
-        """Return them on the GPU; what is queued after this in the current stream finds them there."""
+        """Return them on the GPU; what is queued after this in the current stream finds them
+        there."""
         if self._done is None:
             return [sent(x, self._device) for x in self._arrays]
         current = torch.cuda.current_stream(self._device)

@@ -23,7 +23,8 @@ def _harmonics_backward(
     inputs: list[Tensor], colors: Tensor, grad: Tensor, degree: int, with_centers: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     means, centers, sh, _ = inputs
-    g_means, g_sh = empty_like(means), empty_like(sh)
+    g_means = empty_like(means)
+    g_sh = empty_like(sh)
     g_centers = centers.new_zeros(centers.shape)
     results = g_means, g_sh, g_centers if with_centers else None
     launch(means, "harmonics_backward", *inputs, (colors, grad), results, degree, num_threads())
@@ -48,11 +49,14 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
 harmonics_op = register("harmonics", _harmonics, gradient=Gradient(_save, _backward))
 
 
-def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
-    """Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from ``centers`` (V, 3), zero where culled.
+def evaluate_harmonics(
+    means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int
+) -> Tensor:
+    """Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from ``centers`` (V, 3),
+    zero where culled.
 
-    Differentiable in means, centers and sh (N, K, 3); ``radii`` (V, N, 2) int32; ``degree`` 0 to 4, at most that of
-    ``sh``.
+    Differentiable in means, centers and sh (N, K, 3); ``radii`` (V, N, 2) int32; ``degree`` 0 to 4,
+    at most that of ``sh``.
     """
     return harmonics_op(means, centers, sh, radii, degree)
 
@@ -80,7 +84,8 @@ class _Dimmed(torch.autograd.Function):
 def dimmed(sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
     """Return harmonics (N, K, 3) whose colours are the parts ``left`` (N,) of those of ``sh``.
 
-    Differentiable once, in ``sh`` and in ``few``, which is every so many-th of ``left``: enough to learn few numbers.
+    Differentiable once, in ``sh`` and in ``few``, which is every so many-th of ``left``: enough to
+    learn few numbers.
     """
     return cast(Any, _Dimmed).apply(sh, left, few, every)
 
@@ -88,7 +93,8 @@ def dimmed(sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
 def light_harmonics(directions: Tensor) -> Tensor:
     """Return the harmonics (N, 8) of degree 1 and 2, not normalised, in unit directions (N, 3).
 
-    Diffuse light on what faces these directions has hardly any finer detail (Ramamoorthi and Hanrahan 2001).
+    Diffuse light on what faces these directions has hardly any finer detail (Ramamoorthi and
+    Hanrahan 2001).
     """
     return torch.stack(_light_terms(directions.T), dim=1)
 
@@ -103,7 +109,9 @@ def _light_terms_vjp(directions: Tensor, by_terms: Tensor) -> Tensor:
     """Return the gradient (3, N) by the directions, of that by the harmonics (8, N)."""
     x, y, z = directions.unbind(0)
     products = by_terms[3:6]  # of each coordinate with the next
-    by_directions = by_terms[:3] + products * directions.roll(-1, 0) + (products * directions).roll(1, 0)
+    by_directions = (
+        by_terms[:3] + products * directions.roll(-1, 0) + (products * directions).roll(1, 0)
+    )
     by_directions[0].addcmul_(by_terms[6], x, value=2)
     by_directions[1].addcmul_(by_terms[6], y, value=-2)
     by_directions[2].addcmul_(by_terms[7], z, value=6)
@@ -111,11 +119,13 @@ def _light_terms_vjp(directions: Tensor, by_terms: Tensor) -> Tensor:
 
 
 class _Lit(torch.autograd.Function):
-    """See ``lit``. Numbers of one kind lie side by side: sums over rows of three are slow in torch."""
+    """See ``lit``. Numbers of one kind lie side by side: sums over rows of three are slow in
+    torch."""
 
     @staticmethod
     def forward(ctx: Any, sh: Tensor, linear: Tensor, normals: Tensor, factors: Tensor) -> Tensor:
-        moves, rest = linear.permute(1, 2, 0).contiguous(), normals.T.contiguous()
+        moves = linear.permute(1, 2, 0).contiguous()
+        rest = normals.T.contiguous()
         moved = (moves * rest).sum(1)
         lengths = moved.square().sum(0).sqrt().clamp_min(_SHORTEST)
         facing = moved / lengths
@@ -129,7 +139,10 @@ class _Lit(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (sh, moves, rest, factors, lengths, facing, terms, light), (grad,) = ctx.saved_tensors, grads
+        (sh, moves, rest, factors, lengths, facing, terms, light), (grad,) = (
+            ctx.saved_tensors,
+            grads,
+        )
         by_light = (grad * sh).sum(1).add_(grad[:, 0], alpha=0.5 / SH_C0).T.contiguous()
         by_facing = _light_terms_vjp(facing, factors @ by_light)
         by_moved = (by_facing - facing * (facing * by_facing).sum(0)) / lengths
@@ -142,18 +155,21 @@ _SHORTEST = 1e-12  # length below which a normal has no direction
 
 
 def lit(sh: Tensor, linear: Tensor, normals: Tensor, factors: Tensor) -> Tensor:
-    """Return harmonics (N, K, 3) with their colours times 1 + y A, differentiable once in everything.
+    """Return harmonics (N, K, 3) with their colours times 1 + y A, differentiable once in
+    everything.
 
-    y are the ``light_harmonics`` of the normals (N, 3), of any length, as the maps ``linear`` (N, 3, 3) move them;
-    ``factors`` A (8, 3) are those of red, green and blue.
+    y are the ``light_harmonics`` of the normals (N, 3), of any length, as the maps ``linear`` (N,
+    3, 3) move them; ``factors`` A (8, 3) are those of red, green and blue.
     """
     return cast(Any, _Lit).apply(sh, linear, normals, factors)
 
 
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
-    """Return (..., K) real spherical harmonics of unit directions (..., 3), from the associated Legendre recursion.
+    """Return (..., K) real spherical harmonics of unit directions (..., 3), from the associated
+    Legendre recursion.
 
-    Independent of the kernels' polynomials; signs as in 3DGS (Condon-Shortley phase included). Slow.
+    Independent of the kernels' polynomials; signs as in 3DGS (Condon-Shortley phase included).
+    Slow.
     """
     x, y, z = directions.unbind(-1)
     azimuth = torch.complex(x, y)
@@ -176,7 +192,8 @@ def _factorial_ratio(order: int, m: int) -> float:
 
 
 def _legendre_without_sine(order: int, m: int, z: Tensor) -> Tensor:
-    """Return the associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley phase (-1)^m."""
+    """Return the associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley
+    phase (-1)^m."""
     current = torch.ones_like(z)
     for k in range(1, m + 1):
         current = current * -(2 * k - 1)

@@ -1,7 +1,9 @@
-"""Features from a multiresolution hash grid (Müller et al. 2022, Instant Neural Graphics Primitives), differentiable.
+"""Features from a multiresolution hash grid (Müller et al. 2022, Instant Neural Graphics
+Primitives), differentiable.
 
 M points, L levels, F features of each. A level has samples at (g - 0.5) / scale along each
-axis, clamped at its last. Where all fit, each has a row of its own; else they share rows by a hash of their index.
+axis, clamped at its last. Where all fit, each has a row of its own; else they share rows by a hash
+of their index.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ WIDTHS = 1, 2, 4, 8  # Features of a level that there are kernels for
 
 @dataclass(frozen=True)
 class HashLevels:
-    """Scale, samples along an axis, and rows of each level; rows of all levels lie one after the other in one table."""
+    """Scale, samples along an axis, and rows of each level; rows of all levels lie one after the
+    other in one table."""
 
     scales: tuple[float, ...]
     sizes: tuple[int, ...]
@@ -30,7 +33,8 @@ class HashLevels:
 
     @staticmethod
     def geometric(num_levels: int, coarsest: int, finest: int, most_rows: int) -> HashLevels:
-        """Return levels whose resolution grows by the same factor each time; ``most_rows`` of each is a power of two.
+        """Return levels whose resolution grows by the same factor each time; ``most_rows`` of each
+        is a power of two.
 
         The published formula: scale_l = coarsest b^l - 1, size_l = ceil(scale_l) + 1.
         """
@@ -49,17 +53,40 @@ def _sizes(scales: list[float], sizes: list[int], rows: list[int]) -> list[tuple
     return list(zip(scales, sizes, rows, strict=True))
 
 
-def _hash_grid(coords: Tensor, table: Tensor, scales: list[float], sizes: list[int], rows: list[int]) -> Tensor:
+def _hash_grid(
+    coords: Tensor, table: Tensor, scales: list[float], sizes: list[int], rows: list[int]
+) -> Tensor:
     features = table.new_empty(coords.shape[0], len(rows) * table.shape[1])
-    launch(coords, "hash_grid_forward", coords, table, _sizes(scales, sizes, rows), features, num_threads())
+    launch(
+        coords,
+        "hash_grid_forward",
+        coords,
+        table,
+        _sizes(scales, sizes, rows),
+        features,
+        num_threads(),
+    )
     return features
 
 
 def _hash_grid_backward(
-    coords: Tensor, table: Tensor, grad: Tensor, scales: list[float], sizes: list[int], rows: list[int]
+    coords: Tensor,
+    table: Tensor,
+    grad: Tensor,
+    scales: list[float],
+    sizes: list[int],
+    rows: list[int],
 ) -> Tensor:
     g_table = empty_like(table)
-    launch(coords, "hash_grid_backward", coords, _sizes(scales, sizes, rows), grad, g_table, num_threads())
+    launch(
+        coords,
+        "hash_grid_backward",
+        coords,
+        _sizes(scales, sizes, rows),
+        grad,
+        g_table,
+        num_threads(),
+    )
     return g_table
 
 
@@ -75,7 +102,13 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     coords, table = ctx.saved_tensors
     scales, sizes, rows = ctx.levels
-    return None, hash_grid_backward_op(coords, table, grad.contiguous(), scales, sizes, rows), None, None, None
+    return (
+        None,
+        hash_grid_backward_op(coords, table, grad.contiguous(), scales, sizes, rows),
+        None,
+        None,
+        None,
+    )
 
 
 hash_grid_op = register("hash_grid", _hash_grid, gradient=Gradient(_save, _backward))
@@ -83,11 +116,12 @@ hash_grid_op = register("hash_grid", _hash_grid, gradient=Gradient(_save, _backw
 
 
 def hash_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    """Return (M, L * F) features of points (M, 3) in the unit cube, interpolated between rows of ``table``.
+    """Return (M, L * F) features of points (M, 3) in the unit cube, interpolated between rows of
+    ``table``.
 
-    Differentiable once, in the table. What lies outside of the cube counts as on its surface; a coordinate that is no
-    finite number gives features of NaN. The same bits on any number of threads. Raises DyngsError: shapes or dtypes
-    that do not fit.
+    Differentiable once, in the table. What lies outside of the cube counts as on its surface; a
+    coordinate that is no finite number gives features of NaN. The same bits on any number of
+    threads. Raises DyngsError: shapes or dtypes that do not fit.
     """
     if coords.ndim != 2 or coords.shape[1] != 3:
         raise DyngsError(f"hash grid: points must be (M, 3), got {tuple(coords.shape)}")
@@ -102,7 +136,9 @@ def hash_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
         )
     if coords.requires_grad and torch.is_grad_enabled():
         raise DyngsError("hash grid: there is no gradient by the points; detach them")
-    return hash_grid_op(coords.contiguous(), table, list(levels.scales), list(levels.sizes), list(levels.rows))
+    return hash_grid_op(
+        coords.contiguous(), table, list(levels.scales), list(levels.sizes), list(levels.rows)
+    )
 
 
 def _known(
@@ -126,12 +162,19 @@ def _backward_known(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return None, None, *_backward(ctx, grad)
 
 
-known_features_op = register("known_features", _known, gradient=Gradient(_save_known, _backward_known))
+known_features_op = register(
+    "known_features", _known, gradient=Gradient(_save_known, _backward_known)
+)
 
 
-def known_features(features: Tensor, which: Tensor, coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    """Return the rows ``which`` (K,) of ``features``, as ``hash_features`` of the points ``coords`` (K, 3) gives them.
+def known_features(
+    features: Tensor, which: Tensor, coords: Tensor, table: Tensor, levels: HashLevels
+) -> Tensor:
+    """Return the rows ``which`` (K,) of ``features``, as ``hash_features`` of the points ``coords``
+    (K, 3) gives them.
 
     Differentiable in the table as if they had been looked up again.
     """
-    return known_features_op(features, which, coords, table, list(levels.scales), list(levels.sizes), list(levels.rows))
+    return known_features_op(
+        features, which, coords, table, list(levels.scales), list(levels.sizes), list(levels.rows)
+    )

@@ -1,7 +1,7 @@
 """Fused L1 + SSIM loss of one image, and SSIM as a measure.
 
-In float32 the value and its gradient come from one native call; in other dtypes, and on devices without an
-implementation, from the plain torch formula, which is also the reference of the tests.
+In float32 the value and its gradient come from one native call; in other dtypes, and on devices
+without an implementation, from the plain torch formula, which is also the reference of the tests.
 """
 
 from __future__ import annotations
@@ -46,18 +46,23 @@ def _backward(ctx: Any, grad_loss: Tensor, _: Tensor | None) -> tuple[Tensor | N
 
 
 l1_ssim_op = register("l1_ssim", _l1_ssim, gradient=Gradient(_save, _backward))
-"""The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for; float32, contiguous."""
+"""The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for; float32,
+contiguous."""
 
 
-def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
-    """Return the training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, differentiable in ``rendered``.
+def l1_ssim_loss(
+    rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
+) -> Tensor:
+    """Return the training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``,
+    differentiable in ``rendered``.
 
-    L1 is the mean of ``|x - y|``; SSIM the mean of the SSIM map with an 11x11 Gaussian window of sigma 1.5, zero
-    padding and data range 1, as in 3DGS. A mask (H, W) in [0, 1] multiplies both images and weights both means: ``sum(m
+    L1 is the mean of ``|x - y|``; SSIM the mean of the SSIM map with an 11x11 Gaussian window of
+    sigma 1.5, zero padding and data range 1, as in 3DGS. A mask (H, W) in [0, 1] multiplies both
+    images and weights both means: ``sum(m
     |x - y|) / (3 sum m)``; a mask of zeros gives 0. In float32 on the CPU only first derivatives exist. Where values go
-    beyond about 2, SSIM is computed in float64. ``rendered`` x and the constant ``target`` y are (H, W, 3), any
-    strides; half precision is computed in float32. Raises DyngsError: shapes that do not fit, an empty image, or
-    integer images.
+    beyond about 2, SSIM is computed in float64. ``rendered`` x and the constant ``target`` y are
+    (H, W, 3), any strides; half precision is computed in float32. Raises DyngsError: shapes that do
+    not fit, an empty image, or integer images.
     """
     _check(rendered, target, mask)
     x, y, m = _in_common_precision(rendered, target, mask)
@@ -68,16 +73,21 @@ def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mas
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Return the mean SSIM () of two (H, W, 3) images in [0, 1], differentiable in ``a``; see `l1_ssim_loss`."""
+    """Return the mean SSIM () of two (H, W, 3) images in [0, 1], differentiable in ``a``; see
+    `l1_ssim_loss`."""
     return 1 - l1_ssim_loss(a, b, ssim_weight=1.0)
 
 
-def reference_l1_ssim(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
-    """Return `l1_ssim_loss` computed in plain torch: any floating dtype and device, differentiable in every tensor."""
+def reference_l1_ssim(
+    rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
+) -> Tensor:
+    """Return `l1_ssim_loss` computed in plain torch: any floating dtype and device, differentiable
+    in every tensor."""
     weight = torch.ones_like(rendered[..., 0]) if mask is None else mask
     total = 3 * weight.sum()
     total = torch.where(total == 0, 1, total)
-    x, y = weight[..., None] * rendered, weight[..., None] * target
+    x = weight[..., None] * rendered
+    y = weight[..., None] * target
     loss = (1 - ssim_weight) * (x - y).abs().sum() / total
     if ssim_weight == 0:
         return loss
@@ -89,32 +99,50 @@ def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
 
     Computed in float64, because the difference of second moments that gives a variance cancels.
     """
-    dtype, x, y = x.dtype, x.double(), y.double()
+    dtype = x.dtype
+    x = x.double()
+    y = y.double()
     taps = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=x.dtype, device=x.device)
     taps = torch.exp(-(taps**2) / (2 * SSIM_SIGMA**2))
     column = (taps / taps.sum()).view(1, 1, -1, 1)
-    planes = torch.stack([x, y, x * x, y * y, x * y]).permute(0, 3, 1, 2).flatten(0, 1)[:, None]  # (5 * 3, 1, H, W)
+    # (5 * 3, 1, H, W)
+    planes = torch.stack([x, y, x * x, y * y, x * y]).permute(0, 3, 1, 2).flatten(0, 1)[:, None]
     blurred = conv2d(planes, column, padding=(SSIM_RADIUS, 0))
     blurred = conv2d(blurred, column.transpose(2, 3), padding=(0, SSIM_RADIUS))
-    mean_x, mean_y, square_x, square_y, product = blurred.view(5, 3, *x.shape[:2]).permute(0, 2, 3, 1)
+    mean_x, mean_y, square_x, square_y, product = blurred.view(5, 3, *x.shape[:2]).permute(
+        0, 2, 3, 1
+    )
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
     variances = square_x - mean_x**2 + square_y - mean_y**2
-    return (luminance * (2 * (product - mean_x * mean_y) + SSIM_C2) / (variances + SSIM_C2)).to(dtype)
+    return (luminance * (2 * (product - mean_x * mean_y) + SSIM_C2) / (variances + SSIM_C2)).to(
+        dtype
+    )
 
 
 def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
     if rendered.ndim != 3 or rendered.shape[2] != 3 or rendered.numel() == 0:
-        raise DyngsError(f"loss: the rendered image must be (H, W, 3) and not empty, got {tuple(rendered.shape)}")
+        raise DyngsError(
+            f"loss: the rendered image must be (H, W, 3) and not empty, got {tuple(rendered.shape)}"
+        )
     if target.shape != rendered.shape:
-        raise DyngsError(f"loss: the target is {tuple(target.shape)}, but the image {tuple(rendered.shape)}")
+        raise DyngsError(
+            f"loss: the target is {tuple(target.shape)}, but the image {tuple(rendered.shape)}"
+        )
     if mask is not None and mask.shape != rendered.shape[:2]:
-        raise DyngsError(f"loss: the mask must be (H, W) = {tuple(rendered.shape[:2])}, got {tuple(mask.shape)}")
+        raise DyngsError(
+            f"loss: the mask must be (H, W) = {tuple(rendered.shape[:2])}, got {tuple(mask.shape)}"
+        )
     if not (rendered.is_floating_point() and target.is_floating_point()):
-        raise DyngsError(f"loss: images must be floating point, got {rendered.dtype} and {target.dtype}")
+        raise DyngsError(
+            f"loss: images must be floating point, got {rendered.dtype} and {target.dtype}"
+        )
 
 
-def _in_common_precision(rendered: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the inputs contiguous and in one dtype, at least float32; target and mask cut off from autograd."""
+def _in_common_precision(
+    rendered: Tensor, target: Tensor, mask: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return the inputs contiguous and in one dtype, at least float32; target and mask cut off from
+    autograd."""
     given = [rendered.dtype, target.dtype, torch.float32]
     dtype = reduce(torch.promote_types, given)
     constants = [None if x is None else x.detach().to(dtype).contiguous() for x in (target, mask)]

@@ -1,7 +1,9 @@
-"""The compiled cores for this processor and for CUDA GPUs, the number of threads, and tensors passed to a core.
+"""The compiled cores for this processor and for CUDA GPUs, the number of threads, and tensors
+passed to a core.
 
-There is one module per x86-64 level; the newest that the processor runs is imported, ``DYNGS_ISA=v2|v3|v4`` picks an
-older one, for tests. That for CUDA GPUs (docs/gpu.md) is imported when the first tensor on a GPU comes.
+There is one module per x86-64 level; the newest that the processor runs is imported,
+``DYNGS_ISA=v2|v3|v4`` picks an older one, for tests. That for CUDA GPUs (docs/gpu.md) is imported
+when the first tensor on a GPU comes.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from torch.utils.dlpack import to_dlpack  # pyright: ignore[reportPrivateImportU
 from dyngs.errors import DyngsError
 
 _BASELINE = "SSE4.2" if platform.machine() in ("x86_64", "AMD64") else "NEON"
-ISA_NAMES = {"v2": _BASELINE, "v3": "AVX2", "v4": "AVX-512"}  # instruction sets, x86-64 levels, oldest first
+# instruction sets, x86-64 levels, oldest first
+ISA_NAMES = {"v2": _BASELINE, "v3": "AVX2", "v4": "AVX-512"}
 
 
 def built_isas() -> tuple[str, ...]:
@@ -36,8 +39,9 @@ def built_isas() -> tuple[str, ...]:
 def choose_isa(built: tuple[str, ...], newest: str, requested: str | None) -> str:
     """Return the instruction set to load.
 
-    ``built``: instruction sets that were compiled, oldest first. ``requested``: value of ``DYNGS_ISA``; None where
-    unset. Raises DyngsError: the processor runs none of these, or not the requested one.
+    ``built``: instruction sets that were compiled, oldest first. ``requested``: value of
+    ``DYNGS_ISA``; None where unset. Raises DyngsError: the processor runs none of these, or not the
+    requested one.
     """
     usable = [isa for isa in built if isa <= newest]
     if not usable:
@@ -57,7 +61,8 @@ def choose_isa(built: tuple[str, ...], newest: str, requested: str | None) -> st
 def _load_core() -> tuple[ModuleType, str]:
     built = built_isas() or ("v2",)
     try:
-        asked = import_module(f"dyngs.ops._core_{built[-1]}")  # all but its kernels runs on every processor
+        # all but its kernels runs on every processor
+        asked = import_module(f"dyngs.ops._core_{built[-1]}")
         isa = choose_isa(built, asked.best_isa(), os.environ.get("DYNGS_ISA"))
         return import_module(f"dyngs.ops._core_{isa}"), isa
     except ImportError as error:
@@ -77,7 +82,8 @@ def has_cuda_core() -> bool:
 
 @cache
 def cuda_core() -> ModuleType:
-    """Return the compiled core for CUDA GPUs. Raises DyngsError: it was not built, or cannot be loaded."""
+    """Return the compiled core for CUDA GPUs. Raises DyngsError: it was not built, or cannot be
+    loaded."""
     try:
         return import_module(_CUDA_CORE)
     except ImportError as error:
@@ -86,7 +92,8 @@ def cuda_core() -> ModuleType:
 
 
 def core_for(x: Tensor) -> ModuleType:
-    """Return the compiled core that computes where ``x`` lies; on a GPU it goes on in torch's current stream there.
+    """Return the compiled core that computes where ``x`` lies; on a GPU it goes on in torch's
+    current stream there.
 
     Raises DyngsError: ``x`` is float64 on a GPU.
     """
@@ -94,13 +101,15 @@ def core_for(x: Tensor) -> ModuleType:
         return core
     if x.dtype == torch.float64:
         raise DyngsError("float64 is not there on a GPU; use float32")
-    module, index = cuda_core(), x.get_device()
+    module = cuda_core()
+    index = x.get_device()
     module.use_queue(index, torch._C._cuda_getCurrentRawStream(index))  # pyright: ignore
     return module
 
 
 def lend(size: int, device: int) -> Tensor:
-    """Return ``size`` bytes of a GPU's memory; called by its core, which gives them back when its work is queued."""
+    """Return ``size`` bytes of a GPU's memory; called by its core, which gives them back when its
+    work is queued."""
     return torch.empty(size, dtype=torch.uint8, device=_gpu(device))
 
 
@@ -110,7 +119,8 @@ def _gpu(index: int) -> torch.device:
 
 
 def active_isa() -> str:
-    """Return the instruction set of the loaded kernels: ``v2``, ``v3`` (AVX2) or ``v4`` (AVX-512)."""
+    """Return the instruction set of the loaded kernels: ``v2``, ``v3`` (AVX2) or ``v4``
+    (AVX-512)."""
     return _ISA
 
 
@@ -118,7 +128,8 @@ _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=N
 
 
 def num_threads() -> int:
-    """Return the number of threads of the kernels: of ``kernel_threads``, else torch's; after a fork see ``Fork``."""
+    """Return the number of threads of the kernels: of ``kernel_threads``, else torch's; after a
+    fork see ``Fork``."""
     wanted = _kernel_threads.get() or torch.get_num_threads()
     return _fork.allowed(wanted) if _fork.lost_threads else wanted
 
@@ -126,8 +137,9 @@ def num_threads() -> int:
 class Fork:
     """Handling of the threads of OpenMP in a process made by ``os.fork``.
 
-    The child has the parent's list of waiting threads, but not the threads: the next parallel loop would wait without
-    end. Where the parent had started any, the child runs kernels and torch's operators on one thread, and says so once.
+    The child has the parent's list of waiting threads, but not the threads: the next parallel loop
+    would wait without end. Where the parent had started any, the child runs kernels and torch's
+    operators on one thread, and says so once.
     """
 
     def __init__(self) -> None:
@@ -141,14 +153,16 @@ class Fork:
         self._team = self.lost_threads or self._team or _native_threads() > self._before
 
     def go_on(self) -> None:
-        """Count the threads that are not of OpenMP; called in the parent just after a fork, which ends OpenBLAS's."""
+        """Count the threads that are not of OpenMP; called in the parent just after a fork, which
+        ends OpenBLAS's."""
         if not self._team:
             self._before = _native_threads()
 
     def begin_child(self) -> None:
         """Set the number of threads; called in the child just after the fork."""
         self._before = _native_threads()
-        self.lost_threads, self._told = self._team, False
+        self.lost_threads = self._team
+        self._told = False
         if self.lost_threads:
             self._told = (_kernel_threads.get() or torch.get_num_threads()) == 1
             torch.set_num_threads(1)
@@ -157,14 +171,21 @@ class Fork:
         """Return 1, with one warning where more were wanted or would have been before the fork."""
         if not self._told and torch.utils.data.get_worker_info() is None:
             self._told = True
-            reason = "this process was forked from one that had started threads, which it has not got"
+            reason = (
+                "this process was forked from one that had started threads, which it has not got"
+            )
             remedy = "start processes with multiprocessing's 'spawn' method to use more"
-            warnings.warn(f"dyngs and torch run on one thread: {reason}; {remedy}", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"dyngs and torch run on one thread: {reason}; {remedy}",
+                RuntimeWarning,
+                stacklevel=2,
+            )
         return min(wanted, 1)
 
 
 def _native_threads() -> int:
-    """Return the number of threads of this process that Python did not start; those of OpenMP stay once started.
+    """Return the number of threads of this process that Python did not start; those of OpenMP stay
+    once started.
 
     0 without Linux's /proc: elsewhere processes are not forked, or the OpenMP library starts anew.
     """
@@ -176,15 +197,18 @@ def _native_threads() -> int:
 
 _fork = Fork()
 if sys.platform != "win32":
-    os.register_at_fork(before=_fork.remember, after_in_parent=_fork.go_on, after_in_child=_fork.begin_child)
+    os.register_at_fork(
+        before=_fork.remember, after_in_parent=_fork.go_on, after_in_child=_fork.begin_child
+    )
 
 
 @contextmanager
 def kernel_threads(count: int) -> Generator[None]:
     """Run kernels on ``count`` threads and torch's own operators on one inside this context.
 
-    Why: around the kernels torch only does small element-wise work, where its threads cost more than they save, most of
-    all on a machine that does other things too; and its sums then do not depend on the number of threads.
+    Why: around the kernels torch only does small element-wise work, where its threads cost more
+    than they save, most of all on a machine that does other things too; and its sums then do not
+    depend on the number of threads.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -199,17 +223,21 @@ def kernel_threads(count: int) -> Generator[None]:
 def array(x: Tensor) -> object:
     """Return ``x`` as the kernels take it: C-contiguous, in a DLPack capsule (good for one call).
 
-    A capsule costs 0.5 us where handing over the tensor itself costs 5 us, and a training step passes a hundred.
+    A capsule costs 0.5 us where handing over the tensor itself costs 5 us, and a training step
+    passes a hundred.
     """
     return to_dlpack(x if x.is_contiguous() else x.detach().contiguous())
 
 
 def writable(x: Tensor) -> object:
-    """Return ``x`` as ``array`` does, for a kernel that writes to it; autograd then counts ``x`` as changed.
+    """Return ``x`` as ``array`` does, for a kernel that writes to it; autograd then counts ``x`` as
+    changed.
 
     Raises DyngsError: ``x`` is not contiguous, so that the kernel would write to a copy.
     """
     if not x.is_contiguous():
-        raise DyngsError("a tensor that is updated in place must be contiguous; call .contiguous() first")
+        raise DyngsError(
+            "a tensor that is updated in place must be contiguous; call .contiguous() first"
+        )
     torch.autograd.graph.increment_version(x)
     return to_dlpack(x)

@@ -18,13 +18,20 @@ T = TypeVar("T", float, Tensor)
 
 SPAN = 4  # Control points that a value depends on
 HEAD_SIZES = (3, 4, 3, 1, 3)
-"""Number of values of each head: means, quaternions less the identity, log scales, opacity logits, colours."""
+"""Number of values of each head: means, quaternions less the identity, log scales, opacity logits,
+colours."""
 
 
 def cubic_fractions(place: T) -> tuple[T, T, T, T]:
-    """Return the weights of the control points of a piece of a uniform cubic B-spline, at ``place`` in [0, 1]."""
+    """Return the weights of the control points of a piece of a uniform cubic B-spline, at ``place``
+    in [0, 1]."""
     rest = 1 - place
-    return rest**3 / 6, (3 * place**3 - 6 * place**2 + 4) / 6, (3 * rest**3 - 6 * rest**2 + 4) / 6, place**3 / 6
+    return (
+        rest**3 / 6,
+        (3 * place**3 - 6 * place**2 + 4) / 6,
+        (3 * rest**3 - 6 * rest**2 + 4) / 6,
+        place**3 / 6,
+    )
 
 
 def _place(points: int, time: float) -> tuple[int, float, float, float, float]:
@@ -45,7 +52,8 @@ def _nodes_at(
 ) -> tuple[Tensor, Tensor]:
     heads = means, quats, log_scales, logit_opacities, colors
     width = sum(x.shape[2] for x in heads[1:] if x is not None)
-    motion, values = means.new_empty(means.shape[0], 7), means.new_empty(means.shape[0], width)
+    motion = means.new_empty(means.shape[0], 7)
+    values = means.new_empty(means.shape[0], width)
     launch(means, "nodes_at", heads, _place(means.shape[1], time), motion, values, num_threads())
     return motion, values
 
@@ -61,7 +69,15 @@ def _nodes_at_backward(
 ) -> list[Tensor]:
     heads = means, quats, log_scales, logit_opacities, colors
     results = [None if x is None else empty_like(x) for x in heads]
-    launch(means, "nodes_at_backward", heads, _place(means.shape[1], time), *grads, results, num_threads())
+    launch(
+        means,
+        "nodes_at_backward",
+        heads,
+        _place(means.shape[1], time),
+        *grads,
+        results,
+        num_threads(),
+    )
     return [x for x in results if x is not None]
 
 
@@ -79,7 +95,11 @@ def _backward(ctx: Any, g_motion: Tensor, g_values: Tensor) -> tuple[Tensor | No
     means, *others = (next(saved) if there else None for there in ctx.there)
     assert means is not None
     quats, log_scales, logits, colors = others
-    found = iter(nodes_at_backward_op(means, quats, log_scales, logits, colors, [g_motion, g_values], ctx.time))
+    found = iter(
+        nodes_at_backward_op(
+            means, quats, log_scales, logits, colors, [g_motion, g_values], ctx.time
+        )
+    )
     return *(next(found) if there else None for there in ctx.there), None
 
 
@@ -87,11 +107,13 @@ nodes_at_op = register("nodes_at", _nodes_at, gradient=Gradient(_save, _backward
 
 
 def spline_motion(heads: Sequence[Tensor | None], time: float) -> tuple[Tensor, Tensor]:
-    """Return what nodes do at ``time`` in [0, 1]: motion (S, 7) as ``blend_skinning`` takes it, and values (S, D).
+    """Return what nodes do at ``time`` in [0, 1]: motion (S, 7) as ``blend_skinning`` takes it, and
+    values (S, D).
 
-    Differentiable once. ``heads``: control points (S, P, size) of uniform cubic B-splines, P at least 4, for each of
-    ``HEAD_SIZES``; the first is there, others may be None. Motion: means, then the identity plus quaternions. Values:
-    of all heads that are there but the first, one after the other.
+    Differentiable once. ``heads``: control points (S, P, size) of uniform cubic B-splines, P at
+    least 4, for each of ``HEAD_SIZES``; the first is there, others may be None. Motion: means, then
+    the identity plus quaternions. Values: of all heads that are there but the first, one after the
+    other.
     """
     means, quats, log_scales, logits, colors = heads
     assert means is not None
@@ -102,13 +124,24 @@ def _node_penalties(
     positions: Tensor, radii: Tensor, neighbours: Tensor, motion: Tensor, paths: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     penalties = motion.new_empty(2, dtype=torch.float64)
-    by_motion, by_paths = empty_like(motion), empty_like(paths)
+    by_motion = empty_like(motion)
+    by_paths = empty_like(paths)
     results = penalties, by_paths, by_motion
-    launch(motion, "node_penalties", (positions, radii, neighbours), motion, paths, results, num_threads())
+    launch(
+        motion,
+        "node_penalties",
+        (positions, radii, neighbours),
+        motion,
+        paths,
+        results,
+        num_threads(),
+    )
     return penalties.to(motion.dtype), by_motion, by_paths
 
 
-def _save_penalties(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
+def _save_penalties(
+    ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]
+) -> None:
     ctx.mark_non_differentiable(*output[1:])
     ctx.save_for_backward(*output[1:])
 
@@ -118,15 +151,21 @@ def _penalties_backward(ctx: Any, grad: Tensor, *_: Tensor | None) -> tuple[Tens
     return None, None, None, grad[1] * by_motion, grad[0] * by_paths
 
 
-node_penalties_op = register("node_penalties", _node_penalties, gradient=Gradient(_save_penalties, _penalties_backward))
+node_penalties_op = register(
+    "node_penalties", _node_penalties, gradient=Gradient(_save_penalties, _penalties_backward)
+)
 """The penalties (2,), and the gradients of the second by motion and of the first by paths."""
 
 
-def node_penalties(positions: Tensor, radii: Tensor, neighbours: Tensor, motion: Tensor, paths: Tensor) -> Tensor:
-    """Return two penalties (2,) in squared ``radii``: the nodes' acceleration, and their deviation from rigid motion.
+def node_penalties(
+    positions: Tensor, radii: Tensor, neighbours: Tensor, motion: Tensor, paths: Tensor
+) -> Tensor:
+    """Return two penalties (2,) in squared ``radii``: the nodes' acceleration, and their deviation
+    from rigid motion.
 
-    The mean square of the second differences of ``paths`` (S, P, 3), control points of means, P at least 4; and the
-    mean of |d_j - d_i - (R_i - I) (p_j - p_i)|^2 over ``neighbours`` (S, B) j of nodes i at ``positions`` (S, 3) with
-    ``motion`` (S, 7) of shift d and quaternion of R (Sorkine and Alexa 2007). Differentiable once in motion and paths.
+    The mean square of the second differences of ``paths`` (S, P, 3), control points of means, P at
+    least 4; and the mean of |d_j - d_i - (R_i - I) (p_j - p_i)|^2 over ``neighbours`` (S, B) j of
+    nodes i at ``positions`` (S, 3) with ``motion`` (S, 7) of shift d and quaternion of R (Sorkine
+    and Alexa 2007). Differentiable once in motion and paths.
     """
     return node_penalties_op(positions, radii, neighbours, motion, paths)[0]

@@ -1,9 +1,11 @@
-"""Quadratic triangular Bezier patches: values at places on them, which of them images show, and images of these.
+"""Quadratic triangular Bezier patches: values at places on them, which of them images show, and
+images of these.
 
-P patches, N places, V views. A place is (u, v), w = 1 - u - v; control points (i, j, k), i + j + k = 2, belong to
-u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The boundary-aware weights of BG-Triangle
-(Wu et al. 2025), 1 inside, a half at an outline, 0 outside, are those of pixels here, not of Gaussians on them: between
-two neighbours that show different patches lies an outline, whose place says how much of each the other one covers.
+P patches, N places, V views. A place is (u, v), w = 1 - u - v; control points (i, j, k), i + j + k
+= 2, belong to u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The
+boundary-aware weights of BG-Triangle (Wu et al. 2025), 1 inside, a half at an outline, 0 outside,
+are those of pixels here, not of Gaussians on them: between two neighbours that show different
+patches lies an outline, whose place says how much of each the other one covers.
 """
 
 from __future__ import annotations
@@ -35,8 +37,13 @@ def lattice_size(segments: int) -> int:
 
 
 def lattice(segments: int) -> tuple[Tensor, Tensor]:
-    """Return (K, 2) float64 places of a lattice's points, in their order, and (segments^2, 3) faces, facing alike."""
-    uv = [(i / segments, j / segments) for i in range(segments, -1, -1) for j in range(segments - i, -1, -1)]
+    """Return (K, 2) float64 places of a lattice's points, in their order, and (segments^2, 3)
+    faces, facing alike."""
+    uv = [
+        (i / segments, j / segments)
+        for i in range(segments, -1, -1)
+        for j in range(segments - i, -1, -1)
+    ]
 
     def index(i: int, j: int) -> int:
         row = segments - i
@@ -76,11 +83,14 @@ def _values_gradient(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return patch_values_backward_op(values, ids, uv, grad.contiguous(), ctx.basis), None, None, None
 
 
-patch_values_op = register("patch_values", _values, gradient=Gradient(_save_values, _values_gradient))
+patch_values_op = register(
+    "patch_values", _values, gradient=Gradient(_save_values, _values_gradient)
+)
 
 
 def patch_values(values: Tensor, ids: Tensor, uv: Tensor, along: Along | None = None) -> Tensor:
-    """Return (N, C) values of patches at places on them, differentiable in ``values``; the same on any threads.
+    """Return (N, C) values of patches at places on them, differentiable in ``values``; the same on
+    any threads.
 
     Args:
         values: (P, 6, C) of control points.
@@ -92,7 +102,8 @@ def patch_values(values: Tensor, ids: Tensor, uv: Tensor, along: Along | None = 
 
 
 def lattice_values(values: Tensor, ids: Tensor, uv: Tensor, segments: int) -> Tensor:
-    """Return (N, C): as ``patch_values`` of values (P, K, C) at the points of a lattice, linear between them."""
+    """Return (N, C): as ``patch_values`` of values (P, K, C) at the points of a lattice, linear
+    between them."""
     if not 1 <= segments <= MOST_SEGMENTS:
         raise DyngsError(f"patches: a lattice has 1 to {MOST_SEGMENTS} segments, got {segments}")
     return _looked_up(values, ids, uv, lattice_size(segments), segments)
@@ -100,18 +111,26 @@ def lattice_values(values: Tensor, ids: Tensor, uv: Tensor, segments: int) -> Te
 
 def _looked_up(values: Tensor, ids: Tensor, uv: Tensor, count: int, basis: int) -> Tensor:
     patches, _, channels = values.shape
-    check_tensors("patches", {"values": (values, (patches, count, channels)), "uv": (uv, (len(ids), 2))})
+    check_tensors(
+        "patches", {"values": (values, (patches, count, channels)), "uv": (uv, (len(ids), 2))}
+    )
     if ids.dtype != torch.int32:
         raise DyngsError(f"patches: ids must be int32, got {ids.dtype}")
-    return patch_values_op(values.contiguous(), ids.contiguous(), uv.contiguous().to(values.dtype), basis)
+    return patch_values_op(
+        values.contiguous(), ids.contiguous(), uv.contiguous().to(values.dtype), basis
+    )
 
 
 @torch.no_grad()
-def visible_patches(points: Tensor, cameras: Cameras, near: float, segments: int = SEGMENTS) -> tuple[Tensor, Tensor]:
-    """Return (V, H, W) int32 patch that each pixel shows, -1 for none, and (V, H, W, 2) where on it.
+def visible_patches(
+    points: Tensor, cameras: Cameras, near: float, segments: int = SEGMENTS
+) -> tuple[Tensor, Tensor]:
+    """Return (V, H, W) int32 patch that each pixel shows, -1 for none, and (V, H, W, 2) where on
+    it.
 
-    A z-buffer of flat faces: perspective-correct, both sides, cut at ``near``; of several as near the first is shown.
-    Patches with a point that is not finite are not. The same on any number of threads.
+    A z-buffer of flat faces: perspective-correct, both sides, cut at ``near``; of several as near
+    the first is shown. Patches with a point that is not finite are not. The same on any number of
+    threads.
 
     Args:
         points: (P, 6, 3) control points, world.
@@ -126,25 +145,55 @@ def visible_patches(points: Tensor, cameras: Cameras, near: float, segments: int
     shape = len(cameras), cameras.height, cameras.width
     ids = torch.empty(shape, dtype=torch.int32, device=points.device)
     uv = points.new_empty(*shape, 2)
-    pose, intrinsics = cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()
-    launch(points, "visible_patches", points.contiguous(), pose, intrinsics, segments, near, ids, uv, num_threads())
+    pose = cameras.cam_from_world.contiguous()
+    intrinsics = cameras.intrinsics.contiguous()
+    launch(
+        points,
+        "visible_patches",
+        points.contiguous(),
+        pose,
+        intrinsics,
+        segments,
+        near,
+        ids,
+        uv,
+        num_threads(),
+    )
     return ids, uv
 
 
 def _ends(
-    points: Tensor, cameras: list[Tensor], views: Tensor, ids: Tensor, uv: Tensor, directions: Tensor
+    points: Tensor,
+    cameras: list[Tensor],
+    views: Tensor,
+    ids: Tensor,
+    uv: Tensor,
+    directions: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     found = torch.empty(ids.shape, dtype=torch.bool, device=ids.device)
     out = uv.new_empty(ids.shape), torch.empty_like(uv), torch.empty_like(uv)
-    launch(points, "patch_ends", points, *cameras, uv, (views, ids, directions), found, out, num_threads())
+    launch(
+        points,
+        "patch_ends",
+        points,
+        *cameras,
+        uv,
+        (views, ids, directions),
+        found,
+        out,
+        num_threads(),
+    )
     return found, *out
 
 
 patch_ends_op = register("patch_ends", _ends)
-"""Whether and where patches end between places on them and the next pixels; ``cameras``: poses and intrinsics."""
+"""Whether and where patches end between places on them and the next pixels; ``cameras``: poses and
+intrinsics."""
 
 
-def _blend(means: Tensor, colours: Tensor, crossings: Tensor, rows: Tensor, ids: Tensor) -> tuple[Tensor, Tensor]:
+def _blend(
+    means: Tensor, colours: Tensor, crossings: Tensor, rows: Tensor, ids: Tensor
+) -> tuple[Tensor, Tensor]:
     out = colours.new_empty(*rows.shape, colours.shape[1]), colours.new_empty(rows.shape)
     launch(colours, "blend_patches_forward", colours, crossings, rows, ids, out, num_threads())
     return out
@@ -153,7 +202,17 @@ def _blend(means: Tensor, colours: Tensor, crossings: Tensor, rows: Tensor, ids:
 def _blend_backward(inputs: list[Tensor], grads: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     colours, crossings, rows, ids = inputs
     out = colours.new_empty(len(colours), 2), empty_like(colours), empty_like(crossings)
-    launch(colours, "blend_patches_backward", colours, crossings, rows, ids, tuple(grads), out, num_threads())
+    launch(
+        colours,
+        "blend_patches_backward",
+        colours,
+        crossings,
+        rows,
+        ids,
+        tuple(grads),
+        out,
+        num_threads(),
+    )
     return out
 
 
@@ -170,7 +229,9 @@ def _blend_gradient(ctx: Any, image: Tensor, transmittance: Tensor) -> tuple[Ten
     return *blend_patches_backward_op(list(ctx.saved_tensors), grads), None, None
 
 
-blend_patches_op = register("blend_patches", _blend, gradient=Gradient(_save_blend, _blend_gradient))
+blend_patches_op = register(
+    "blend_patches", _blend, gradient=Gradient(_save_blend, _blend_gradient)
+)
 
 
 @dataclass(frozen=True)
@@ -200,19 +261,26 @@ class Projected:
 def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> Projected:
     """Return where ``points`` (N, 3) of the world are in the images of ``views`` (N,)."""
     which = slice(0, 1) if len(cameras) == 1 else views
-    pose, inner = cameras.cam_from_world[which], cameras.intrinsics[which]
-    local = points @ pose[0, :3, :3].T if len(cameras) == 1 else (pose[:, :3, :3] * points[:, None]).sum(2)
+    pose = cameras.cam_from_world[which]
+    inner = cameras.intrinsics[which]
+    local = (
+        points @ pose[0, :3, :3].T
+        if len(cameras) == 1
+        else (pose[:, :3, :3] * points[:, None]).sum(2)
+    )
     x, y, z = (local + pose[:, :3, 3]).unbind(1)
-    across, down = inner[:, 0, 0] * x / z + inner[:, 0, 2], inner[:, 1, 1] * y / z + inner[:, 1, 2]
+    across = inner[:, 0, 0] * x / z + inner[:, 0, 2]
+    down = inner[:, 1, 1] * y / z + inner[:, 1, 2]
     return Projected(torch.stack([across, down], 1), z)
 
 
 def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tensor:
-    """Return (V, 2, H, W): how far from a pixel's centre to the next in its row, in its column, their outline is.
+    """Return (V, 2, H, W): how far from a pixel's centre to the next in its row, in its column,
+    their outline is.
 
-    ``NO_CROSSING`` where both show the same patch, where the outline runs rather along the row or column than across
-    it, or where neither ends in between: then what shows is a fold. Where both end there it is the middle of the two
-    ends. Differentiable in ``points`` (P, 6, 3).
+    ``NO_CROSSING`` where both show the same patch, where the outline runs rather along the row or
+    column than across it, or where neither ends in between: then what shows is a fold. Where both
+    end there it is the middle of the two ends. Differentiable in ``points`` (P, 6, 3).
     """
     views, height, width = places.rows.shape
     out = points.new_full((views, 2, height, width), NO_CROSSING)
@@ -231,7 +299,8 @@ def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tenso
 
 
 def _differing(places: Places, axis: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return indices of pixels that show another patch than the next along x (axis 0) or y, of those, of crossings."""
+    """Return indices of pixels that show another patch than the next along x (axis 0) or y, of
+    those, of crossings."""
     rows = places.rows
     _, height, width = rows.shape
     labels = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1)
@@ -241,13 +310,18 @@ def _differing(places: Places, axis: int) -> tuple[Tensor, Tensor, Tensor]:
     else:
         differs[:, :-1] = labels[:, 1:] != labels[:, :-1]
     first = differs.view(-1).nonzero()[:, 0]
-    return first, first + (1, width)[axis], first + (first // (height * width) + axis) * (height * width)
+    return (
+        first,
+        first + (1, width)[axis],
+        first + (first // (height * width) + axis) * (height * width),
+    )
 
 
 def _ends_between(
     points: Tensor, cameras: Cameras, places: Places, pixels: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return (N,) steps in ``directions`` from ``pixels`` to where what they show ends, and (N,) whether it does."""
+    """Return (N,) steps in ``directions`` from ``pixels`` to where what they show ends, and (N,)
+    whether it does."""
     rows = places.rows.view(-1)[pixels].long()
     ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0)], -1)
     views = (pixels // places.rows[0].numel()).to(torch.int32)
@@ -266,17 +340,21 @@ def _ends_between(
     return steps.index_put((which,), moved), found
 
 
-def blend_patches(means: Tensor, colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
+def blend_patches(
+    means: Tensor, colours: Tensor, crossings: Tensor, places: Places
+) -> tuple[Tensor, Tensor]:
     """Return (V, H, W, C) images before black and (V, H, W) transmittance, differentiable once.
 
-    A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel and the next one,
-    with an outline t steps from the first (``crossings``), max(0, 1/2 - t) of the first are the second's, and
-    max(0, t - 1/2) of the second the first's. Where neighbours would cover more than all of a pixel their shares are
-    scaled to it. The same bits on any number of threads.
+    A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel
+    and the next one, with an outline t steps from the first (``crossings``), max(0, 1/2 - t) of the
+    first are the second's, and max(0, t - 1/2) of the second the first's. Where neighbours would
+    cover more than all of a pixel their shares are scaled to it. The same bits on any number of
+    threads.
 
     Args:
-        means: (N, 2) px, of the places, which are at the centres of their pixels: not read. Their gradient is that of
-            moving what a patch shows along the image, by differences of neighbours on the same patch.
+        means: (N, 2) px, of the places, which are at the centres of their pixels: not read. Their
+            gradient is that of moving what a patch shows along the image, by differences of
+            neighbours on the same patch.
         colours: (N, C).
         crossings: (V, 2, H, W), see ``outline_crossings``.
     """
@@ -285,4 +363,6 @@ def blend_patches(means: Tensor, colours: Tensor, crossings: Tensor, places: Pla
     check_tensors("patches", checked | {"crossings": (crossings, (views, 2, height, width))})
     if not means.dtype == colours.dtype == crossings.dtype:
         raise DyngsError("patches: means, colours and crossings of one dtype")
-    return blend_patches_op(means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids)
+    return blend_patches_op(
+        means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids
+    )

@@ -1,7 +1,8 @@
 """A small multilayer perceptron over many rows, fused.
 
-Each layer of a few features would go through memory once per step and direction; the kernel runs all layers of a
-hundred rows while they are in the cache, on a GPU in shared memory. Results do not depend on the number of threads.
+Each layer of a few features would go through memory once per step and direction; the kernel runs
+all layers of a hundred rows while they are in the cache, on a GPU in shared memory. Results do not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ from dyngs.ops.native import core_for, num_threads
 from dyngs.ops.registration import Gradient, has_kernel, launch, register
 
 KEPT_BYTES = 2**30
-"""The backward pass computes activations again where keeping them would take more memory than this, and on a GPU."""
+"""The backward pass computes activations again where keeping them would take more memory than this,
+and on a GPU."""
 GPU_LAYERS, GPU_WIDTH = 16, 256
-"""Networks of more layers, or with more features anywhere, are computed by torch's operators on a GPU."""
+"""Networks of more layers, or with more features anywhere, are computed by torch's operators on a
+GPU."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +37,17 @@ class Layer:
 
 
 def _empty_kept(x: Tensor, widths: list[int], skip: int, keep: bool) -> Tensor:
-    """Return room for the activations between the layers; empty unless asked for, and if they would take too much."""
+    """Return room for the activations between the layers; empty unless asked for, and if they would
+    take too much."""
     if not keep or x.device.type != "cpu":
         return x.new_empty(0)
     size = x.shape[0] * core_for(x).perceptron_kept_per_row(widths, skip)
     return x.new_empty(size if size * x.element_size() <= KEPT_BYTES else 0)
 
 
-def _perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
+def _perceptron(
+    x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool
+) -> tuple[Tensor, Tensor]:
     y = x.new_empty(x.shape[0], widths[-1])
     kept = _empty_kept(x, widths, skip, keep)
     launch(x, "perceptron_forward", x, params, y, _or_none(kept), widths, skip, num_threads())
@@ -55,7 +61,18 @@ def _perceptron_backward(
     grad_x = x.new_empty(x.shape if with_x else (0,))
     grad_params = params.new_empty(params.shape)
     results = grad_x if with_x else None, grad_params
-    launch(x, "perceptron_backward", x, params, grad, _or_none(kept), *results, widths, skip, num_threads())
+    launch(
+        x,
+        "perceptron_backward",
+        x,
+        params,
+        grad,
+        _or_none(kept),
+        *results,
+        widths,
+        skip,
+        num_threads(),
+    )
     return grad_x, grad_params
 
 
@@ -64,7 +81,8 @@ def _or_none(kept: Tensor) -> Tensor | None:
 
 
 perceptron_backward_op = register("perceptron_backward", _perceptron_backward)
-"""Gradients by x, empty unless asked for, and by the parameters; ``inputs`` are x, params and kept."""
+"""Gradients by x, empty unless asked for, and by the parameters; ``inputs`` are x, params and
+kept."""
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
@@ -76,30 +94,40 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> N
 
 def _backward(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
     with_x = ctx.needs_input_grad[0]
-    grad_x, grad_params = perceptron_backward_op(list(ctx.saved_tensors), grad, ctx.widths, ctx.skip, with_x)
+    grad_x, grad_params = perceptron_backward_op(
+        list(ctx.saved_tensors), grad, ctx.widths, ctx.skip, with_x
+    )
     return grad_x if with_x else None, grad_params, None, None, None
 
 
 perceptron_op = register("perceptron", _perceptron, gradient=Gradient(_save, _backward))
-"""Outputs (M, out), and the activations between the layers in the kernel's layout or an empty tensor. ``params`` holds
-weight and bias of each layer, flat; ``skip`` 0 means none."""
+"""Outputs (M, out), and the activations between the layers in the kernel's layout or an empty
+tensor. ``params`` holds weight and bias of each layer, flat; ``skip`` 0 means none."""
 
 
 def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable once in all of them.
+    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable
+    once in all of them.
 
-    A row with NaN gives an output row of NaN; gradients by the layers are sums over all rows, so a NaN in one reaches
-    them. ``x`` (M, K), any strides; half precision is computed in float32. ``skip``: layer, from 1 on, whose input is
-    the hidden activations followed by ``x``: its weight is (out, width + K) (Mildenhall et al. 2020, figure 7). Raises
-    DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
+    A row with NaN gives an output row of NaN; gradients by the layers are sums over all rows, so a
+    NaN in one reaches them. ``x`` (M, K), any strides; half precision is computed in float32.
+    ``skip``: layer, from 1 on, whose input is the hidden activations followed by ``x``: its weight
+    is (out, width + K) (Mildenhall et al. 2020, figure 7). Raises DyngsError: no layer, shapes that
+    do not fit, integer tensors, or tensors on different devices.
     """
     widths = _checked_widths(x, layers, skip)
-    dtype = reduce(torch.promote_types, (t.dtype for layer in layers for t in (layer.weight, layer.bias)), x.dtype)
+    dtype = reduce(
+        torch.promote_types,
+        (t.dtype for layer in layers for t in (layer.weight, layer.bias)),
+        x.dtype,
+    )
     dtype = torch.promote_types(dtype, torch.float32)
     too_large = x.device.type != "cpu" and (len(layers) > GPU_LAYERS or max(widths) > GPU_WIDTH)
     if too_large or not has_kernel("perceptron", x.device):
         return reference_perceptron(x, layers, skip=skip)
-    params = torch.cat([t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)])
+    params = torch.cat(
+        [t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)]
+    )
     x = x.to(dtype)
     at = 0 if skip is None else skip
     with_gradient = torch.is_grad_enabled() and (x.requires_grad or params.requires_grad)
@@ -107,7 +135,8 @@ def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -
 
 
 def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """Return the value of `perceptron` in plain torch: any floating dtype and device, any order of derivatives."""
+    """Return the value of `perceptron` in plain torch: any floating dtype and device, any order of
+    derivatives."""
     h = x
     for i, layer in enumerate(layers):
         h = linear(torch.cat([h, x], dim=1) if i == skip else h, layer.weight, layer.bias)
@@ -118,25 +147,36 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
 
 def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:
     if x.ndim != 2 or x.shape[1] == 0:
-        raise DyngsError(f"perceptron: the inputs must be (M, K) with K at least 1, got {tuple(x.shape)}")
+        raise DyngsError(
+            f"perceptron: the inputs must be (M, K) with K at least 1, got {tuple(x.shape)}"
+        )
     if not layers:
         raise DyngsError("perceptron: no layers; give at least one")
     if skip is not None and not 1 <= skip < len(layers):
-        raise DyngsError(f"perceptron: skip={skip} must name one of the layers 1 to {len(layers) - 1}, or be None")
+        raise DyngsError(
+            f"perceptron: skip={skip} must name one of the layers 1 to {len(layers) - 1}, or be None"
+        )
     widths = [x.shape[1]]
     for i, layer in enumerate(layers):
-        weight, bias = layer.weight, layer.bias
+        weight = layer.weight
+        bias = layer.bias
         features = widths[-1] + (widths[0] if i == skip else 0)
         if weight.ndim != 2 or weight.shape[0] == 0 or weight.shape[1] != features:
             raise DyngsError(
                 f"perceptron: the weight of layer {i} must be (out, {features}), got {tuple(weight.shape)}"
             )
         if bias.shape != weight.shape[:1]:
-            raise DyngsError(f"perceptron: the bias of layer {i} must be ({weight.shape[0]},), got {tuple(bias.shape)}")
+            raise DyngsError(
+                f"perceptron: the bias of layer {i} must be ({weight.shape[0]},), got {tuple(bias.shape)}"
+            )
         for tensor in (x, weight, bias):
             if not tensor.is_floating_point():
-                raise DyngsError(f"perceptron: inputs and layers must be floating point, got {tensor.dtype}")
+                raise DyngsError(
+                    f"perceptron: inputs and layers must be floating point, got {tensor.dtype}"
+                )
             if tensor.device != x.device:
-                raise DyngsError(f"perceptron: the inputs are on {x.device}, but layer {i} on {tensor.device}")
+                raise DyngsError(
+                    f"perceptron: the inputs are on {x.device}, but layer {i} on {tensor.device}"
+                )
         widths.append(weight.shape[0])
     return widths

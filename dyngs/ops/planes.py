@@ -1,7 +1,8 @@
-"""Features from factored space-time grids, and the penalties that keep the grids smooth, differentiable.
+"""Features from factored space-time grids, and the penalties that keep the grids smooth,
+differentiable.
 
-HexPlane (Cao and Johnson 2023) and K-Planes (Fridovich-Keil et al. 2023) in the form of 4DGS (Wu et al. 2024).
-M points, L levels, C channels, R samples along an axis of space and T along time.
+HexPlane (Cao and Johnson 2023) and K-Planes (Fridovich-Keil et al. 2023) in the form of 4DGS (Wu et
+al. 2024). M points, L levels, C channels, R samples along an axis of space and T along time.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ MAX_POINTS = 2**31 - 1
 
 @dataclass(frozen=True)
 class PlaneLevel:
-    """The six planes of one level, channels last. The first axis of a plane's name varies fastest."""
+    """The six planes of one level, channels last. The first axis of a plane's name varies
+    fastest."""
 
     space: Tensor  # (3, R, R, C) planes xy, xz, yz; their rows are y, z, z
     time: Tensor  # (3, T, R, C) planes xt, yt, zt; their rows are times
@@ -41,11 +43,27 @@ def _hexplane(coords: Tensor, planes: list[Tensor], time: float) -> tuple[Tensor
 
 
 def _hexplane_backward(
-    coords: Tensor, planes: list[Tensor], order: Tensor, grad: Tensor, time: float, with_coords: bool
+    coords: Tensor,
+    planes: list[Tensor],
+    order: Tensor,
+    grad: Tensor,
+    time: float,
+    with_coords: bool,
 ) -> tuple[Tensor, list[Tensor]]:
-    g_coords, g_planes = coords.new_empty(coords.shape if with_coords else (0,)), [empty_like(x) for x in planes]
+    g_coords = coords.new_empty(coords.shape if with_coords else (0,))
+    g_planes = [empty_like(x) for x in planes]
     results = _pairs(g_planes), g_coords if with_coords else None
-    launch(coords, "hexplane_backward", coords, _pairs(planes), time, order, grad, *results, num_threads())
+    launch(
+        coords,
+        "hexplane_backward",
+        coords,
+        _pairs(planes),
+        time,
+        order,
+        grad,
+        *results,
+        num_threads(),
+    )
     return g_coords, g_planes
 
 
@@ -60,7 +78,9 @@ def _save_hexplane(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tens
     ctx.save_for_backward(order, coords, *planes)
 
 
-def _hexplane_gradient(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor | None, list[Tensor], None]:
+def _hexplane_gradient(
+    ctx: Any, grad: Tensor, _: Tensor | None
+) -> tuple[Tensor | None, list[Tensor], None]:
     order, coords, *planes = ctx.saved_tensors
     with_coords = ctx.needs_input_grad[0]
     g_coords, g_planes = hexplane_backward_op(coords, planes, order, grad, ctx.time, with_coords)
@@ -68,12 +88,15 @@ def _hexplane_gradient(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor
 
 
 hexplane_op = register("hexplane", _hexplane, gradient=Gradient(_save_hexplane, _hexplane_gradient))
-"""Features (M, L * C), and the order (M,) int32 in which the backward pass visits the points. ``planes`` holds those of
-space and those of time of each level in turn."""
+"""Features (M, L * C), and the order (M,) int32 in which the backward pass visits the points.
+``planes`` holds those of space and those of time of each level in turn."""
 
 
-def _plane_penalty(planes: list[Tensor], weights: list[float], with_gradient: bool) -> tuple[Tensor, list[Tensor]]:
-    first, grads = planes[0], [empty_like(x) for x in planes] if with_gradient else []
+def _plane_penalty(
+    planes: list[Tensor], weights: list[float], with_gradient: bool
+) -> tuple[Tensor, list[Tensor]]:
+    first = planes[0]
+    grads = [empty_like(x) for x in planes] if with_gradient else []
     penalty = first.new_empty(1, dtype=torch.float64)
     pairs = _pairs(grads) if with_gradient else None
     launch(first, "plane_penalty", _pairs(planes), pairs, tuple(weights), penalty, num_threads())
@@ -84,14 +107,15 @@ def _save_penalty(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, list[
     planes, ctx.weights, with_gradient = inputs
     _, grads = output
     ctx.mark_non_differentiable(*grads)
-    # The gradient is kept outside save_for_backward: autograd takes over a gradient that nobody else holds, and
-    # otherwise copies it.
+    # The gradient is kept outside save_for_backward: autograd takes over a gradient that nobody
+    # else holds, and otherwise copies it.
     ctx.grads = grads if with_gradient else None
     ctx.save_for_backward(*planes)
 
 
 def _penalty_gradient(ctx: Any, grad: Tensor, _: object) -> tuple[list[Tensor], None, None]:
-    grads, ctx.grads = ctx.grads, None
+    grads = ctx.grads
+    ctx.grads = None
     if grads is None:  # a second backward pass through a retained graph
         _, grads = plane_penalty_op(list(ctx.saved_tensors), ctx.weights, True)
     if type(grad) is not Tensor:  # torch traces a graph, which cannot branch on a value
@@ -102,21 +126,26 @@ def _penalty_gradient(ctx: Any, grad: Tensor, _: object) -> tuple[list[Tensor], 
     return grads, None, None
 
 
-plane_penalty_op = register("plane_penalty", _plane_penalty, gradient=Gradient(_save_penalty, _penalty_gradient))
+plane_penalty_op = register(
+    "plane_penalty", _plane_penalty, gradient=Gradient(_save_penalty, _penalty_gradient)
+)
 """The penalty () and its gradients by the planes, an empty list unless asked for."""
 
 
 def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel]) -> Tensor:
-    """Return (M, L * C) features of points (M, 3) at one time in [0, 1]: the product of the six planes, by level.
+    """Return (M, L * C) features of points (M, 3) at one time in [0, 1]: the product of the six
+    planes, by level.
 
-    Bilinear: sample 0 lies at coordinate -1 or time 0, the last one at 1. What lies outside is clamped, without
-    gradient; NaN coordinates give NaN features. Differentiable once, in coordinates and planes; the same bits on any
-    number of threads. Raises DyngsError: shapes or dtypes that do not fit each other, no levels, or a time that is no
-    number.
+    Bilinear: sample 0 lies at coordinate -1 or time 0, the last one at 1. What lies outside is
+    clamped, without gradient; NaN coordinates give NaN features. Differentiable once, in
+    coordinates and planes; the same bits on any number of threads. Raises DyngsError: shapes or
+    dtypes that do not fit each other, no levels, or a time that is no number.
     """
     _check_levels(levels)
     if coords.ndim != 2 or coords.shape[1] != 3 or len(coords) > MAX_POINTS:
-        raise DyngsError(f"hexplane: coordinates must be (M, 3) with M < 2^31, got {tuple(coords.shape)}")
+        raise DyngsError(
+            f"hexplane: coordinates must be (M, 3) with M < 2^31, got {tuple(coords.shape)}"
+        )
     first = levels[0].space
     if coords.dtype != first.dtype or coords.device != first.device:
         raise DyngsError(
@@ -129,12 +158,13 @@ def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel])
 
 
 def plane_penalty(levels: Sequence[PlaneLevel], weights: tuple[float, float, float]) -> Tensor:
-    """Return ``w_space R_space + w_time R_time + w_one R_one``, the regularizers of 4DGS: (), differentiable once.
+    """Return ``w_space R_space + w_time R_time + w_one R_one``, the regularizers of 4DGS: (),
+    differentiable once.
 
-    R_space is the mean squared second difference along both axes of a space plane, averaged over the two; R_time that
-    along the time axis of a time plane; R_one the mean of ``|1 - plane|`` of a time plane; each summed over planes and
-    levels. An axis of fewer than 3 samples counts 0. Raises DyngsError: levels that do not fit, weights that are not
-    finite.
+    R_space is the mean squared second difference along both axes of a space plane, averaged over
+    the two; R_time that along the time axis of a time plane; R_one the mean of ``|1 - plane|`` of a
+    time plane; each summed over planes and levels. An axis of fewer than 3 samples counts 0. Raises
+    DyngsError: levels that do not fit, weights that are not finite.
     """
     _check_levels(levels)
     if not all(math.isfinite(w) for w in weights):
@@ -149,19 +179,30 @@ def _check_levels(levels: Sequence[PlaneLevel]) -> None:
         raise DyngsError("planes: at least one level is needed")
     first = levels[0].space
     if first.dtype not in (torch.float32, torch.float64) or first.ndim != 4:
-        raise DyngsError(f"planes: need (3, R, R, C) in float32 or float64, got {tuple(first.shape)} {first.dtype}")
+        raise DyngsError(
+            f"planes: need (3, R, R, C) in float32 or float64, got {tuple(first.shape)} {first.dtype}"
+        )
     channels = first.shape[3]
     for number, level in enumerate(levels):
-        space, time = tuple(level.space.shape), tuple(level.time.shape)
+        space = tuple(level.space.shape)
+        time = tuple(level.time.shape)
         size = space[1] if len(space) > 1 else 0
         times = time[1] if len(time) > 1 else 0
-        if space != (3, size, size, channels) or time != (3, times, size, channels) or size * times * channels == 0:
+        if (
+            space != (3, size, size, channels)
+            or time != (3, times, size, channels)
+            or size * times * channels == 0
+        ):
             raise DyngsError(
                 f"planes: level {number} must have space (3, R, R, {channels}) and time (3, T, R, {channels}), "
                 f"none empty, got {space} and {time}"
             )
-        if {(x.dtype, x.device) for x in (level.space, level.time)} != {(first.dtype, first.device)}:
-            raise DyngsError(f"planes: level {number} must be {first.dtype} on {first.device} like the first")
+        if {(x.dtype, x.device) for x in (level.space, level.time)} != {
+            (first.dtype, first.device)
+        }:
+            raise DyngsError(
+                f"planes: level {number} must be {first.dtype} on {first.device} like the first"
+            )
 
 
 def _tensors(levels: Sequence[PlaneLevel]) -> list[Tensor]:

@@ -1,4 +1,5 @@
-"""Skinning by joints: Gaussians of a body moved to a pose, means and covariances, differentiable (Loper et al. 2015).
+"""Skinning by joints: Gaussians of a body moved to a pose, means and covariances, differentiable
+(Loper et al. 2015).
 
 N Gaussians, J joints.
 """
@@ -23,9 +24,16 @@ _KEPT = 12  # numbers per Gaussian that the forward pass keeps for the backward 
 _Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
-def _posing(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> _Results:
-    moved = means.new_empty(means.shape), quats.new_empty(quats.shape), log_scales.new_empty(log_scales.shape)
-    blended, kept = transforms.new_empty(means.shape[0], 3, 4), means.new_empty(means.shape[0], _KEPT)
+def _posing(
+    means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor
+) -> _Results:
+    moved = (
+        means.new_empty(means.shape),
+        quats.new_empty(quats.shape),
+        log_scales.new_empty(log_scales.shape),
+    )
+    blended = transforms.new_empty(means.shape[0], 3, 4)
+    kept = means.new_empty(means.shape[0], _KEPT)
     rest = means, quats, log_scales
     launch(means, "pose_forward", rest, weights, transforms, moved, blended, kept, num_threads())
     return *moved, blended, kept
@@ -50,8 +58,9 @@ def _posing_backward(
 
 
 posing_backward_op = register("posing_backward", _posing_backward)
-"""Gradients by means, quaternions and log scales at rest, by the weights, empty unless asked for, and by transforms;
-``posed`` is what ``posing_op`` returned, ``grads`` are the gradients by the first three of it."""
+"""Gradients by means, quaternions and log scales at rest, by the weights, empty unless asked for,
+and by transforms; ``posed`` is what ``posing_op`` returned, ``grads`` are the gradients by the
+first three of it."""
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: _Results) -> None:
@@ -62,8 +71,13 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: _Results) -> None:
 
 def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     saved: tuple[Tensor, ...] = ctx.saved_tensors
-    rest, weights, transforms, posed = list(saved[:3]), saved[3], saved[4], list(saved[5:])
-    by_moved = [torch.zeros_like(x) if g is None else g for x, g in zip(posed[:3], grads[:3], strict=True)]
+    rest = list(saved[:3])
+    weights = saved[3]
+    transforms = saved[4]
+    posed = list(saved[5:])
+    by_moved = [
+        torch.zeros_like(x) if g is None else g for x, g in zip(posed[:3], grads[:3], strict=True)
+    ]
     with_weights = ctx.needs_input_grad[3]
     *by_rest, by_weights, by_transforms = posing_backward_op(
         rest, weights, transforms, posed, by_moved, grads[3], with_weights
@@ -72,7 +86,8 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
 
 
 posing_op = register("posing", _posing, gradient=Gradient(_save, _backward))
-"""Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs (N, 12)."""
+"""Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs
+(N, 12)."""
 
 
 @dataclass(frozen=True)
@@ -85,17 +100,27 @@ class Posed:
     transforms: Tensor  # (N, 3, 4) blended, by which each was moved
 
 
-def pose_by_joints(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> Posed:
-    """Return Gaussians moved by their joints, T_i = sum_j w_ij A_j: means T x, covariances T S T^T, both exactly.
+def pose_by_joints(
+    means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor
+) -> Posed:
+    """Return Gaussians moved by their joints, T_i = sum_j w_ij A_j: means T x, covariances T S T^T,
+    both exactly.
 
-    With S = R diag(s^2) R^T and T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T. The axes come in no
-    order; a rigid map leaves theirs. Differentiable, once, in everything; where d_i^2 - d_j^2 nearly vanishes, so does
-    its part of the gradient. Axes of less than e^-16 of the longest count as that. The same bits on any number of
-    threads. NaN stays in its Gaussian, but for gradients by the transforms. ``weights`` (N, J) skin; ``transforms`` (J,
-    3, 4) posed from rest; half precision is computed in float32. Raises DyngsError: shapes that do not fit, integers,
-    or other devices.
+    With S = R diag(s^2) R^T and T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T. The
+    axes come in no order; a rigid map leaves theirs. Differentiable, once, in everything; where
+    d_i^2 - d_j^2 nearly vanishes, so does its part of the gradient. Axes of less than e^-16 of the
+    longest count as that. The same bits on any number of threads. NaN stays in its Gaussian, but
+    for gradients by the transforms. ``weights`` (N, J) skin; ``transforms`` (J, 3, 4) posed from
+    rest; half precision is computed in float32. Raises DyngsError: shapes that do not fit,
+    integers, or other devices.
     """
-    inputs = {"means": means, "quats": quats, "log_scales": log_scales, "weights": weights, "transforms": transforms}
+    inputs = {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales,
+        "weights": weights,
+        "transforms": transforms,
+    }
     _check(inputs)
     dtype = reduce(torch.promote_types, (x.dtype for x in inputs.values()), torch.float32)
     return Posed(*posing_op(*(x.to(dtype) for x in inputs.values()))[:4])
@@ -106,5 +131,13 @@ def _check(inputs: dict[str, Tensor]) -> None:
     if weights.ndim != 2:
         raise DyngsError(f"pose_by_joints: weights must be (N, J), got {tuple(weights.shape)}")
     count, joints = weights.shape
-    wanted = {"means": (count, 3), "quats": (count, 4), "log_scales": (count, 3), "transforms": (joints, 3, 4)}
-    check_tensors("pose_by_joints", {name: (x, wanted.get(name, tuple(x.shape))) for name, x in inputs.items()})
+    wanted = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "log_scales": (count, 3),
+        "transforms": (joints, 3, 4),
+    }
+    check_tensors(
+        "pose_by_joints",
+        {name: (x, wanted.get(name, tuple(x.shape))) for name, x in inputs.items()},
+    )

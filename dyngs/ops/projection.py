@@ -56,7 +56,9 @@ def _settings(size: list[int], limits: list[float], antialiased: bool) -> Struct
 
 
 def _arrays(*tensors: Tensor) -> Struct:
-    return Struct("GaussianArraysF32" if tensors[0].dtype == torch.float32 else "GaussianArraysF64", tensors)
+    return Struct(
+        "GaussianArraysF32" if tensors[0].dtype == torch.float32 else "GaussianArraysF64", tensors
+    )
 
 
 def _project(
@@ -72,10 +74,13 @@ def _project(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     rows = (viewmats.shape[0], means.shape[0])
     per_splat = 7 * means.element_size() + 8
-    settings, what = _settings(size, limits, antialiased), f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)"
+    settings = _settings(size, limits, antialiased)
+    what = f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)"
     check_memory(rows[0] * rows[1] * per_splat, what, means)
-    means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
-    factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
+    means2d = means.new_empty(*rows, 2)
+    depths = means.new_empty(rows)
+    factors = means.new_empty(*rows, 3)
+    compensations = means.new_empty(rows)
     splats = means2d, depths, factors, compensations, means.new_empty(*rows, 2, dtype=torch.int32)
     arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
     launch(means, "project_forward", arrays, settings, *splats)
@@ -110,7 +115,12 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None
 
 
 def _backward(
-    ctx: Any, g_means2d: Tensor, g_depths: Tensor, g_factors: Tensor, g_compensations: Tensor, _: Tensor | None
+    ctx: Any,
+    g_means2d: Tensor,
+    g_depths: Tensor,
+    g_factors: Tensor,
+    g_compensations: Tensor,
+    _: Tensor | None,
 ) -> tuple[Tensor | None, ...]:
     *gaussians, radii = ctx.saved_tensors
     with_cameras = any(ctx.needs_input_grad[4:6])
@@ -133,11 +143,12 @@ def project(
     cameras: Cameras,
     options: ProjectionOptions = ProjectionOptions(),
 ) -> Projection:
-    """Return the splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023).
+    """Return the splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl
+    et al. 2023).
 
-    Differentiable in means, quats, scales and cameras. ``quats`` (N, 4) wxyz, any norm; zero means identity; ``scales``
-    (N, 3) standard deviations; ``opacities`` (N,) in [0, 1] only set the extents. Raises DyngsError: an image with
-    sides above 2^23 px, or more splats than memory holds.
+    Differentiable in means, quats, scales and cameras. ``quats`` (N, 4) wxyz, any norm; zero means
+    identity; ``scales`` (N, 3) standard deviations; ``opacities`` (N,) in [0, 1] only set the
+    extents. Raises DyngsError: an image with sides above 2^23 px, or more splats than memory holds.
     """
     check_size(cameras.width, cameras.height)  # before torch, which takes no integers from 2^63 on
     limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]

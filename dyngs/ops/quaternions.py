@@ -1,10 +1,11 @@
-"""Quaternions wxyz of any length: unit quaternions, products, rotations of vectors, rotation matrices and back.
+"""Quaternions wxyz of any length: unit quaternions, products, rotations of vectors, rotation
+matrices and back.
 
 Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/quaternion.hpp).
 """
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
+# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 
@@ -13,30 +14,36 @@ import torch
 from torch import Tensor
 
 SHORTEST = 1e-12
-"""Size of the largest entry below which the gradient grows no further; the value is exact down to denormals."""
+"""Size of the largest entry below which the gradient grows no further; the value is exact down to
+denormals."""
 
 
 def unit_quats(quats: Tensor) -> Tensor:
-    """Return the unit quaternions (..., 4) along ``quats`` of any length; the identity for zero, with zero gradient.
+    """Return the unit quaternions (..., 4) along ``quats`` of any length; the identity for zero,
+    with zero gradient.
 
-    Divided by the largest entry first, so that no square leaves the range of floats. NaN and infinity give NaN.
+    Divided by the largest entry first, so that no square leaves the range of floats. NaN and
+    infinity give NaN.
     """
     largest = quats.detach().abs().amax(-1, keepdim=True)
     zero = largest == 0
     scaled = quats / largest.clamp_min(SHORTEST)
     exact = quats.detach() / torch.where(zero, 1, largest)
-    scaled = scaled + (exact - scaled).detach()  # another value where a quaternion is short, the gradient as it was
+    # another value where a quaternion is short, the gradient as it was
+    scaled = scaled + (exact - scaled).detach()
     scaled = torch.where(zero, identity_quat(quats), scaled)
     return scaled / scaled.norm(dim=-1, keepdim=True)
 
 
 def identity_quat(like: Tensor) -> Tensor:
     """Return the quaternion (4,) of no rotation, in the dtype and on the device of ``like``."""
-    return torch.arange(4, device=like.device).eq(0).to(like.dtype)  # numbers from a list would wait for a GPU
+    # numbers from a list would wait for a GPU
+    return torch.arange(4, device=like.device).eq(0).to(like.dtype)
 
 
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Return the Hamilton products (..., 4): the rotation ``right`` followed by ``left``, not normalised."""
+    """Return the Hamilton products (..., 4): the rotation ``right`` followed by ``left``, not
+    normalised."""
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
     return torch.stack(
@@ -51,42 +58,72 @@ def quat_product(left: Tensor, right: Tensor) -> Tensor:
 
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Return ``vectors`` (..., 3) rotated by ``quats`` (..., 4) of any length; zero rotates nothing."""
+    """Return ``vectors`` (..., 3) rotated by ``quats`` (..., 4) of any length; zero rotates
+    nothing."""
     unit = unit_quats(quats)
-    w, axis = unit[..., :1], unit[..., 1:]
+    w = unit[..., :1]
+    axis = unit[..., 1:]
     twice = 2 * torch.linalg.cross(axis, vectors)
     return vectors + w * twice + torch.linalg.cross(axis, twice)
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Return the rotation matrices (..., 3, 3) of ``quats`` (..., 4) of any length; the identity for zero."""
+    """Return the rotation matrices (..., 3, 3) of ``quats`` (..., 4) of any length; the identity
+    for zero."""
     w, x, y, z = unit_quats(quats).unbind(-1)
-    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
-    xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
-    entries = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    xx = 2 * x * x
+    yy = 2 * y * y
+    zz = 2 * z * z
+    xy = 2 * x * y
+    xz = 2 * x * z
+    yz = 2 * y * z
+    wx = 2 * w * x
+    wy = 2 * w * y
+    wz = 2 * w * z
+    entries = (
+        1 - yy - zz,
+        xy - wz,
+        xz + wy,
+        xy + wz,
+        1 - xx - zz,
+        yz - wx,
+        xz - wy,
+        yz + wx,
+        1 - xx - yy,
+    )
     return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
 
 def quats_of(matrices: Tensor) -> Tensor:
-    """Return the unit quaternions wxyz (..., 4) of rotations (..., 3, 3), with their largest component positive.
+    """Return the unit quaternions wxyz (..., 4) of rotations (..., 3, 3), with their largest
+    component positive.
 
-    Differentiable, at half turns too: the column of 4 q q^T with the largest diagonal entry, normalised (Shepperd
-    1978). Matrices that are not quite rotations still give unit quaternions.
+    Differentiable, at half turns too: the column of 4 q q^T with the largest diagonal entry,
+    normalised (Shepperd 1978). Matrices that are not quite rotations still give unit quaternions.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = matrices.reshape(-1, 9).T.contiguous().unbind()
-    wx, wy, wz = zy - yz, xz - zx, yx - xy
-    sxy, sxz, syz = xy + yx, xz + zx, yz + zy
+    wx = zy - yz
+    wy = xz - zx
+    wz = yx - xy
+    sxy = xy + yx
+    sxz = xz + zx
+    syz = yz + zy
     diagonal = (xx + yy + zz + 1, xx - yy - zz + 1, yy - xx - zz + 1, zz - xx - yy + 1)
     w, x, y, z = diagonal
     columns = ((w, wx, wy, wz), (wx, x, sxy, sxz), (wy, sxy, y, syz), (wz, sxz, syz, z))
-    chosen, largest = torch.stack(columns[0]), w
+    chosen = torch.stack(columns[0])
+    largest = w
     for column, entry in zip(columns[1:], diagonal[1:], strict=True):
-        chosen, largest = torch.where(entry > largest, torch.stack(column), chosen), torch.maximum(largest, entry)
-    return (chosen / chosen.square().sum(0).sqrt().clamp_min(1e-30)).T.reshape(*matrices.shape[:-2], 4)
+        chosen = torch.where(entry > largest, torch.stack(column), chosen)
+        largest = torch.maximum(largest, entry)
+    return (chosen / chosen.square().sum(0).sqrt().clamp_min(1e-30)).T.reshape(
+        *matrices.shape[:-2], 4
+    )
 
 
 def shorter_ways(quats: np.ndarray) -> np.ndarray:
-    """Return quaternions (F, ..., 4), their signs so that interpolated numbers go the shorter way."""
+    """Return quaternions (F, ..., 4), their signs so that interpolated numbers go the shorter
+    way."""
     turned = (quats[1:] * quats[:-1]).sum(-1, keepdims=True) < 0
     signs = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
     return np.concatenate([quats[:1], quats[1:] * signs])

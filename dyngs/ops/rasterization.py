@@ -1,7 +1,7 @@
 """Tile binning and alpha blending of splats."""
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
+# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ TILE = 16
 MAX_CHANNELS = 40
 MAX_ENTRIES = 2**31 - 1
 LARGEST_ALPHA = 1 - 2.0**-20
-"""Beyond it nothing of what lies behind would be left in float32, from which the backward pass restores the rest."""
-MOMENTS = 6  # that the backward pass holds per (Gaussian, tile) pair, next to the gradients of colours
+"""Beyond it nothing of what lies behind would be left in float32, from which the backward pass
+restores the rest."""
+# that the backward pass holds per (Gaussian, tile) pair, next to the gradients of colours
+MOMENTS = 6
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,8 @@ class BlendOptions:
     alpha_max: float = 0.99  # alpha is clamped here, and the clamp stops the gradient
     transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would take it below
     absgrad: bool = False  # also sum the absolute gradients of the 2D means into the probe
-    # refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more than memory holds,
-    # at 20 bytes each
+    # refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more
+    # than memory holds, at 20 bytes each
     max_entries: int = MAX_ENTRIES
 
     def __post_init__(self) -> None:
@@ -56,7 +58,8 @@ class TileEntries:
     """E pairs of a tile and a splat that meets it, sorted by view, tile, depth, index."""
 
     tile_offsets: Tensor  # (V T + 1,) int64: where each tile's pairs begin
-    slot_ranges: Tensor  # (2 V N,) int32: begin and end of each splat's slots in a buffer of E records
+    # (2 V N,) int32: begin and end of each splat's slots in a buffer of E records
+    slot_ranges: Tensor
     gaussians: Tensor  # (E,) int32: view * N + Gaussian
     slots: Tensor  # (E,) int32: the pair's own slot
 
@@ -64,12 +67,15 @@ class TileEntries:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
 
     def check(self, device: torch.device) -> None:
-        """Raise an error unless the tensors are what the kernels take; those check lengths and indices themselves."""
+        """Raise an error unless the tensors are what the kernels take; those check lengths and
+        indices themselves."""
         for name, x in vars(self).items():
             dtype = torch.int64 if name == "tile_offsets" else torch.int32
             if x.dtype != dtype or x.ndim != 1 or x.device != device:
                 got = f"{x.dtype} {tuple(x.shape)} on {x.device}"
-                raise DyngsError(f"rasterize: entries.{name} must be {dtype} with one axis on {device}, got {got}")
+                raise DyngsError(
+                    f"rasterize: entries.{name} must be {dtype} with one axis on {device}, got {got}"
+                )
 
     @property
     def tiles_per_gaussian(self) -> Tensor:
@@ -83,7 +89,8 @@ class Blended:
     """V blended images of D channels."""
 
     color: Tensor  # (V, H, W, D), background composited
-    transmittance: Tensor  # (V, H, W) in [0, 1], the fraction of the background that is seen; alpha is 1 minus it
+    # (V, H, W) in [0, 1], the fraction of the background that is seen; alpha is 1 minus it
+    transmittance: Tensor
 
 
 def _settings(size: list[int], thresholds: list[float]) -> Struct:
@@ -92,7 +99,9 @@ def _settings(size: list[int], thresholds: list[float]) -> Struct:
 
 
 def _arrays(*splats: Tensor) -> Struct:
-    return Struct("SplatArraysF32" if splats[0].dtype == torch.float32 else "SplatArraysF64", splats)
+    return Struct(
+        "SplatArraysF32" if splats[0].dtype == torch.float32 else "SplatArraysF64", splats
+    )
 
 
 @contextmanager
@@ -108,12 +117,15 @@ def _bin_tiles(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     if shapes_only():
         return _unknown_entries(depths, size)
-    settings, most = _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
+    settings = _settings(size, thresholds)
+    most = min(max_entries, MAX_ENTRIES)
     try:
         entries = launch(depths, "bin_tiles", _arrays(*splats), depths, settings, most)
     except ValueError as error:  # std::length_error
         raise DyngsError(f"render refused: {error}; {REMEDY}") from None
-    tile_offsets, slot_ranges, gaussians, slots = (x if isinstance(x, Tensor) else torch.from_numpy(x) for x in entries)
+    tile_offsets, slot_ranges, gaussians, slots = (
+        x if isinstance(x, Tensor) else torch.from_numpy(x) for x in entries
+    )
     slot_ranges, gaussians, slots = (x.view(torch.int32) for x in (slot_ranges, gaussians, slots))
     return tile_offsets.view(torch.int64), slot_ranges, gaussians, slots
 
@@ -136,9 +148,12 @@ bin_tiles_op = register("bin_tiles", _bin_tiles)
 
 def _image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     check_size(*size)
-    views, channels = colors.shape[0], colors.shape[2]
+    views = colors.shape[0]
+    channels = colors.shape[2]
     needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)
-    check_memory(needed, f"{views} image(s) of {size[0]}x{size[1]} px with {channels} channels", colors)
+    check_memory(
+        needed, f"{views} image(s) of {size[0]}x{size[1]} px with {channels} channels", colors
+    )
     shape = (views, size[1], size[0])
     image = colors.new_empty(*shape, channels)
     return image, colors.new_empty(shape), colors.new_empty(shape, dtype=torch.int32)
@@ -161,10 +176,21 @@ def _blend(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     image = _image(colors, size)
-    splats, entries = _arrays(means2d, factors, opacities, radii), (tile_offsets, slot_ranges, gaussians, slots)
+    splats = _arrays(means2d, factors, opacities, radii)
+    entries = (tile_offsets, slot_ranges, gaussians, slots)
     with _refusals("rasterize"):
         settings = _settings(size, thresholds)
-        launch(colors, "rasterize_forward", splats, colors, background, entries, settings, (*image, None), 0)
+        launch(
+            colors,
+            "rasterize_forward",
+            splats,
+            colors,
+            background,
+            entries,
+            settings,
+            (*image, None),
+            0,
+        )
     return image
 
 
@@ -180,15 +206,21 @@ def _blend_backward(
     with_probe: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     means2d, factors, opacities, colors, radii = splats
-    pairs, fields = entries[3].shape[0], MOMENTS + colors.shape[2] + 2 * absgrad
-    check_memory(pairs * fields * colors.element_size(), f"the gradients of {pairs} (Gaussian, tile) pairs", colors)
+    pairs = entries[3].shape[0]
+    fields = MOMENTS + colors.shape[2] + 2 * absgrad
+    check_memory(
+        pairs * fields * colors.element_size(),
+        f"the gradients of {pairs} (Gaussian, tile) pairs",
+        colors,
+    )
     by_means2d, by_factors, by_opacities, by_colors = out = [
         empty_like(x) for x in (means2d, factors, opacities, colors)
     ]
     probe = means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0)
     given = _arrays(means2d, factors, opacities, radii), colors, background, tuple(entries)
     with _refusals("rasterize, backward"):
-        settings, results = _settings(size, thresholds), (*out, probe if with_probe else None)
+        settings = _settings(size, thresholds)
+        results = (*out, probe if with_probe else None)
         launch(colors, "rasterize_backward", *given, settings, (*grads, *image), results, absgrad)
     return by_means2d, by_factors, by_opacities, by_colors, probe
 
@@ -197,17 +229,35 @@ blend_backward_op = register("blend_backward", _blend_backward)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    means2d, factors, opacities, colors, background, _, radii, *entries, ctx.size, ctx.thresholds, ctx.absgrad = inputs
+    (
+        means2d,
+        factors,
+        opacities,
+        colors,
+        background,
+        _,
+        radii,
+        *entries,
+        ctx.size,
+        ctx.thresholds,
+        ctx.absgrad,
+    ) = inputs
     _, transmittance, stop = output
     ctx.mark_non_differentiable(stop)
     ctx.has_background = background is not None
     kept = [background] if ctx.has_background else []
-    ctx.save_for_backward(means2d, factors, opacities, colors, radii, transmittance, stop, *entries, *kept)
+    ctx.save_for_backward(
+        means2d, factors, opacities, colors, radii, transmittance, stop, *entries, *kept
+    )
 
 
-def _backward(ctx: Any, g_color: Tensor, g_transmittance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+def _backward(
+    ctx: Any, g_color: Tensor, g_transmittance: Tensor, _: Tensor | None
+) -> tuple[Tensor | None, ...]:
     saved = ctx.saved_tensors
-    splats, image, entries = list(saved[:5]), list(saved[5:7]), list(saved[7:11])
+    splats = list(saved[:5])
+    image = list(saved[5:7])
+    entries = list(saved[7:11])
     background = saved[11] if ctx.has_background else None
     with_probe = ctx.needs_input_grad[5]
     *out, probe = blend_backward_op(
@@ -243,7 +293,17 @@ def _tally(
     image = *_image(colors, size), sums
     with _refusals("tally"):
         settings = _settings(size, thresholds)
-        launch(colors, "rasterize_forward", _arrays(*splats), colors, background, tuple(entries), settings, image, kind)
+        launch(
+            colors,
+            "rasterize_forward",
+            _arrays(*splats),
+            colors,
+            background,
+            tuple(entries),
+            settings,
+            image,
+            kind,
+        )
     return sums, image[0], image[1]
 
 
@@ -251,14 +311,19 @@ tally_op = register("tally", _tally)
 
 
 def bin_tiles(
-    projection: Projection, opacities: Tensor, size: tuple[int, int], options: BlendOptions = BlendOptions()
+    projection: Projection,
+    opacities: Tensor,
+    size: tuple[int, int],
+    options: BlendOptions = BlendOptions(),
 ) -> TileEntries:
     """Return the splats of each 16x16 tile, nearest first; arguments as for ``rasterize``."""
     check_size(*size)  # before torch, which takes no integers from 2^63 on
     with torch.no_grad():
         splats = [projection.means2d, projection.factors, opacities, projection.radii]
         thresholds = options.thresholds
-        return TileEntries(*bin_tiles_op(splats, projection.depths, list(size), thresholds, options.max_entries))
+        return TileEntries(
+            *bin_tiles_op(splats, projection.depths, list(size), thresholds, options.max_entries)
+        )
 
 
 def rasterize(
@@ -274,14 +339,18 @@ def rasterize(
 ) -> Blended:
     """Return the splats blended front to back into V images of D channels.
 
-    Differentiable in means2d, factors, opacities, colors and background. ``opacities`` (V, N), compensated already if
-    wanted; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None: black; ``probe`` (V, N, 4) zeros, whose
-    gradient is that of the 2D means in px, then (with ``absgrad``) the sum over pixels of its absolute values;
-    ``entries``: what ``bin_tiles`` returned for the same. Raises DyngsError: too many channels, sides above 2^23 px,
-    more (Gaussian, tile) pairs than ``options.max_entries`` or than memory holds, or ``entries`` that do not fit.
+    Differentiable in means2d, factors, opacities, colors and background. ``opacities`` (V, N),
+    compensated already if wanted; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None:
+    black; ``probe`` (V, N, 4) zeros, whose gradient is that of the 2D means in px, then (with
+    ``absgrad``) the sum over pixels of its absolute values; ``entries``: what ``bin_tiles``
+    returned for the same. Raises DyngsError: too many channels, sides above 2^23 px, more
+    (Gaussian, tile) pairs than ``options.max_entries`` or than memory holds, or ``entries`` that do
+    not fit.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
-        raise DyngsError(f"colors have {colors.shape[-1]} channels; 1 to {MAX_CHANNELS} can be blended in one call")
+        raise DyngsError(
+            f"colors have {colors.shape[-1]} channels; 1 to {MAX_CHANNELS} can be blended in one call"
+        )
     check_size(*size)
     if entries is None:
         entries = bin_tiles(projection, opacities, size, options)
@@ -315,8 +384,8 @@ class Tally(IntEnum):
     LANES = 3
     """pixels that were computed for it, blended or not"""
     SQUARED_SLOPES = 4
-    """squares of the derivative of the image, its channels added up, with respect to G, the value of the 2D Gaussian
-    there (Tu et al. 2026)"""
+    """squares of the derivative of the image, its channels added up, with respect to G, the value
+    of the 2D Gaussian there (Tu et al. 2026)"""
 
 
 def tally(
@@ -329,12 +398,15 @@ def tally(
     colors: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Tensor:
-    """Return (V, N) sums over pixels of the quantity ``kind``, for every Gaussian; not differentiable.
+    """Return (V, N) sums over pixels of the quantity ``kind``, for every Gaussian; not
+    differentiable.
 
     Other arguments as for ``rasterize``; colours and background matter to ``SQUARED_SLOPES`` only.
     """
     colors = torch.zeros_like(opacities)[..., None] if colors is None else colors
-    return blend_and_tally(projection, opacities, colors, size, kind, options, background=background)[1]
+    return blend_and_tally(
+        projection, opacities, colors, size, kind, options, background=background
+    )[1]
 
 
 def blend_and_tally(

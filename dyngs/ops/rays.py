@@ -1,6 +1,8 @@
-"""Samples along rays through the occupied cells of a space, and what is seen along them (Max 1995), differentiable.
+"""Samples along rays through the occupied cells of a space, and what is seen along them (Max 1995),
+differentiable.
 
-R rays, M samples. The samples of a ray lie next to each other, from ``offsets[r]`` to before ``offsets[r + 1]``.
+R rays, M samples. The samples of a ray lie next to each other, from ``offsets[r]`` to before
+``offsets[r + 1]``.
 """
 
 from __future__ import annotations
@@ -20,11 +22,13 @@ TRANSMITTANCE_MIN = 1e-4  # A ray ends when less than this is left (Müller et a
 
 @dataclass(frozen=True)
 class Space:
-    """Nested cubes around a centre, each twice the one inside it, all cut into as many cells along an axis.
+    """Nested cubes around a centre, each twice the one inside it, all cut into as many cells along
+    an axis.
 
     Example::
 
-        Space((0.0, 0.0, 0.0), half=1.5, cascades=1, cells=128)  # one cube: nothing lies outside of it
+        Space((0.0, 0.0, 0.0), half=1.5, cascades=1, cells=128)  # one cube: nothing lies outside of
+        it
     """
 
     centre: tuple[float, float, float]  # world
@@ -45,8 +49,8 @@ class Space:
     def unit(self, points: Tensor) -> Tensor:
         """Return points (..., 3) of the world in the unit cube.
 
-        With several cubes what lies outside of the innermost is contracted: y to (2 - 1/|y|) y/|y| in the max-norm
-        (Barron et al. 2022), so that the innermost cube becomes [1/4, 3/4]^3.
+        With several cubes what lies outside of the innermost is contracted: y to (2 - 1/|y|) y/|y|
+        in the max-norm (Barron et al. 2022), so that the innermost cube becomes [1/4, 3/4]^3.
         """
         y = (points - points.new_tensor(self.centre)) / self.half
         if self.cascades == 1:
@@ -89,7 +93,8 @@ class Samples:
 
 @dataclass(frozen=True)
 class Steps:
-    """How long samples are: at least ``length``, and at least ``cone`` times their distance; world units."""
+    """How long samples are: at least ``length``, and at least ``cone`` times their distance; world
+    units."""
 
     near: float
     length: float
@@ -97,16 +102,32 @@ class Steps:
     most: int = 1 << 16  # of a ray
 
 
-def _march_arguments(rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]) -> tuple[Any, ...]:
-    """Return what both kernels take: arrays (of rays: origins, directions, shifts), sizes, cells and options."""
+def _march_arguments(
+    rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]
+) -> tuple[Any, ...]:
+    """Return what both kernels take: arrays (of rays: origins, directions, shifts), sizes, cells
+    and options."""
     x, y, z, half, cascades, cells = space
     near, length, cone, most = steps
-    return *rays, ((x, y, z), half, int(cascades), int(cells)), occupied, (near, length, cone, int(most))
+    return (
+        *rays,
+        ((x, y, z), half, int(cascades), int(cells)),
+        occupied,
+        (near, length, cone, int(most)),
+    )
 
 
-def _march_counts(rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]) -> Tensor:
+def _march_counts(
+    rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]
+) -> Tensor:
     counts = rays[2].new_empty(rays[2].shape, dtype=torch.int64)
-    launch(rays[2], "march_count", *_march_arguments(rays, occupied, space, steps), counts, num_threads())
+    launch(
+        rays[2],
+        "march_count",
+        *_march_arguments(rays, occupied, space, steps),
+        counts,
+        num_threads(),
+    )
     return counts
 
 
@@ -115,7 +136,12 @@ march_counts_op = register("march_counts", _march_counts)
 
 
 def _march_samples(
-    rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float], offsets: Tensor, count: int
+    rays: list[Tensor],
+    occupied: Tensor,
+    space: list[float],
+    steps: list[float],
+    offsets: Tensor,
+    count: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     like = rays[2]
     which = like.new_empty(count, dtype=torch.int32)
@@ -126,19 +152,22 @@ def _march_samples(
 
 
 march_samples_op = register("march_samples", _march_samples)
-"""Ray, start, end (M,) and coordinates (M, 3) of the M = ``count`` samples whose ``offsets`` (R + 1,) are given."""
+"""Ray, start, end (M,) and coordinates (M, 3) of the M = ``count`` samples whose ``offsets`` (R +
+1,) are given."""
 
 
 @torch.no_grad()
 def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: Steps) -> Samples:
     """Return the samples of rays whose middle lies in an occupied cell.
 
-    Empty cells are skipped by whole steps. ``shifts`` (R,) in [0, 1): by which fraction of a step those of each ray are
-    shifted. ``occupied``: bool of ``space.shape``. The same samples on any number of threads. The host waits for the
-    number of samples.
+    Empty cells are skipped by whole steps. ``shifts`` (R,) in [0, 1): by which fraction of a step
+    those of each ray are shifted. ``occupied``: bool of ``space.shape``. The same samples on any
+    number of threads. The host waits for the number of samples.
     """
     if occupied.shape != space.shape or occupied.dtype != torch.bool:
-        raise DyngsError(f"march: cells must be bool {space.shape}, got {occupied.dtype} {tuple(occupied.shape)}")
+        raise DyngsError(
+            f"march: cells must be bool {space.shape}, got {occupied.dtype} {tuple(occupied.shape)}"
+        )
     given = (
         [rays.origins.contiguous(), rays.directions.contiguous(), shifts.contiguous()],
         occupied,
@@ -164,9 +193,18 @@ reached_op = register("reached", _reached)
 
 
 @torch.no_grad()
-def reached(densities: Tensor, samples: Samples, transmittance_min: float = TRANSMITTANCE_MIN) -> tuple[Tensor, Tensor]:
-    """Return (M,) bool which samples light gets to through those before them, and the (R + 1,) offsets of these."""
-    given = (densities.contiguous(), samples.starts, samples.ends, samples.offsets, transmittance_min)
+def reached(
+    densities: Tensor, samples: Samples, transmittance_min: float = TRANSMITTANCE_MIN
+) -> tuple[Tensor, Tensor]:
+    """Return (M,) bool which samples light gets to through those before them, and the (R + 1,)
+    offsets of these."""
+    given = (
+        densities.contiguous(),
+        samples.starts,
+        samples.ends,
+        samples.offsets,
+        transmittance_min,
+    )
     which, counts = reached_op(*given)
     return which, offsets_of(counts)
 
@@ -177,20 +215,50 @@ def offsets_of(counts: Tensor) -> Tensor:
 
 
 def _composite(
-    densities: Tensor, colours: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, transmittance_min: float
+    densities: Tensor,
+    colours: Tensor,
+    starts: Tensor,
+    ends: Tensor,
+    offsets: Tensor,
+    transmittance_min: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     rays = offsets.shape[0] - 1
-    out = (densities.new_empty(rays, 3), densities.new_empty(rays), densities.new_empty(rays), empty_like(densities))
+    out = (
+        densities.new_empty(rays, 3),
+        densities.new_empty(rays),
+        densities.new_empty(rays),
+        empty_like(densities),
+    )
     launch(
-        densities, "composite_forward", densities, colours, starts, ends, offsets, transmittance_min, out, num_threads()
+        densities,
+        "composite_forward",
+        densities,
+        colours,
+        starts,
+        ends,
+        offsets,
+        transmittance_min,
+        out,
+        num_threads(),
     )
     return out
 
 
-def _composite_backward(samples: list[Tensor], grads: list[Tensor], transmittance_min: float) -> tuple[Tensor, Tensor]:
-    g_densities, g_colours = empty_like(samples[0]), empty_like(samples[1])
+def _composite_backward(
+    samples: list[Tensor], grads: list[Tensor], transmittance_min: float
+) -> tuple[Tensor, Tensor]:
+    g_densities = empty_like(samples[0])
+    g_colours = empty_like(samples[1])
     results = g_densities, g_colours
-    launch(samples[0], "composite_backward", *samples, transmittance_min, tuple(grads), *results, num_threads())
+    launch(
+        samples[0],
+        "composite_backward",
+        *samples,
+        transmittance_min,
+        tuple(grads),
+        *results,
+        num_threads(),
+    )
     return g_densities, g_colours
 
 
@@ -204,9 +272,13 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None
     ctx.save_for_backward(*samples)
 
 
-def _backward(ctx: Any, colour: Tensor, transmittance: Tensor, depth: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+def _backward(
+    ctx: Any, colour: Tensor, transmittance: Tensor, depth: Tensor, _: Tensor
+) -> tuple[Tensor | None, ...]:
     grads = [x.contiguous() for x in (colour, transmittance, depth)]
-    by_densities, by_colours = composite_backward_op(list(ctx.saved_tensors), grads, ctx.transmittance_min)
+    by_densities, by_colours = composite_backward_op(
+        list(ctx.saved_tensors), grads, ctx.transmittance_min
+    )
     return by_densities, by_colours, None, None, None, None
 
 
@@ -225,13 +297,17 @@ class Composited:
 
 
 def composite(
-    densities: Tensor, colours: Tensor, samples: Samples, transmittance_min: float = TRANSMITTANCE_MIN
+    densities: Tensor,
+    colours: Tensor,
+    samples: Samples,
+    transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> Composited:
-    """Return what rays see of samples with densities (M,), per world unit, and colours (M, 3); differentiable once.
+    """Return what rays see of samples with densities (M,), per world unit, and colours (M, 3);
+    differentiable once.
 
-    alpha = 1 - exp(-density length), weight = alpha times the transmittance before it. A ray ends when less than
-    ``transmittance_min`` is left. The same bits on any number of threads. Raises DyngsError: shapes or dtypes that do
-    not fit.
+    alpha = 1 - exp(-density length), weight = alpha times the transmittance before it. A ray ends
+    when less than ``transmittance_min`` is left. The same bits on any number of threads. Raises
+    DyngsError: shapes or dtypes that do not fit.
     """
     count = len(samples)
     if densities.shape != (count,) or colours.shape != (count, 3):
@@ -241,5 +317,11 @@ def composite(
         )
     if not densities.dtype == colours.dtype == samples.starts.dtype:
         raise DyngsError("composite: densities, colours and samples must be of one dtype")
-    given = (densities.contiguous(), colours.contiguous(), samples.starts, samples.ends, samples.offsets)
+    given = (
+        densities.contiguous(),
+        colours.contiguous(),
+        samples.starts,
+        samples.ends,
+        samples.offsets,
+    )
     return Composited(*composite_op(*given, transmittance_min))

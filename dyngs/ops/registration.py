@@ -1,9 +1,10 @@
 """Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
 
-``register`` takes an implementation, whose type hints are the schema, and the formula of its gradient. An
-implementation allocates its results and has them filled by ``launch``, which does nothing where only shapes are needed
-(``torch.compile``). The compiled cores for CPU and CUDA have the same functions, so that one implementation serves
-both. ``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
+``register`` takes an implementation, whose type hints are the schema, and the formula of its
+gradient. An implementation allocates its results and has them filled by ``launch``, which does
+nothing where only shapes are needed (``torch.compile``). The compiled cores for CPU and CUDA have
+the same functions, so that one implementation serves both. ``torch.library.custom_op`` would do the
+same, but imports ``torch._dynamo`` when the first op is made: 2 s.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -39,8 +40,8 @@ class Gradient:
 
     # called as ``save(ctx, inputs, output)`` after the forward pass, keeps what the formula needs
     save: Callable[[Any, tuple[Any, ...], Any], None]
-    # called as ``backward(ctx, *gradients of the outputs)``, returns one gradient per input; for an input that is a
-    # list of tensors, a list
+    # called as ``backward(ctx, *gradients of the outputs)``, returns one gradient per input; for an
+    # input that is a list of tensors, a list
     backward: Callable[..., Any]
 
 
@@ -52,17 +53,19 @@ def register(
     mutates: tuple[str, ...] = (),
     gradient: Gradient | None = None,
 ) -> Callable[P, R]:
-    """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments; elsewhere it raises DyngsError.
+    """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments; elsewhere it raises
+    DyngsError.
 
-    ``kernel``: the implementation, whose type hints give the schema; no result may share memory with an input.
-    ``devices``: for whose tensors it is; CUDA counts only where its core was built. ``mutates``: arguments that it
-    writes to.
+    ``kernel``: the implementation, whose type hints give the schema; no result may share memory
+    with an input. ``devices``: for whose tensors it is; CUDA counts only where its core was built.
+    ``mutates``: arguments that it writes to.
     """
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
     qualified = f"{NAMESPACE}::{name}"
     _LIBRARY.define(name + schema)
     torch.library.register_fake(qualified, _shapes_of(kernel), lib=_LIBRARY)
-    _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")  # for every device that has none of its own
+    # for every device that has none of its own
+    _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")
     _kernels[name] = {"meta"}
     for device in devices:
         if device != "cuda" or has_cuda_core():
@@ -71,14 +74,21 @@ def register(
     if gradient is not None:
         formula = _first_order(qualified, gradient.backward)
         if re.search(r"Tensor\??\[\]", schema):  # lists of tensors, which autograd has no place for
-            torch.library.register_autograd(qualified, formula, setup_context=gradient.save, lib=_LIBRARY)
+            torch.library.register_autograd(
+                qualified, formula, setup_context=gradient.save, lib=_LIBRARY
+            )
         else:
-            _LIBRARY.impl(name, _with_gradient(op, gradient.save, formula), "Autograd", with_keyset=True)
+            _LIBRARY.impl(
+                name, _with_gradient(op, gradient.save, formula), "Autograd", with_keyset=True
+            )
     return cast(Callable[P, R], op)
 
 
-def _with_gradient(op: Any, save: Callable[..., None], formula: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``op`` for tensors that may require gradients, as ``torch.library.register_autograd`` in half the time."""
+def _with_gradient(
+    op: Any, save: Callable[..., None], formula: Callable[..., Any]
+) -> Callable[..., Any]:
+    """Return ``op`` for tensors that may require gradients, as ``torch.library.register_autograd``
+    in half the time."""
 
     def below(keys: Any, arguments: tuple[Any, ...]) -> Any:
         with torch._C._AutoDispatchBelowAutograd():  # pyright: ignore[reportPrivateUsage]
@@ -126,14 +136,17 @@ _mode = _Mode()
 
 
 def shapes_only() -> bool:
-    """Return whether an implementation is asked for the shapes of its results alone: its inputs have no data."""
+    """Return whether an implementation is asked for the shapes of its results alone: its inputs
+    have no data."""
     return _mode.shapes_only
 
 
 def launch(like: Tensor, name: str, *arguments: object) -> Any:
-    """Return what the function ``name`` of the core gives; None, without calling it, where only shapes are needed.
+    """Return what the function ``name`` of the core gives; None, without calling it, where only
+    shapes are needed.
 
-    ``arguments``: tensors, those written to included, are passed as arrays, also those in tuples and lists.
+    ``arguments``: tensors, those written to included, are passed as arrays, also those in tuples
+    and lists.
     """
     if _mode.shapes_only:
         return None
@@ -150,8 +163,12 @@ _PLAIN = frozenset({int, float, bool, type(None)})
 
 
 def _each(core: ModuleType, values: Iterable[object]) -> list[Any]:
-    """Return ``values`` as the core takes them; of the two hundred that a training step passes most are plain."""
-    return [array(x) if type(x) is Tensor else x if type(x) in _PLAIN else _passed(core, x) for x in values]
+    """Return ``values`` as the core takes them; of the two hundred that a training step passes most
+    are plain."""
+    return [
+        array(x) if type(x) is Tensor else x if type(x) in _PLAIN else _passed(core, x)
+        for x in values
+    ]
 
 
 def _passed(core: ModuleType, value: Any) -> Any:
@@ -178,13 +195,15 @@ def _shapes_of(kernel: Callable[P, R]) -> Callable[P, R]:
 
 
 def implement(name: str, device: str, kernel: Callable[..., object]) -> None:
-    """Make ``kernel`` the implementation of the op ``name`` for tensors on ``device``, for example ``"cuda"``."""
+    """Make ``kernel`` the implementation of the op ``name`` for tensors on ``device``, for example
+    ``"cuda"``."""
     _LIBRARY.impl(name, kernel, device.upper())
     _kernels[name].add(device)
 
 
 def has_kernel(name: str, device: torch.device) -> bool:
-    """Return whether the op ``name`` is implemented on ``device``; where it is not, plain torch may do."""
+    """Return whether the op ``name`` is implemented on ``device``; where it is not, plain torch may
+    do."""
     return device.type in _kernels[name]
 
 
@@ -210,9 +229,11 @@ def _tensors(values: Iterable[object]) -> list[Tensor]:
 
 
 def _first_order(qualified: str, backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the formula ``backward`` made one whose results raise an error when they are differentiated again.
+    """Return the formula ``backward`` made one whose results raise an error when they are
+    differentiated again.
 
-    Why: the native backward ops have no derivative, and without this their second derivatives would count as zero.
+    Why: the native backward ops have no derivative, and without this their second derivatives would
+    count as zero.
     """
 
     def formula(ctx: Any, *grads: Tensor | None) -> Any:
@@ -227,11 +248,16 @@ def _first_order(qualified: str, backward: Callable[..., Any]) -> Callable[..., 
 
 
 def _guarded(qualified: str, results: Any, sources: list[Tensor]) -> Any:
-    """Return ``results`` (a tensor, None, or a tuple or list of such) with an error as the gradient of each tensor."""
+    """Return ``results`` (a tensor, None, or a tuple or list of such) with an error as the gradient
+    of each tensor."""
     if isinstance(results, (list, tuple)):
         guarded = [_guarded(qualified, x, sources) for x in cast(Iterable[object], results)]
         return guarded if isinstance(results, list) else tuple(guarded)
-    return cast(Any, _Undifferentiable.apply(qualified, results, *sources)) if isinstance(results, Tensor) else results
+    return (
+        cast(Any, _Undifferentiable.apply(qualified, results, *sources))
+        if isinstance(results, Tensor)
+        else results
+    )
 
 
 class _Undifferentiable(torch.autograd.Function):
@@ -244,4 +270,6 @@ class _Undifferentiable(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> None:
-        raise DyngsError(f"{ctx.qualified} is differentiable once; a second derivative was asked for")
+        raise DyngsError(
+            f"{ctx.qualified} is differentiable once; a second derivative was asked for"
+        )

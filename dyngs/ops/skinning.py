@@ -1,4 +1,5 @@
-"""Linear blend skinning of points by sparse control nodes (SC-GS: Huang et al. 2024), and offsets added to Gaussians.
+"""Linear blend skinning of points by sparse control nodes (SC-GS: Huang et al. 2024), and offsets
+added to Gaussians.
 
 M points, S nodes, B nodes that one point follows, D values of a node.
 """
@@ -19,10 +20,20 @@ from dyngs.ops.registration import Gradient, InPlace, launch, register
 
 
 def _skinning(
-    points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
+    points: Tensor,
+    positions: Tensor,
+    radii: Tensor,
+    followed: Tensor,
+    motion: Tensor,
+    values: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    count, nodes = points.shape[0], (positions, radii, motion, values)
-    results = points.new_empty(count, 3), points.new_empty(count, values.shape[1]), points.new_empty(followed.shape)
+    count = points.shape[0]
+    nodes = (positions, radii, motion, values)
+    results = (
+        points.new_empty(count, 3),
+        points.new_empty(count, values.shape[1]),
+        points.new_empty(followed.shape),
+    )
     try:
         launch(points, "skinning_forward", nodes, (points, followed), *results, num_threads())
     except IndexError:
@@ -34,19 +45,33 @@ def _skinning(
 
 
 def _skinning_backward(
-    nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
+    nodes: list[Tensor],
+    points: Tensor,
+    followed: Tensor,
+    weights: Tensor,
+    grads: list[Tensor],
+    with_points: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     _, _, motion, values = nodes
     g_points = points.new_empty(points.shape if with_points else (0,))
-    g_motion, g_values = points.new_empty(motion.shape), points.new_empty(values.shape)
+    g_motion = points.new_empty(motion.shape)
+    g_values = points.new_empty(values.shape)
     results = g_points if with_points else None, g_motion, g_values
-    launch(points, "skinning_backward", nodes, (points, followed), (*grads, weights), *results, num_threads())
+    launch(
+        points,
+        "skinning_backward",
+        nodes,
+        (points, followed),
+        (*grads, weights),
+        *results,
+        num_threads(),
+    )
     return g_points, g_motion, g_values
 
 
 skinning_backward_op = register("skinning_backward", _skinning_backward)
-"""Gradients by the points, empty unless asked for, and by motion and values of the nodes; ``nodes`` are positions,
-radii, motion and values, ``grads`` those by offsets and blended values."""
+"""Gradients by the points, empty unless asked for, and by motion and values of the nodes; ``nodes``
+are positions, radii, motion and values, ``grads`` those by offsets and blended values."""
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -55,9 +80,12 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None
     ctx.save_for_backward(points, positions, radii, followed, motion, values, output[2])
 
 
-def _backward(ctx: Any, g_offset: Tensor, g_blended: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+def _backward(
+    ctx: Any, g_offset: Tensor, g_blended: Tensor, _: Tensor | None
+) -> tuple[Tensor | None, ...]:
     points, positions, radii, followed, motion, values, weights = ctx.saved_tensors
-    with_points, nodes = ctx.needs_input_grad[0], [positions, radii, motion, values]
+    with_points = ctx.needs_input_grad[0]
+    nodes = [positions, radii, motion, values]
     g_points, g_motion, g_values = skinning_backward_op(
         nodes, points, followed, weights, [g_offset, g_blended], with_points
     )
@@ -69,38 +97,58 @@ skinning_op = register("skinning", _skinning, gradient=Gradient(_save, _backward
 
 
 def blend_skinning(
-    points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
+    points: Tensor,
+    positions: Tensor,
+    radii: Tensor,
+    followed: Tensor,
+    motion: Tensor,
+    values: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return offsets (M, 3) of points that follow moving nodes, and the nodes' values (M, D) blended alike.
+    """Return offsets (M, 3) of points that follow moving nodes, and the nodes' values (M, D)
+    blended alike.
 
-    x is offset by sum_b w_b (R_b (x - p_b) - (x - p_b) + d_b) with w = softmax_b(-|x - p_b|^2 / (2 radius_b^2)).
-    Differentiable, once, in ``points``, ``motion`` and ``values``; the weights count as constant. The same bits on any
-    number of threads. NaN reaches its point or its node's followers only, and gradients by nodes. ``positions`` (S, 3)
-    p and ``radii`` (S,) positive, constant; ``followed`` (M, B) int64; ``motion`` (S, 7) shift d, then quaternion wxyz
-    of R, of any length; ``values`` (S, D). Half precision is computed in float32. Raises DyngsError: shapes, types or
-    devices that do not fit, or a node that does not exist.
+    x is offset by sum_b w_b (R_b (x - p_b) - (x - p_b) + d_b) with w = softmax_b(-|x - p_b|^2 / (2
+    radius_b^2)). Differentiable, once, in ``points``, ``motion`` and ``values``; the weights count
+    as constant. The same bits on any number of threads. NaN reaches its point or its node's
+    followers only, and gradients by nodes. ``positions`` (S, 3) p and ``radii`` (S,) positive,
+    constant; ``followed`` (M, B) int64; ``motion`` (S, 7) shift d, then quaternion wxyz of R, of
+    any length; ``values`` (S, D). Half precision is computed in float32. Raises DyngsError: shapes,
+    types or devices that do not fit, or a node that does not exist.
     """
     _check(points, positions, radii, followed, motion, values)
     floats = (points, positions, radii, motion, values)
     dtype = reduce(torch.promote_types, (x.dtype for x in floats), torch.float32)
     points, positions, radii, motion, values = (x.to(dtype) for x in floats)
-    offset, blended, _ = skinning_op(points, positions.detach(), radii.detach(), followed, motion, values)
+    offset, blended, _ = skinning_op(
+        points, positions.detach(), radii.detach(), followed, motion, values
+    )
     return offset, blended
 
 
-def _check(points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor) -> None:
+def _check(
+    points: Tensor,
+    positions: Tensor,
+    radii: Tensor,
+    followed: Tensor,
+    motion: Tensor,
+    values: Tensor,
+) -> None:
     nodes = len(positions) if positions.ndim else 0
     expected = {
         "points": (points, (len(points) if points.ndim else 0, 3)),
         "positions": (positions, (nodes, 3)),
         "radii": (radii, (nodes,)),
         "motion": (motion, (nodes, 7)),
-        "values": (values, (nodes, *values.shape[1:2])) if values.ndim == 2 else (values, (nodes, -1)),
+        "values": (values, (nodes, *values.shape[1:2]))
+        if values.ndim == 2
+        else (values, (nodes, -1)),
     }
     check_tensors("blend_skinning", expected)
     if followed.dtype != torch.int64 or followed.device != points.device:
         wanted = f"int64 on {points.device} like the points"
-        raise DyngsError(f"blend_skinning: followed must be {wanted}, got {followed.dtype} on {followed.device}")
+        raise DyngsError(
+            f"blend_skinning: followed must be {wanted}, got {followed.dtype} on {followed.device}"
+        )
     if followed.ndim != 2 or len(followed) != len(points) or followed.shape[1] == 0:
         raise DyngsError(
             f"blend_skinning: followed must be ({len(points)}, B) with B at least 1, got {tuple(followed.shape)}"
@@ -130,36 +178,61 @@ add_offsets_op = register(
 )
 
 
-def add_offsets_(gaussians: Sequence[Tensor], rows: Tensor | None, offsets: Sequence[Tensor | None]) -> None:
+def add_offsets_(
+    gaussians: Sequence[Tensor], rows: Tensor | None, offsets: Sequence[Tensor | None]
+) -> None:
     """Move M of N Gaussians in place, as ``dyngs.deform.field.deformed`` defines it; no gradient.
 
-    ``gaussians``: means, quats, log scales, opacity logits, harmonics (N, K, 3); contiguous where there are offsets.
-    ``rows`` (M,) int64 without repetition; None: the first M. ``offsets`` (M, ...) of each in this order, of the base
-    colour in place of harmonics; None but for the first: none. Raises IndexError: no such row; DyngsError: not
+    ``gaussians``: means, quats, log scales, opacity logits, harmonics (N, K, 3); contiguous where
+    there are offsets. ``rows`` (M,) int64 without repetition; None: the first M. ``offsets`` (M,
+    ...) of each in this order, of the base colour in place of
+    harmonics; None but for the first: none. Raises IndexError: no such row; DyngsError: not
     contiguous.
     """
     by_means, by_quats, by_log_scales, by_logits, by_colors = (
         None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets
     )
     assert by_means is not None
-    # .data where nothing is added: a tensor that stays as it is must not count as changed for autograd
+    # .data where nothing is added: a tensor that stays as it is must not count as changed for
+    # autograd
     means, quats, log_scales, logits, sh = (
-        x.data.contiguous() if offset is None else x.detach() for x, offset in zip(gaussians, offsets, strict=True)
+        x.data.contiguous() if offset is None else x.detach()
+        for x, offset in zip(gaussians, offsets, strict=True)
     )
-    add_offsets_op(means, quats, log_scales, logits, sh, rows, by_means, by_quats, by_log_scales, by_logits, by_colors)
+    add_offsets_op(
+        means,
+        quats,
+        log_scales,
+        logits,
+        sh,
+        rows,
+        by_means,
+        by_quats,
+        by_log_scales,
+        by_logits,
+        by_colors,
+    )
 
 
 def _add_offsets_backward(
-    grads: list[Tensor | None], rows: Tensor | None, count: int, quats: Tensor | None, offset: Tensor | None
+    grads: list[Tensor | None],
+    rows: Tensor | None,
+    count: int,
+    quats: Tensor | None,
+    offset: Tensor | None,
 ) -> list[Tensor]:
     like = next(x for x in grads if x is not None)
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3))
-    results = [None if x is None else like.new_empty(shape) for x, shape in zip(grads, shapes, strict=True)]
+    results = [
+        None if x is None else like.new_empty(shape) for x, shape in zip(grads, shapes, strict=True)
+    ]
     means, turned, log_scales, logits, sh = grads
     before = None if turned is None else turned.clone(memory_format=torch.contiguous_format)
     own = (None,) * 3 if before is None else (quats, offset, InPlace(before))
     given = (means, log_scales, logits, sh)
-    launch(like, "add_offsets_backward", given, rows, own, results, count, like.shape[0], num_threads())
+    launch(
+        like, "add_offsets_backward", given, rows, own, results, count, like.shape[0], num_threads()
+    )
     return [x for x in (*results, before) if x is not None]
 
 
@@ -167,12 +240,18 @@ add_offsets_backward_op = register("add_offsets_backward", _add_offsets_backward
 
 
 def offset_gradients(
-    grads: Sequence[Tensor | None], rows: Tensor | None, count: int, quats: Tensor | None, offset: Tensor | None
+    grads: Sequence[Tensor | None],
+    rows: Tensor | None,
+    count: int,
+    quats: Tensor | None,
+    offset: Tensor | None,
 ) -> tuple[list[Tensor | None], Tensor | None]:
-    """Return the gradients by the M = ``count`` offsets of ``add_offsets_``, and by the quaternions before it.
+    """Return the gradients by the M = ``count`` offsets of ``add_offsets_``, and by the quaternions
+    before it.
 
-    ``grads``: by means, quats, log scales, opacity logits and harmonics after it, None where there is none, and then
-    there is none in what is returned. ``quats`` (N, 4) before it, and their ``offset`` (M, 4), where they were turned.
+    ``grads``: by means, quats, log scales, opacity logits and harmonics after it, None where there
+    is none, and then there is none in what is returned. ``quats`` (N, 4) before it, and their
+    ``offset`` (M, 4), where they were turned.
     """
     if all(x is None for x in grads):
         return [None] * len(grads), None

@@ -1,4 +1,5 @@
-"""Cuts of a trained scene: Gaussians, faint blending, control nodes and pieces of splines, harmonics."""
+"""Cuts of a trained scene: Gaussians, faint blending, control nodes and pieces of splines,
+harmonics."""
 
 from __future__ import annotations
 
@@ -34,15 +35,21 @@ class Cut:
     """A choice of parts to take away; the defaults take nothing."""
 
     fraction: float = 0.0  # of the Gaussians that is removed
-    alpha_min: float | None = None  # pixels skip Gaussians with a lower alpha; None: as the run has it
+    # pixels skip Gaussians with a lower alpha; None: as the run has it
+    alpha_min: float | None = None
     field: FieldSize | None = None  # size of the field of control nodes; None: as it is
-    # PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay
+    # PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics
+    # stay
     harmonics: float = 0.0
 
     def __str__(self) -> str:
         words = [f"{self.fraction:.1%} of the Gaussians"] if self.fraction else []
         words += [f"alphas below {self.alpha_min:.3g}"] if self.alpha_min else []
-        words += [f"all but {self.field.nodes} nodes of {self.field.pieces} pieces"] if self.field else []
+        words += (
+            [f"all but {self.field.nodes} nodes of {self.field.pieces} pieces"]
+            if self.field
+            else []
+        )
         words += [f"harmonics worth {self.harmonics:g} dB"] if self.harmonics else []
         return ", ".join(words) or "nothing"
 
@@ -50,11 +57,16 @@ class Cut:
 def field_size(scene: GaussianScene) -> FieldSize | None:
     """Return the size of the field of ``scene``; None where no control nodes move anything."""
     nodes = _nodes_of(scene)
-    return FieldSize(nodes.num_nodes, nodes.num_pieces) if nodes is not None and nodes.num_nodes else None
+    return (
+        FieldSize(nodes.num_nodes, nodes.num_pieces)
+        if nodes is not None and nodes.num_nodes
+        else None
+    )
 
 
 def with_field(scene: GaussianScene, size: FieldSize) -> GaussianScene:
-    """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move anything."""
+    """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move
+    anything."""
     nodes = _nodes_of(scene)
     if nodes is None or not isinstance(scene, DynamicScene) or scene.field is None:
         return scene
@@ -92,7 +104,8 @@ def apply_cut(trainer: GaussianTrainer, cut: Cut, scores: Tensor) -> None:
     trainer.config = cut_config(trainer.config, replace(cut, field=None))
     trainer.model.draw_as(trainer.config.model)
     remove_(trainer, scores if cut.fraction else None)
-    if cut.field is not None and _nodes_of(trainer.model.scene) is not None:  # else nothing that moves is left
+    if cut.field is not None and _nodes_of(trainer.model.scene) is not None:
+        # else nothing that moves is left
         trainer.config = cut_config(trainer.config, cut)
         trainer.model.exchange(with_field(trainer.model.scene, cut.field))
     if cut.harmonics:
@@ -105,13 +118,21 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     seen = [i for i in usable if i not in judged] or judged
     background = sent(background_colour(trainer.background), trainer.device)
     looks = list(_looks(trainer, judged, background))
-    found = find_view_dependent(_looks(trainer, seen, background), looks, trainer.model.options, background, tolerance)
+    found = find_view_dependent(
+        _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
+    )
     trainer.model.drop_harmonics(~found.keeps, found.offsets)
-    trainer.model.keep_plain(~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy))
+    trainer.model.keep_plain(
+        ~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
+    )
 
 
-def _looks(trainer: GaussianTrainer, indices: Sequence[int], background: Tensor) -> Iterator[MeasuredView]:
+def _looks(
+    trainer: GaussianTrainer, indices: Sequence[int], background: Tensor
+) -> Iterator[MeasuredView]:
     for image in (trainer.images[i] for i in indices):
         with torch.no_grad():
-            now = trainer.model.training.time_step(trainer.model.scene, image, trainer.done).gaussians.detach()
+            now = trainer.model.training.time_step(
+                trainer.model.scene, image, trainer.done
+            ).gaussians.detach()
         yield MeasuredView(now, image.cameras, image.composite(background), image.mask)

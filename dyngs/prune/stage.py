@@ -1,9 +1,11 @@
-"""The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and training goes on with them.
+"""The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and
+training goes on with them.
 
-The fraction that goes is input here; ``dyngs.prune.search`` finds it, and what else can go, with the same functions.
+The fraction that goes is input here; ``dyngs.prune.search`` finds it, and what else can go, with
+the same functions.
 
-It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that is pruned ends
-with the same bytes as one that had the stage in its configuration.
+It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that
+is pruned ends with the same bytes as one that had the stage in its configuration.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ from dyngs.training.events import Event, Message, Started, StepDone, TopologyCha
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
 
-STEEPNESS = 4.0  # Slope of the hyperbolic tangent: second differences of a profile are small numbers
+# Slope of the hyperbolic tangent: second differences of a profile are small numbers
+STEEPNESS = 4.0
 VOLUME_POWER = 0.1
 
 
@@ -54,7 +57,8 @@ class ScoringViews:
 
 @dataclass(frozen=True)
 class Importance:
-    """Contributions C (K, N) of N Gaussians at K moments: sums over pixels and views, in one of several ways."""
+    """Contributions C (K, N) of N Gaussians at K moments: sums over pixels and views, in one of
+    several ways."""
 
     fractions: Tensor
     slopes: Tensor | None
@@ -67,11 +71,12 @@ class Importance:
 
     @property
     def variation(self) -> Tensor:
-        """(N,) sum_k gamma(k) g(k) C(k), the spatio-temporal variation score of 4DGS-1K (Yuan et al. 2025) for a
-        canonical form that moves.
+        """(N,) sum_k gamma(k) g(k) C(k), the spatio-temporal variation score of 4DGS-1K (Yuan et
+        al. 2025) for a canonical form that moves.
 
-        gamma(k) = V(k)^0.1 with the volume V, over that of the mean Gaussian; g(k) = 1 / (tanh(4 |d(k)|) / 2 + 1/2) in
-        (1, 2] with the second difference d of the profile p over moments. p is the opacity over its maximum where it
+        gamma(k) = V(k)^0.1 with the volume V, over that of the mean Gaussian; g(k) = 1 / (tanh(4
+        |d(k)|) / 2 + 1/2) in (1, 2] with the second difference d of the profile p over moments.
+        p is the opacity over its maximum where it
         changes, and otherwise what is seen, C, smoothed by [1 2 1] / 4, over its maximum.
         """
         return (self._volumes() * self._variation() * self.fractions).sum(0)
@@ -90,9 +95,15 @@ class Importance:
 
 @torch.no_grad()
 def importance(views: ScoringViews, *, slopes: bool) -> Importance:
-    """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the larger half."""
-    scene, options, behind = views.scene, views.options, views.background
-    fractions, opacities, volumes, squares = [], [], [], torch.zeros((), device=behind.device)
+    """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the
+    larger half."""
+    scene = views.scene
+    options = views.options
+    behind = views.background
+    fractions = []
+    opacities = []
+    volumes = []
+    squares = torch.zeros((), device=behind.device)
     for time in views.times:
         moment = scene.time_step(time)
         now = moment.gaussians
@@ -103,12 +114,21 @@ def importance(views: ScoringViews, *, slopes: bool) -> Importance:
         if slopes:
             shader = scene.shader(moment)
             for camera in views.cameras:
-                squares = squares + sensitivities(now, camera, options, background=behind, shader=shader)[0]
-    return Importance(torch.stack(fractions), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
+                squares = (
+                    squares
+                    + sensitivities(now, camera, options, background=behind, shader=shader)[0]
+                )
+    return Importance(
+        torch.stack(fractions),
+        squares if slopes else None,
+        torch.stack(opacities),
+        torch.stack(volumes),
+    )
 
 
 def highest(scores: Tensor, fraction: float) -> Tensor:
-    """Return (N,) bool: all but the lowest ``fraction`` of ``scores`` (N,), at least one; of equal ones the first."""
+    """Return (N,) bool: all but the lowest ``fraction`` of ``scores`` (N,), at least one; of equal
+    ones the first."""
     count = min(max(1, math.ceil(len(scores) * (1 - fraction) - 1e-9)), len(scores))
     kept = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
     kept[torch.sort(scores, descending=True, stable=True).indices[:count]] = True
@@ -121,11 +141,13 @@ def _smoothed(x: Tensor) -> Tensor:
     return (padded[:-2] + 2 * x + padded[2:]) / 4
 
 
-MOVING_VIEWS, MOVING_TIMES = 8, 24  # Numbers of training cameras and times whose pairs are scored in dynamic scenes
+# Numbers of training cameras and times whose pairs are scored in dynamic scenes
+MOVING_VIEWS, MOVING_TIMES = 8, 24
 STILL_VIEWS = 100
 PROBED_VIEWS = 16  # Number of training images on which the loss is measured
 MASKED_BELOW = 0.5
-"""At a key time, Gaussians that contribute no more px to all views together are masked (docs/prune.md)."""
+"""At a key time, Gaussians that contribute no more px to all views together are masked
+(docs/prune.md)."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +176,9 @@ class PruneStage:
 
     def __call__(self, event: Event) -> None:
         match event:
-            case Started() | StepDone() if event.step == self._trainer().config.train.steps < event.total:
+            case Started() | StepDone() if (
+                event.step == self._trainer().config.train.steps < event.total
+            ):
                 done = prune_(self._trainer())
                 self._loop.tell(Message(str(done)))
                 self._loop.tell(TopologyChanged(event.step, done.before, done.after))
@@ -162,21 +186,30 @@ class PruneStage:
 
 @torch.no_grad()
 def prune_(trainer: GaussianTrainer) -> Pruned:
-    """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their number stays."""
+    """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their
+    number stays."""
     trainer.model.exchange(trainer.model.scene.unmasked())
-    before, whole = len(trainer.model.scene), quality_of(trainer, trainer.model.scene)
-    remove_(trainer, scores_of(trainer, trainer.config.prune) if trainer.config.prune.fraction > 0 else None)
-    scene, active = trainer.model.scene, 1.0
+    before = len(trainer.model.scene)
+    whole = quality_of(trainer, trainer.model.scene)
+    remove_(
+        trainer,
+        scores_of(trainer, trainer.config.prune) if trainer.config.prune.fraction > 0 else None,
+    )
+    scene = trainer.model.scene
+    active = 1.0
     loss = whole - quality_of(trainer, scene.unmasked())
     if scene.masks is not None:
         masks = scene.masks
-        active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in range(len(masks.times) - 1))
+        active = fmean(
+            len(masks.active(k)) / max(masks.count, 1) for k in range(len(masks.times) - 1)
+        )
     return Pruned(before, len(scene), loss, active)
 
 
 @torch.no_grad()
 def remove_(trainer: GaussianTrainer, scores: Tensor | None) -> None:
-    """Leave all but the fraction ``prune.fraction`` with the lowest ``scores`` (N,), and mask them if requested."""
+    """Leave all but the fraction ``prune.fraction`` with the lowest ``scores`` (N,), and mask them
+    if requested."""
     options = trainer.config.prune
     whole = trainer.model.scene.unmasked()
     trainer.model.exchange(whole)
@@ -191,8 +224,10 @@ def remove_(trainer: GaussianTrainer, scores: Tensor | None) -> None:
 
 @torch.no_grad()
 def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
-    """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first of docs/prune.md."""
-    score, scene = (options or PruneConfig()).score, trainer.model.scene.unmasked()
+    """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first
+    of docs/prune.md."""
+    score = (options or PruneConfig()).score
+    scene = trainer.model.scene.unmasked()
     found = importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
     match score:
         case "variation":
@@ -202,7 +237,8 @@ def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> T
 
 
 def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
-    """Return at most ``count`` distinct ``cameras``, evenly chosen: each camera of a fixed rig once."""
+    """Return at most ``count`` distinct ``cameras``, evenly chosen: each camera of a fixed rig
+    once."""
     found: dict[bytes, Cameras] = {}
     for camera in cameras:
         numbers = torch.cat([camera.cam_from_world[0, :3], camera.intrinsics[0]], dim=1)
@@ -214,10 +250,15 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
 def scoring_views(
     trainer: GaussianTrainer, scene: GaussianScene, times: Sequence[float | None] | None = None
 ) -> ScoringViews:
-    """Return all pairs of some training cameras and some times; with no times all that matters are cameras."""
+    """Return all pairs of some training cameras and some times; with no times all that matters are
+    cameras."""
     background = background_colour(trainer.background)
     if times is None:
-        times = [None] if scene.is_static else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
+        times = (
+            [None]
+            if scene.is_static
+            else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
+        )
     views = STILL_VIEWS if scene.is_static else MOVING_VIEWS
     cameras = distinct_cameras(trainer.images.cameras(), views)
     return ScoringViews(scene, cameras, times, trainer.model.options, background)
@@ -235,19 +276,26 @@ def quality_of(
     images: Sequence[Image] | None = None,
     alpha_min: float | None = None,
 ) -> float:
-    """Return the mean PSNR of ``images`` drawn of ``scene``, dB; by default of ``probe_images``, as in training."""
-    background, options = sent(background_colour(trainer.background), trainer.device), trainer.model.options
+    """Return the mean PSNR of ``images`` drawn of ``scene``, dB; by default of ``probe_images``, as
+    in training."""
+    background = sent(background_colour(trainer.background), trainer.device)
+    options = trainer.model.options
     options = options if alpha_min is None else replace(options, alpha_min=alpha_min)
-    scene, values = scene.to(trainer.device), []
+    scene = scene.to(trainer.device)
+    values = []
     for image in probe_images(trainer) if images is None else images:
-        drawn = scene.render(image.cameras, image.time, options=options, background=background).rgb[0]
+        drawn = scene.render(image.cameras, image.time, options=options, background=background).rgb[
+            0
+        ]
         values.append(psnr(drawn, image.composite(background), image.mask))
     return fmean(values)
 
 
 def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> VisibilityMasks:
-    """Return at which of evenly spaced key times each Gaussian kept is seen from any of the survey's cameras."""
-    options, last = trainer.config.prune, len(scene.times) - 1
+    """Return at which of evenly spaced key times each Gaussian kept is seen from any of the
+    survey's cameras."""
+    options = trainer.config.prune
+    last = len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
     fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
@@ -259,9 +307,11 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> Visi
 
 
 def there_after(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
-    """Return (K, N) bool: which Gaussians are more opaque than ``alpha_min`` between one of K key times and the next.
+    """Return (K, N) bool: which Gaussians are more opaque than ``alpha_min`` between one of K key
+    times and the next.
 
-    At the training times and in the middle between any two: what is there for a while only may miss all key times.
+    At the training times and in the middle between any two: what is there for a while only may miss
+    all key times.
     """
     looked_at = sorted({*scene.times, *((a + b) / 2 for a, b in pairwise(scene.times))})
     found = torch.zeros(len(times), len(scene), dtype=torch.bool, device=scene.device)

@@ -1,6 +1,7 @@
 """Avatar files: a trained person in one file, to be rendered in any pose without the run.
 
-Local letters: N Gaussians, J joints, K joints that one Gaussian follows, M vertices and T triangles of the template.
+Local letters: N Gaussians, J joints, K joints that one Gaussian follows, M vertices and T triangles
+of the template.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ _WEIGHT_SUM = 1e-3
 
 @dataclass(frozen=True)
 class TemplateRef:
-    """File and SHA-256 of the body template of an avatar, and whether it is the free one that comes with dyngs.
+    """File and SHA-256 of the body template of an avatar, and whether it is the free one that comes
+    with dyngs.
 
     It is needed only to retarget motions of other skeletons.
     """
@@ -54,13 +56,17 @@ class TemplateRef:
 
 
 def write_avatar(run: LoadedRun, path: Path) -> Path:
-    """Write the person of a run, upright and at rest at the place of the capture (docs/formats.md); return ``path``.
+    """Write the person of a run, upright and at rest at the place of the capture (docs/formats.md);
+    return ``path``.
 
-    Raises DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
+    Raises DyngsError: the run is not that of a person, its template is missing, or the file cannot
+    be written.
     """
-    from dyngs.human.motion.placement import rest_clip  # late: scipy, which reading an avatar does without
+    # late: scipy, which reading an avatar does without
+    from dyngs.human.motion.placement import rest_clip
 
-    scene, model = avatar_of(run.scene), run.config.model
+    scene = avatar_of(run.scene)
+    model = run.config.model
     if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
             f"--format avatar needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
@@ -69,7 +75,9 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         raise DyngsError(f"{path}: an avatar is written as {SUFFIX}")
     inputs_of(run).require_output(path)
     if scene.colour is not None:
-        raise DyngsError("an avatar file holds harmonics, this run's colours are a network; train with colour.kind=sh")
+        raise DyngsError(
+            "an avatar file holds harmonics, this run's colours are a network; train with colour.kind=sh"
+        )
     reference = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
     anchors = scene.anchors
     tensors = {f"gaussians.{name}": x for name, x in scene.gaussians.tensors().items()}
@@ -88,23 +96,35 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         "reference.scale": reference.scale,
     }
     if scene.shapes is not None:
-        tensors |= {"shapes.directions": scene.shapes.directions.half(), "shapes.faces": scene.shapes.faces.int()}
+        tensors |= {
+            "shapes.directions": scene.shapes.directions.half(),
+            "shapes.faces": scene.shapes.faces.int(),
+        }
     if scene.light is not None:
         tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
     file = template_path(model)
     template = TemplateRef(file.name, _sha256(file), model.body is None)
-    header = {**asdict(run.info), "near": model.near, "eps2d": model.eps2d, "template": asdict(template)}
-    write_tensors(path, _KIND, {name: x.detach().contiguous() for name, x in tensors.items()}, header)
+    header = {
+        **asdict(run.info),
+        "near": model.near,
+        "eps2d": model.eps2d,
+        "template": asdict(template),
+    }
+    write_tensors(
+        path, _KIND, {name: x.detach().contiguous() for name, x in tensors.items()}, header
+    )
     return path
 
 
 def read_avatar(path: Path) -> LoadedRun:
-    """Read the person of a file, upright and at rest; ``dyngs.runs.opened`` moves it as it does one of a run.
+    """Read the person of a file, upright and at rest; ``dyngs.runs.opened`` moves it as it does one
+    of a run.
 
     A template other than the free one is looked for next to the file when a motion needs it.
 
     Raises:
-        DyngsError: the file is missing, damaged, altered or not an avatar, or the template next to it is another one.
+        DyngsError: the file is missing, damaged, altered or not an avatar, or the template next to
+            it is another one.
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     try:
@@ -119,7 +139,11 @@ def read_avatar(path: Path) -> LoadedRun:
             sh_degree={1: 0, 4: 1}[scene.gaussians.sh.shape[1]],
         )
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else printable(str(error), 120)
+        why = (
+            f"{error.args[0]} is missing"
+            if isinstance(error, KeyError)
+            else printable(str(error), 120)
+        )
         raise DyngsError(f"{path}: not a valid avatar ({why}){_ADVICE}") from None
     options = render_options(model, info.extent, info.world_scale)
     scene = replace(scene, options=options, background=background_colour(info.background))
@@ -133,7 +157,9 @@ def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
     file = template_path(HumanModel()) if ref.packaged else path.parent / Path(ref.file).name
     if file.is_file() and _sha256(file) != ref.sha256:
         whose = "that of this version of dyngs" if ref.packaged else f"{file}"
-        raise DyngsError(f"{path}: needs its own template '{ref.file}', not {whose}; put that file beside it")
+        raise DyngsError(
+            f"{path}: needs its own template '{ref.file}', not {whose}; put that file beside it"
+        )
     return None if ref.packaged else file
 
 
@@ -141,18 +167,40 @@ def _sha256(file: Path) -> str:
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
-        raise DyngsError(f"{file}: the template cannot be read ({error.strerror}); restore it") from None
+        raise DyngsError(
+            f"{file}: the template cannot be read ({error.strerror}); restore it"
+        ) from None
 
 
 def _check(tensors: Mapping[str, Tensor]) -> None:
     """Raises KeyError for a missing tensor, ValueError for a wrong type, shape or range."""
-    n, j, terms = len(tensors["gaussians.means"]), len(tensors["skeleton.joints"]), tensors["gaussians.sh"].shape[1]
-    k, count = tensors["anchors.joints"].shape[1], 2**31 - 1  # the faces of a template without shapes are not there
-    gaussians = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, terms, 3)}
-    shapes: dict[str, tuple[int, ...]] = {f"gaussians.{name}": shape for name, shape in gaussians.items()}
-    anchors = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
+    n = len(tensors["gaussians.means"])
+    j = len(tensors["skeleton.joints"])
+    terms = tensors["gaussians.sh"].shape[1]
+    k = tensors["anchors.joints"].shape[1]
+    count = 2**31 - 1  # the faces of a template without shapes are not there
+    gaussians = {
+        "means": (n, 3),
+        "quats": (n, 4),
+        "log_scales": (n, 3),
+        "logit_opacities": (n,),
+        "sh": (n, terms, 3),
+    }
+    shapes: dict[str, tuple[int, ...]] = {
+        f"gaussians.{name}": shape for name, shape in gaussians.items()
+    }
+    anchors = {
+        "points": (n, 3),
+        "size": (n,),
+        "barycentric": (n, 3),
+        "uv": (n, 2),
+        "height": (n,),
+        "weights": (n, k),
+    }
     shapes |= {f"anchors.{name}": shape for name, shape in anchors.items()}
-    shapes |= dict.fromkeys(("skeleton.joints", "skeleton.template_joints", "fit.turns", "reference.poses"), (j, 3))
+    shapes |= dict.fromkeys(
+        ("skeleton.joints", "skeleton.template_joints", "fit.turns", "reference.poses"), (j, 3)
+    )
     shapes |= {"fit.log_scale": (1,), "reference.trans": (3,), "reference.scale": (1,)}
     if "light" in tensors:
         shapes |= {"light": (TERMS, 3), "normals": (n, 3)}
@@ -175,7 +223,9 @@ def _check(tensors: Mapping[str, Tensor]) -> None:
 def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
 
     def part(prefix: str) -> dict[str, Any]:
-        return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
+        return {
+            name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)
+        }
 
     own = part("anchors.")
     anchors = Anchors(**{**own, "face": own["face"].long(), "joints": own["joints"].long()})
@@ -203,6 +253,10 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
         anchors=anchors,
         skeleton=skeleton,
         clip=reference,
-        learned=new_corrections(reference, skeleton, anchors, tensors.get("normals")).restored(values),
-        shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
+        learned=new_corrections(reference, skeleton, anchors, tensors.get("normals")).restored(
+            values
+        ),
+        shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long())
+        if shapes
+        else None,
     )

@@ -1,4 +1,5 @@
-"""Record of the capture that a run is trained on. A resumed run compares it with the capture there."""
+"""Record of the capture that a run is trained on. A resumed run compares it with the capture
+there."""
 
 from __future__ import annotations
 
@@ -45,8 +46,11 @@ def changed_files(folder: Path, data: DataConfig, capture: Capture | None) -> li
     try:
         stored = json.loads(read_limited(path))
         change = _change(stored["views"], now["views"])
-        files = [name for name, digest in now["files"].items() if stored["files"].get(name) != digest]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # of an earlier version, or damaged
+        files = [
+            name for name, digest in now["files"].items() if stored["files"].get(name) != digest
+        ]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        # of an earlier version, or damaged
         return []
     if change is not None:
         raise DyngsError(
@@ -64,11 +68,18 @@ def named(names: Sequence[str]) -> str:
 
 def _change(before: dict[str, list[float]], now: dict[str, list[float]]) -> str | None:
     """Return what differs between the views of two records; None where nothing does."""
-    for text, names in (("without", before.keys() - now.keys()), ("with the new", now.keys() - before.keys())):
+    for text, names in (
+        ("without", before.keys() - now.keys()),
+        ("with the new", now.keys() - before.keys()),
+    ):
         if names:
             return f"{text} training views {named(sorted(names))}"
     extent = np.ptp([row[_CENTRE] for row in before.values()], axis=0).max(initial=0.0)
-    others = [name for name, row in now.items() if not _is_close(np.array(row), np.array(before[name]), extent)]
+    others = [
+        name
+        for name, row in now.items()
+        if not _is_close(np.array(row), np.array(before[name]), extent)
+    ]
     return f"other sizes, times or cameras of {named(others)}" if others else None
 
 
@@ -105,7 +116,9 @@ def _numbers(view: View, capture: Capture) -> list[float]:
     rotation = view.cam_from_world[:3, :3]
     size = (view.width, view.height, -1.0 if view.time is None else view.time)
     lens = (*view.lens.params, view.lens.focal_ratio)
-    return np.concatenate([size, centre, rotation.ravel(), view.intrinsics[:2].ravel(), lens]).tolist()
+    return np.concatenate(
+        [size, centre, rotation.ravel(), view.intrinsics[:2].ravel(), lens]
+    ).tolist()
 
 
 def _files_of(view: View) -> Iterator[Path]:
@@ -117,7 +130,8 @@ def _files_of(view: View) -> Iterator[Path]:
 
 
 def _digest(path: Path) -> str:
-    """Return a digest of the size, the beginning and the end of a file; "" where it cannot be read."""
+    """Return a digest of the size, the beginning and the end of a file; "" where it cannot be
+    read."""
     try:
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)

@@ -1,7 +1,8 @@
 """Checkpoints and run folders.
 
-A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safetensors``, ``timing.json`` and
-``log.jsonl``. Equal runs write equal checkpoint bytes: wall time is kept in ``timing.json``.
+A run folder holds ``config.yaml`` (resolved), ``checkpoints/step_0007000.safetensors``,
+``timing.json`` and ``log.jsonl``. Equal runs write equal checkpoint bytes: wall time is kept in
+``timing.json``.
 """
 
 from __future__ import annotations
@@ -76,17 +77,23 @@ def step_of(path: Path) -> int:
 
 
 def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float) -> Path:
-    """Write a checkpoint atomically, remove all but the newest ``KEEP_CHECKPOINTS``, and return its path.
+    """Write a checkpoint atomically, remove all but the newest ``KEEP_CHECKPOINTS``, and return its
+    path.
 
-    Raises DyngsError: a model with values that are not finite (earlier checkpoints stay), a full disk, and the like.
+    Raises DyngsError: a model with values that are not finite (earlier checkpoints stay), a full
+    disk, and the like.
     """
     tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
     for name, x in tensors.items():
         if not bool(torch.isfinite(x).all()):
-            field, step = name.removeprefix("gaussians.").removeprefix("model."), checkpoint.info.step
-            raise DyngsError(f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}")
+            field = name.removeprefix("gaussians.").removeprefix("model.")
+            step = checkpoint.info.step
+            raise DyngsError(
+                f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}"
+            )
     path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"
-    # Its time first: a checkpoint whose time is lost by a kill between the two would go on as if it had taken none.
+    # Its time first: a checkpoint whose time is lost by a kill between the two would go on as if it
+    # had taken none.
     _write_seconds(run_dir, checkpoint.info.step, seconds_train)
     header = asdict(checkpoint.info) | {"settings": checkpoint.settings}
     write_tensors(path, _KIND, tensors, header, ", then `dyngs train --resume`")
@@ -95,20 +102,29 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Return the checkpoint in ``path``. Raises DyngsError, which names an older one if there is."""
+    """Return the checkpoint in ``path``. Raises DyngsError, which names an older one if there
+    is."""
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
     with reading(path, _instead_of(path).removeprefix("; ")):
         return Checkpoint(info_of(header), tensors, path, dict(header.get("settings", {})))
 
 
 def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
-    """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or OverflowError."""
+    """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or
+    OverflowError."""
     step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
-    extent, background, mode = float(header["extent"]), header["background"], header["rasterize_mode"]
-    scale = float(header.get("world_scale", 1.0))  # earlier versions trained in the unit of the files
+    extent = float(header["extent"])
+    background = header["background"]
+    mode = header["rasterize_mode"]
+    # earlier versions trained in the unit of the files
+    scale = float(header.get("world_scale", 1.0))
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= MAX_STEP:
         raise ValueError(f"its step is {step!r:.60}")
-    if not all(math.isfinite(value) for value in (extent, x, y, z, scale)) or extent < 0 or scale <= 0:
+    if (
+        not all(math.isfinite(value) for value in (extent, x, y, z, scale))
+        or extent < 0
+        or scale <= 0
+    ):
         raise ValueError("its extent, world_offset or world_scale is not valid")
     if background not in BACKGROUNDS or mode not in {mode.value for mode in RasterizeMode}:
         raise ValueError(f"its background is {background!r:.60}, its rasterize_mode {mode!r:.60}")
@@ -116,11 +132,14 @@ def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
-    """Return the newest checkpoint of a run, also while it trains. Raises DyngsError for none or a damaged one."""
+    """Return the newest checkpoint of a run, also while it trains. Raises DyngsError for none or a
+    damaged one."""
     while True:
         paths = checkpoint_paths(run_dir)
         if not paths:
-            raise DyngsError(f"{run_dir}: no checkpoints there; give the folder of a run that has trained")
+            raise DyngsError(
+                f"{run_dir}: no checkpoints there; give the folder of a run that has trained"
+            )
         try:
             return load_checkpoint(paths[-1])
         except DyngsError:
@@ -129,21 +148,27 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
 
 
 def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
-    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has none."""
+    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has
+    none."""
     config = load_resolved(run_dir, data_root=data_root)
     if config.model.is_network:
         raise DyngsError(
             f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
         )
-    checkpoint = _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
+    checkpoint = (
+        _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
+    )
     checkpoint.require_settings(config)
     scene = restored_model(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
 
 
-def found_corrections(run_dir: Path, run: LoadedRun, trained_on: Sequence[View]) -> CameraCorrections | None:
-    """Return the corrections of a run's cameras; None where it refined none, or has no checkpoint."""
+def found_corrections(
+    run_dir: Path, run: LoadedRun, trained_on: Sequence[View]
+) -> CameraCorrections | None:
+    """Return the corrections of a run's cameras; None where it refined none, or has no
+    checkpoint."""
     if run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
         return None
     checkpoint = latest_checkpoint(run_dir)
@@ -154,7 +179,8 @@ def found_corrections(run_dir: Path, run: LoadedRun, trained_on: Sequence[View])
 
 
 def has_only_scene_file(run_dir: Path) -> bool:
-    """Return whether the run is only there as the file that ``dyngs export --format dyngs`` writes."""
+    """Return whether the run is only there as the file that ``dyngs export --format dyngs``
+    writes."""
     return (run_dir / SCENE_FILE).is_file() and not checkpoint_paths(run_dir)
 
 
@@ -173,14 +199,17 @@ def last_good(run_dir: Path) -> str:
 
 
 def seconds_at(run_dir: Path, step: int) -> float:
-    """Return the training time up to the checkpoint of ``step``, over all resumes; 0 where it is not known."""
+    """Return the training time up to the checkpoint of ``step``, over all resumes; 0 where it is
+    not known."""
     return _read_seconds(run_dir).get(str(step), 0.0)
 
 
 def _read_seconds(run_dir: Path) -> dict[str, float]:
     try:
         stored = json.loads(read_limited(run_dir / TIMING_NAME, _MOST_TIMING_BYTES))
-        known = {str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()}
+        known = {
+            str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()
+        }
         return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}
     except Exception:  # a lost or damaged file costs no more than the times
         return {}

@@ -1,4 +1,5 @@
-"""The configuration in a run folder and the fitted body that it names next to it: the folder may move as a whole."""
+"""The configuration in a run folder and the fitted body that it names next to it: the folder may
+move as a whole."""
 
 from __future__ import annotations
 
@@ -18,12 +19,14 @@ _KEPT = (*_PARAMETERS, "fit_report.json")
 
 
 def write_config(config: Config, folder: Path) -> None:
-    """Write the configuration of the run in ``folder``, with a copy of the fit that ``data.body`` names.
+    """Write the configuration of the run in ``folder``, with a copy of the fit that ``data.body``
+    names.
 
-    The fit is copied once: where the folder has one it is the run's. Where the fit is gone, as that of a run of former
-    versions may be, its path stays as it is.
+    The fit is copied once: where the folder has one it is the run's. Where the fit is gone, as that
+    of a run of former versions may be, its path stays as it is.
     """
-    body, own = config.data.body, folder.absolute() / BODY_FOLDER
+    body = config.data.body
+    own = folder.absolute() / BODY_FOLDER
     if body is not None and (own.is_dir() or (body / _PARAMETERS[0]).is_file()):
         if not own.is_dir():
             _copy_fit(body, own)
@@ -33,14 +36,21 @@ def write_config(config: Config, folder: Path) -> None:
 
 def with_body_of(config: Config, stored: Config) -> Config:
     """Return ``config`` with the path of the fit of ``stored``, where both have the same."""
-    return _with_body(config, stored.data.body) if is_same_body(config.data.body, stored.data.body) else config
+    return (
+        _with_body(config, stored.data.body)
+        if is_same_body(config.data.body, stored.data.body)
+        else config
+    )
 
 
 def is_same_body(one: Path | None, other: Path | None) -> bool:
-    """Return whether two values of ``data.body`` give the same body parameters, wherever they lie."""
+    """Return whether two values of ``data.body`` give the same body parameters, wherever they
+    lie."""
     if one == other or one is None or other is None:
         return one == other
-    return (one / _PARAMETERS[0]).is_file() and all(_content(one / x) == _content(other / x) for x in _PARAMETERS)
+    return (one / _PARAMETERS[0]).is_file() and all(
+        _content(one / x) == _content(other / x) for x in _PARAMETERS
+    )
 
 
 def _with_body(config: Config, body: Path | None) -> Config:

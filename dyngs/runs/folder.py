@@ -1,4 +1,5 @@
-"""Contents of a run folder: checks before a new run begins, and removal of unfinished files of killed processes."""
+"""Contents of a run folder: checks before a new run begins, and removal of unfinished files of
+killed processes."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ EXPORT_FOLDER = "export"
 CHOICES_NAME = "choices.json"
 """In a run folder: what small runs before it said."""
 ASKED_NAME = "asked.yaml"
-"""In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
+"""In a run folder: the configuration as it was asked for, where training has chosen something else
+(config.yaml)."""
 _BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, CHOICES_NAME, RECORD_NAME, BODY_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
 
@@ -33,7 +35,9 @@ def default_folder(name: str) -> Path:
     """Return the run folder of a run that has only a name."""
     parts = Path(name).parts
     if not parts or ".." in parts or Path(name).is_absolute():
-        raise DyngsError(f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER")
+        raise DyngsError(
+            f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER"
+        )
     return Path("runs", name)
 
 
@@ -49,23 +53,33 @@ def require_no_run(folder: Path) -> None:
             f"{folder} already holds a run, as {SCENE_FILE}, which can be drawn but not trained on; give another folder"
         )
     if found:
-        raise DyngsError(f"{folder} already holds {found[0]}, which a new run would replace; give another folder")
+        raise DyngsError(
+            f"{folder} already holds {found[0]}, which a new run would replace; give another folder"
+        )
 
 
 def require_empty(folder: Path) -> None:
-    """Raise unless ``folder`` does not exist or is empty; a lock file whose owner was killed is removed."""
-    if folder.is_dir() and not folder.is_symlink() and [path.name for path in folder.iterdir()] == [LOCK_NAME]:
+    """Raise unless ``folder`` does not exist or is empty; a lock file whose owner was killed is
+    removed."""
+    if (
+        folder.is_dir()
+        and not folder.is_symlink()
+        and [path.name for path in folder.iterdir()] == [LOCK_NAME]
+    ):
         with writing(folder):  # it removes the file at its end
             pass
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise DyngsError(f"{folder}: exists already; give another --out")
     if folder.exists() and not os.access(folder, os.W_OK):
-        raise DyngsError(f"{folder}: cannot be written; give another --out or change its permissions")
+        raise DyngsError(
+            f"{folder}: cannot be written; give another --out or change its permissions"
+        )
 
 
 @contextmanager
 def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
-    """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one that becomes it."""
+    """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one
+    that becomes it."""
     if not out.exists():
         with new_folder(out, require_empty) as started:
             yield started
@@ -77,7 +91,8 @@ def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]
 
 
 def _require_export_of(config: Config, folder: Path) -> None:
-    """Raise unless a run can be exported to ``folder``: no run is there, or a former export of the same one."""
+    """Raise unless a run can be exported to ``folder``: no run is there, or a former export of the
+    same one."""
     found = _found(folder)
     if not found and not checkpoint_paths(folder):
         return
@@ -86,11 +101,14 @@ def _require_export_of(config: Config, folder: Path) -> None:
     except DyngsError:
         same = False
     if not same or checkpoint_paths(folder):
-        raise DyngsError(f"{folder}: holds another run, which an export would replace; give another --out")
+        raise DyngsError(
+            f"{folder}: holds another run, which an export would replace; give another --out"
+        )
 
 
 def require_startable(folder: Path, config: Config) -> None:
-    """Raise unless the run of ``config`` would replace nothing in ``folder`` but what the same run has only begun."""
+    """Raise unless the run of ``config`` would replace nothing in ``folder`` but what the same run
+    has only begun."""
     begun = _config_of_begun(folder)
     if begun is None:
         if checkpoint_paths(folder):
@@ -104,7 +122,8 @@ def require_startable(folder: Path, config: Config) -> None:
 
 
 def is_done(folder: Path, config: Config) -> bool:
-    """Return whether ``folder`` holds the finished run of just this configuration, as it was asked for."""
+    """Return whether ``folder`` holds the finished run of just this configuration, as it was asked
+    for."""
     paths = checkpoint_paths(folder)
     if not paths or not _is_as_asked(folder, config):
         return False
@@ -113,7 +132,8 @@ def is_done(folder: Path, config: Config) -> bool:
 
 def note_asked(folder: Path, asked: Config) -> None:
     """Write the configuration that was requested next to that of the run, if the two differ."""
-    path, stored = folder / ASKED_NAME, load_resolved(folder)
+    path = folder / ASKED_NAME
+    stored = load_resolved(folder)
     if _is_same_run(stored, asked):
         path.unlink(missing_ok=True)
     else:
@@ -121,13 +141,19 @@ def note_asked(folder: Path, asked: Config) -> None:
 
 
 def note_root(folder: Path, data: DataConfig) -> None:
-    """Write into the configuration of a run where its capture lies by now; it must be the same capture."""
+    """Write into the configuration of a run where its capture lies by now; it must be the same
+    capture."""
     for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:
             capture = None if stored.model.is_network else read_capture(data)
             changed_files(folder, data, capture)
-            save_config(stored.model_copy(update={"data": stored.data.model_copy(update={"root": data.root})}), path)
+            save_config(
+                stored.model_copy(
+                    update={"data": stored.data.model_copy(update={"root": data.root})}
+                ),
+                path,
+            )
 
 
 def asked_for(folder: Path) -> Config:
@@ -144,9 +170,11 @@ def _is_as_asked(folder: Path, config: Config) -> bool:
 
 
 def _about_other(folder: Path, config: Config) -> str:
-    """Return why the run of ``config`` cannot begin in ``folder``, which has checkpoints, and what to do."""
+    """Return why the run of ``config`` cannot begin in ``folder``, which has checkpoints, and what
+    to do."""
     try:
-        stored, asked = load_resolved(folder), asked_for(folder)
+        stored = load_resolved(folder)
+        asked = asked_for(folder)
     except DyngsError:
         return f"{folder} already holds a run, whose {RESOLVED_NAME} cannot be read; give another run.dir"
     done = step_of(checkpoint_paths(folder)[-1])
@@ -169,7 +197,9 @@ def _about_other(folder: Path, config: Config) -> str:
 def _differences(one: Config, other: Config) -> Iterator[tuple[str, object, object]]:
     """Yield dotted key and both values, as they are printed, of what makes two runs different."""
     both = one, with_body_of(other, one)
-    first, second = (_flat(c.model_dump(mode="json", exclude={"run"}) | {"run.seed": c.run.seed}) for c in both)
+    first, second = (
+        _flat(c.model_dump(mode="json", exclude={"run"}) | {"run.seed": c.run.seed}) for c in both
+    )
     for key in dict.fromkeys((*first, *second)):
         if first.get(key) != second.get(key):
             yield key, first.get(key, "not"), second.get(key, "not")
@@ -179,7 +209,9 @@ def _flat(values: Mapping[str, object], above: str = "") -> dict[str, object]:
     """Return nested values by their dotted keys."""
     found: dict[str, object] = {}
     for key, value in values.items():
-        found |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
+        found |= (
+            _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
+        )
     return found
 
 
@@ -196,9 +228,11 @@ def begin(folder: Path, config: Config) -> None:
 
 
 def tidy(folder: Path, *, sole_writer: bool) -> None:
-    """Remove what killed processes left half written in a run folder; its owner calls this before it writes.
+    """Remove what killed processes left half written in a run folder; its owner calls this before
+    it writes.
 
-    ``sole_writer``: no other process writes into it, so that checkpoints that nobody goes on writing can be told.
+    ``sole_writer``: no other process writes into it, so that checkpoints that nobody goes on
+    writing can be told.
     """
     remove_leftovers(folder, _BEGUN.__contains__ if sole_writer else None)
     for inner in (folder / "checkpoints", folder / EXPORT_FOLDER):
@@ -207,7 +241,8 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
 
 
 def _found(folder: Path) -> list[str]:
-    """Return the names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
+    """Return the names in ``folder`` that a run writes, whatever lies there under them; those of a
+    begun run last."""
     metrics = sorted(path.name for path in folder.glob("metrics*.json"))
     names = [SCENE_FILE, EXPORT_FOLDER, *metrics, *_BEGUN]
     found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
@@ -217,9 +252,14 @@ def _found(folder: Path) -> list[str]:
 
 
 def _config_of_begun(folder: Path) -> Config | None:
-    """Return the configuration of a run stopped before its first checkpoint; None where there is no such run."""
+    """Return the configuration of a run stopped before its first checkpoint; None where there is no
+    such run."""
     found = _found(folder)
-    if RESOLVED_NAME not in found or checkpoint_paths(folder) or any(name not in _BEGUN for name in found):
+    if (
+        RESOLVED_NAME not in found
+        or checkpoint_paths(folder)
+        or any(name not in _BEGUN for name in found)
+    ):
         return None
     try:
         return load_resolved(folder)
@@ -228,7 +268,8 @@ def _config_of_begun(folder: Path) -> Config | None:
 
 
 def _is_same_run(one: Config, other: Config) -> bool:
-    """Return whether two runs have the same bytes, whatever they are called, wherever they are, by how many threads."""
+    """Return whether two runs have the same bytes, whatever they are called, wherever they are, by
+    how many threads."""
     return _what_counts(one) == _what_counts(with_body_of(other, one))
 
 

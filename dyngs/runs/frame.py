@@ -1,4 +1,5 @@
-"""The frame that `dyngs edit` gave to a run: RUN/frame.json, by which all that leaves the run is moved."""
+"""The frame that `dyngs edit` gave to a run: RUN/frame.json, by which all that leaves the run is
+moved."""
 
 from __future__ import annotations
 
@@ -36,11 +37,15 @@ class RunFrame:
 
 def write_frame(folder: Path, frame: RunFrame) -> None:
     """Write the frame of the run in ``folder``, atomically."""
-    write_text(folder / FRAME_NAME, json.dumps(asdict(frame) | {"similarity": frame.similarity.numbers}) + "\n")
+    write_text(
+        folder / FRAME_NAME,
+        json.dumps(asdict(frame) | {"similarity": frame.similarity.numbers}) + "\n",
+    )
 
 
 def read_frame(folder: Path) -> RunFrame | None:
-    """Return the frame of the run in ``folder``, None where it was not edited. Raises DyngsError: it is damaged."""
+    """Return the frame of the run in ``folder``, None where it was not edited. Raises DyngsError:
+    it is damaged."""
     path = folder / FRAME_NAME
     if not path.exists():
         return None
@@ -49,10 +54,18 @@ def read_frame(folder: Path) -> RunFrame | None:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError("too large")
         told = json.loads(path.read_bytes())
-        similarity, (x, y, z) = similarity_of([float(a) for a in told["similarity"]]), map(float, told["offset"])
-        up, fixed = told["up"], told["fixed"]
-        if not (np.isfinite((x, y, z)).all() and (up is None or up in AXES) and isinstance(fixed, bool)):
+        similarity, (x, y, z) = (
+            similarity_of([float(a) for a in told["similarity"]]),
+            map(float, told["offset"]),
+        )
+        up = told["up"]
+        fixed = told["fixed"]
+        if not (
+            np.isfinite((x, y, z)).all() and (up is None or up in AXES) and isinstance(fixed, bool)
+        ):
             raise ValueError("no offset or no axis")
     except (ValueError, KeyError, TypeError, RecursionError):
-        raise DyngsError(f"{path}: is no frame of `dyngs edit`; edit the original run again") from None
+        raise DyngsError(
+            f"{path}: is no frame of `dyngs edit`; edit the original run again"
+        ) from None
     return RunFrame(similarity, (x, y, z), up, fixed)

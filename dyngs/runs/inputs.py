@@ -1,4 +1,5 @@
-"""What a command reads: the files of runs, and what configurations and captures name, for the check of its outputs."""
+"""What a command reads: the files of runs, and what configurations and captures name, for the check
+of its outputs."""
 
 from __future__ import annotations
 
@@ -15,7 +16,13 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import Inputs
 from dyngs.runs.capture_record import RECORD_NAME
-from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, LoadedRun, checkpoint_paths, has_only_scene_file
+from dyngs.runs.checkpoint import (
+    SCENE_FILE,
+    TIMING_NAME,
+    LoadedRun,
+    checkpoint_paths,
+    has_only_scene_file,
+)
 from dyngs.runs.config_file import BODY_FOLDER
 from dyngs.runs.folder import ASKED_NAME
 from dyngs.runs.log import LOG_NAME
@@ -25,10 +32,11 @@ _FILES_OF_VIEWS = ("image_path", "mask_path", "depth_path", "motion_mask_path", 
 
 
 def inputs_of(*read: Read) -> Inputs:
-    """Return what is read of files, folders, runs, configurations and captures, with all that these name.
+    """Return what is read of files, folders, runs, configurations and captures, with all that these
+    name.
 
-    Of a run, its folder or its ``scene.dyngs``, these are its own files and what its configuration names: other files
-    in its folder are outputs.
+    Of a run, its folder or its ``scene.dyngs``, these are its own files and what its configuration
+    names: other files in its folder are outputs.
     """
     found = list(chain.from_iterable(_named_by(one) for one in read))
     return Inputs((one for one in found if isinstance(one, Path)), lambda: _outside_captures(found))
@@ -68,7 +76,9 @@ def _config_of(run_dir: Path) -> Config | None:
 
 
 def _files_of_run(run_dir: Path) -> Iterator[Path]:
-    yield from (run_dir / name for name in (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME))
+    yield from (
+        run_dir / name for name in (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME)
+    )
     yield from checkpoint_paths(run_dir)
     yield from (run_dir / BODY_FOLDER).glob("*")
     if has_only_scene_file(run_dir):
@@ -76,7 +86,8 @@ def _files_of_run(run_dir: Path) -> Iterator[Path]:
 
 
 def _outside_captures(found: Sequence[Path | DataConfig | Capture]) -> Iterator[Path]:
-    """Yield the files of captures that lie elsewhere than in their folders, as ``data.follow_links`` allows."""
+    """Yield the files of captures that lie elsewhere than in their folders, as
+    ``data.follow_links`` allows."""
     captures = [one for one in found if isinstance(one, Capture)]
     for data in (one for one in found if isinstance(one, DataConfig)):
         try:

@@ -26,7 +26,8 @@ class LogRecord:
     Attributes:
         loss, psnr: of this step; of its image, dB, None where its mask leaves nothing.
         num_gaussians, num_moving: after the step, and those of them that depend on time.
-        bad_gradients: how often so far a Gaussian was left out of a step because its gradient was not finite.
+        bad_gradients: how often so far a Gaussian was left out of a step because its gradient was
+            not finite.
         seconds: training time so far, over all resumes.
     """
 
@@ -48,8 +49,11 @@ class RunLog:
         tensorboard: also write event files to ``run_dir/tensorboard``.
     """
 
-    def __init__(self, run_dir: Path, after_step: int, *, every: int = 1, tensorboard: bool = False) -> None:
-        self.path, self._every = run_dir / LOG_NAME, every
+    def __init__(
+        self, run_dir: Path, after_step: int, *, every: int = 1, tensorboard: bool = False
+    ) -> None:
+        self.path = run_dir / LOG_NAME
+        self._every = every
         self._board = _open_tensorboard(run_dir, after_step) if tensorboard else None
         write_text(self.path, "".join(_lines_up_to(self.path, after_step)))
         self._file: IO[str] = self.path.open("a", encoding="utf-8")
@@ -68,7 +72,9 @@ class RunLog:
 
     def write_scores(self, step: int, split: str, psnr: float, ssim: float) -> None:
         """Append the scores of an evaluation during training."""
-        self._append({"step": step, "split": split, "psnr": psnr, "ssim": ssim}, split, ("psnr", "ssim"))
+        self._append(
+            {"step": step, "split": split, "psnr": psnr, "ssim": ssim}, split, ("psnr", "ssim")
+        )
 
     def _append(self, values: dict[str, Any], group: str, plotted: Sequence[str]) -> None:
         """Append a line and flush, so that a crash loses nothing."""
@@ -109,7 +115,8 @@ def _lines_up_to(path: Path, step: int) -> list[str]:
         try:
             if json.loads(line)["step"] <= step:
                 kept.append(line + "\n")
-        except (ValueError, KeyError, TypeError, RecursionError):  # the torn last line of a killed run
+        except (ValueError, KeyError, TypeError, RecursionError):
+            # the torn last line of a killed run
             continue
     return kept
 

@@ -30,19 +30,31 @@ _PARTS = "model."  # Of a checkpoint, what is no state of its training
 def write_network(run_dir: Path, config: Config, checkpoint: Checkpoint, path: Path) -> Path:
     """Write the network of a run; return ``path``.
 
-    Raises DyngsError: values that float16 cannot hold, a body template of the user's own, or a path that is an input.
+    Raises DyngsError: values that float16 cannot hold, a body template of the user's own, or a path
+    that is an input.
     """
     if path.suffix.lower() != SUFFIX:
         raise DyngsError(f"{path}: a network is written as {SUFFIX}")
     inputs_of(run_dir).require_output(path)
     if getattr(config.model, "body", None) is not None:
-        raise DyngsError(f"{run_dir}: a file of a network holds no template, and model.body names one; give the run")
+        raise DyngsError(
+            f"{run_dir}: a file of a network holds no template, and model.body names one; give the run"
+        )
     tensors = {name: x for name, x in checkpoint.tensors.items() if name.startswith(_PARTS)}
-    small = {name: x.half().contiguous() if x.is_floating_point() else x for name, x in tensors.items()}
+    small = {
+        name: x.half().contiguous() if x.is_floating_point() else x for name, x in tensors.items()
+    }
     for name, x in small.items():
         if not bool(torch.isfinite(x).all()):
-            raise DyngsError(f"{run_dir}: {name.removeprefix(_PARTS)} is beyond what float16 holds; lower model.lr")
-    write_tensors(path, _KIND, small, {**asdict(checkpoint.info), "model": config.model.model_dump(mode="json")})
+            raise DyngsError(
+                f"{run_dir}: {name.removeprefix(_PARTS)} is beyond what float16 holds; lower model.lr"
+            )
+    write_tensors(
+        path,
+        _KIND,
+        small,
+        {**asdict(checkpoint.info), "model": config.model.model_dump(mode="json")},
+    )
     return path
 
 
@@ -53,22 +65,32 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     with reading(path, _ADVICE.removeprefix("; ")):
-        info, model = info_of(header), header["model"]
+        info = info_of(header)
+        model = header["model"]
         if not isinstance(model, dict) or model.get("body") is not None:
             raise ValueError("its section model is not that of a network")
         config = Config.model_validate({"data": {"root": path.parent}, "model": model})
         if not config.model.is_network:
             raise ValueError(f"it is of model.kind={config.model.kind}")
-    return config, Checkpoint(info, {n: x.float() if x.is_floating_point() else x for n, x in tensors.items()}, path)
+    return config, Checkpoint(
+        info, {n: x.float() if x.is_floating_point() else x for n, x in tensors.items()}, path
+    )
 
 
 def published_network(name: str) -> Path:
-    """Return the file of the weights ``name`` in the package of published ones. Raises DyngsError: it is not there."""
+    """Return the file of the weights ``name`` in the package of published ones. Raises DyngsError:
+    it is not there."""
     package = find_spec(PUBLISHED)
     if package is None:
         advice = "install the package dyngs-people-weights, see docs/people_network.md, to use published weights"
-        raise DyngsError(f"{name}: no run and no file of weights; give the run of a network, or {advice}")
-    files = {x.stem: x for folder in package.submodule_search_locations or () for x in Path(folder).glob(f"*{SUFFIX}")}
+        raise DyngsError(
+            f"{name}: no run and no file of weights; give the run of a network, or {advice}"
+        )
+    files = {
+        x.stem: x
+        for folder in package.submodule_search_locations or ()
+        for x in Path(folder).glob(f"*{SUFFIX}")
+    }
     if name not in files:
         raise DyngsError(
             f"{name}: no run and no file of weights; published are {' and '.join(sorted(files)) or 'none'}"

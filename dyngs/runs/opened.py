@@ -1,4 +1,5 @@
-"""Scenes with what is known about them: of a run, an avatar file, a file of Gaussians, or a training in progress."""
+"""Scenes with what is known about them: of a run, an avatar file, a file of Gaussians, or a
+training in progress."""
 
 from __future__ import annotations
 
@@ -45,12 +46,15 @@ T = TypeVar("T")
 
 
 class Captured:
-    """The capture that a scene was trained on; read when it is first needed, and only once, if not ``capture``.
+    """The capture that a scene was trained on; read when it is first needed, and only once, if not
+    ``capture``.
 
     It is in the scene coordinates of ``info``.
     """
 
-    def __init__(self, data: DataConfig, info: CheckpointInfo, capture: Capture | None = None) -> None:
+    def __init__(
+        self, data: DataConfig, info: CheckpointInfo, capture: Capture | None = None
+    ) -> None:
         self.data, self._info = data, info
         self._found: Capture | DyngsError | None = capture
         self._kept: dict[str, Any] = {}
@@ -69,7 +73,8 @@ class Captured:
 
     @property
     def cameras(self) -> Cameras | None:
-        """The V training cameras, all with size and intrinsics of the first; None where the capture cannot be read."""
+        """The V training cameras, all with size and intrinsics of the first; None where the capture
+        cannot be read."""
         return self.once("cameras", self._cameras)
 
     def _cameras(self) -> Cameras | None:
@@ -92,8 +97,10 @@ class Opened(LoadedRun):
         captured: what it was trained on; None: a file, which does not say.
         turned: (4,) wxyz, the rotation from the axes of the capture's files to those of the scene.
         edited: the frame that a run was given after training; None: it is that of its capture.
-        stated_up: axis that the file, the frame or the user says is up, such as "-y"; None: none does.
-        fps: frame rate of the motion that a person plays instead of that of training; None: it is that of training.
+        stated_up: axis that the file, the frame or the user says is up, such as "-y"; None: none
+            does.
+        fps: frame rate of the motion that a person plays instead of that of training; None: it is
+            that of training.
         as_captured: a person is in the poses of the capture.
         notes: lines about what was changed or left out in reading.
         path: run folder or file that it was opened from; None: none.
@@ -118,7 +125,9 @@ class Opened(LoadedRun):
     def capture(self) -> Capture:
         """As of ``Captured``. Raises DyngsError where there is none, or it cannot be read."""
         if self.captured is None:
-            raise DyngsError(f"{self.config.data.root}: a file, without the capture that it was trained on")
+            raise DyngsError(
+                f"{self.config.data.root}: a file, without the capture that it was trained on"
+            )
         return self.captured.capture
 
     @property
@@ -143,8 +152,11 @@ class Opened(LoadedRun):
 
     @property
     def world_offset(self) -> np.ndarray:
-        """(3,) float64; added to coordinates that ``frame`` has moved, it gives those that people mean."""
-        return np.asarray(self.info.world_offset if self.edited is None else self.edited.offset, np.float64)
+        """(3,) float64; added to coordinates that ``frame`` has moved, it gives those that people
+        mean."""
+        return np.asarray(
+            self.info.world_offset if self.edited is None else self.edited.offset, np.float64
+        )
 
     @property
     def file_unit(self) -> Similarity:
@@ -153,19 +165,22 @@ class Opened(LoadedRun):
 
     @property
     def frame(self) -> Similarity:
-        """From the scene, as it is drawn, to the frame it was given, else to the capture's files less their offset."""
+        """From the scene, as it is drawn, to the frame it was given, else to the capture's files
+        less their offset."""
         if self.edited is not None:
             return self.edited.similarity
         return Similarity(inverse(self.turned), self.info.world_scale)
 
     @property
     def world(self) -> Similarity:
-        """``frame``, with the offset: from the scene to the coordinates that people mean, in float64."""
+        """``frame``, with the offset: from the scene to the coordinates that people mean, in
+        float64."""
         x, y, z = self.world_offset.tolist()
         return Similarity(shift=(x, y, z)).after(self.frame)
 
     def direction_of(self, axis: str) -> np.ndarray:
-        """Return the direction (3,) in the scene of an axis such as "-y": of its frame, else of the scene itself."""
+        """Return the direction (3,) in the scene of an axis such as "-y": of its frame, else of the
+        scene itself."""
         own = np.array(AXES[axis])
         return own if self.edited is None else self.edited.similarity.rotation.T @ own
 
@@ -176,11 +191,15 @@ class Opened(LoadedRun):
 
     @property
     def up(self) -> tuple[np.ndarray, str] | None:
-        """Direction (3,) that is up, and what says so: the file, a body at rest, or the cameras; None: nothing does."""
+        """Direction (3,) that is up, and what says so: the file, a body at rest, or the cameras;
+        None: nothing does."""
         if self.stated_up is not None:
-            return self.direction_of(self.stated_up), "the file" if self.edited is None else "the edit"
+            return self.direction_of(
+                self.stated_up
+            ), "the file" if self.edited is None else "the edit"
         if self.person is not None:
-            from dyngs.human.motion.placement import up_direction as up_of_body  # late: scipy, as below
+            # late: scipy, as below
+            from dyngs.human.motion.placement import up_direction as up_of_body
 
             return up_of_body(self.person.clip).double().cpu().numpy(), "the body at rest"
         cameras = self.cameras
@@ -188,7 +207,8 @@ class Opened(LoadedRun):
 
     @property
     def seconds(self) -> float:
-        """Seconds that pass from time 0 to 1: as the capture or the motion says, else 30 frames a second."""
+        """Seconds that pass from time 0 to 1: as the capture or the motion says, else 30 frames a
+        second."""
         frames = max(len(self.renderable.times), 1)
         if self.fps is not None:
             return max(frames / self.fps, SHORTEST)
@@ -220,16 +240,19 @@ class Opened(LoadedRun):
         return self.showing(scene_of_split(self, self.capture, split))
 
     def in_motion(self, path: Path, *, keep_feet: bool = False) -> Opened:
-        """Return the same with its person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM animation).
+        """Return the same with its person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM
+        animation).
 
-        A file with ``scale`` is a fit to this person in the world of the capture; any other motion is adapted to the
-        size, position and up direction of the person. With ``keep_feet`` the root moves so that feet on the floor stay
-        where they are (``dyngs.human.motion.feet``); a note says by how much they slide before and after.
+        A file with ``scale`` is a fit to this person in the world of the capture; any other motion
+        is adapted to the size, position and up direction of the person. With ``keep_feet`` the root
+        moves so that feet on the floor stay where they are (``dyngs.human.motion.feet``); a note
+        says by how much they slide before and after.
 
         Raises:
             DyngsError: it is no person, or the file cannot be read.
         """
-        from dyngs.human.motion.placement import place_like  # late: they need scipy, which no other drawing does
+        # late: they need scipy, which no other drawing does
+        from dyngs.human.motion.placement import place_like
         from dyngs.human.motion.retarget import read_motion
 
         person, model = self._person_for(f"--motion {path}")
@@ -245,20 +268,24 @@ class Opened(LoadedRun):
         clip = motion_clip(motion)
         if not is_fit:
             clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-        playing, notes = scene.playing(clip), (*self.notes, *motion.notes)
+        playing = scene.playing(clip)
+        notes = (*self.notes, *motion.notes)
         if keep_feet:
             from dyngs.human.motion.feet import feet_kept, sole_points  # late: scipy, as above
             from dyngs.human.motion.placement import up_direction as up_of_body
 
-            skeleton, floor = playing.learned_skeleton, float(scene.anchors.points[:, 1].min())
+            skeleton = playing.learned_skeleton
+            floor = float(scene.anchors.points[:, 1].min())
             soles = sole_points(playing.moves_as, skeleton.joints, skeleton.parents, floor)
             clip, before, after = feet_kept(clip, soles, up_of_body(scene.clip), motion.fps)
-            playing, notes = scene.playing(clip), (*notes, before.compared(after))
+            playing = scene.playing(clip)
+            notes = (*notes, before.compared(after))
         playing = playing.to(person.gaussians.means.device)
         return replace(self, renderable=playing, fps=motion.fps, as_captured=False, notes=notes)
 
     def at_rest(self) -> Opened:
-        """Return the same with its person in the rest pose of the template, upright on the floor. Raises DyngsError."""
+        """Return the same with its person in the rest pose of the template, upright on the floor.
+        Raises DyngsError."""
         from dyngs.human.motion.placement import rest_clip  # late: scipy, as above
 
         scene, _ = self._person_for("--pose rest")
@@ -266,15 +293,18 @@ class Opened(LoadedRun):
         return replace(self, renderable=scene.playing(rest), as_captured=False)
 
     def in_own_frame(self) -> Opened:
-        """Return the same with its person moved into the frame of the edit, for files that hold nothing but them."""
-        person, how = self.person, self.frame
+        """Return the same with its person moved into the frame of the edit, for files that hold
+        nothing but them."""
+        person = self.person
+        how = self.frame
         if self.edited is None or person is None:
             return self
         from dyngs.human.motion.placement import moved  # late: scipy, as above
 
         like = person.clip.trans
         pelvis = person.learned_skeleton.joints[0] * math.exp(person.fit.log_scale)
-        rotation, shift = torch.from_numpy(how.rotation).to(like), like.new_tensor(how.shift)
+        rotation = torch.from_numpy(how.rotation).to(like)
+        shift = like.new_tensor(how.shift)
 
         def there(clip: MotionClip) -> MotionClip:
             return moved(clip, rotation, how.scale, shift, pelvis)
@@ -288,7 +318,9 @@ class Opened(LoadedRun):
         model = self.config.model
         if self.person is None or not isinstance(model, HumanModel):
             kind = self.config.model.kind
-            raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {kind}")
+            raise DyngsError(
+                f"{wanted} needs the run of a person (model.kind=human), this one is {kind}"
+            )
         return self.person, model
 
 
@@ -298,8 +330,11 @@ def _once(kept: dict[str, Any], name: str, compute: Callable[[], T]) -> T:
     return kept[name]
 
 
-def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | None = None) -> Opened:
-    """Open a run folder, a ``scene.dyngs`` with the ``config.yaml`` of its run, an avatar, or a file of Gaussians.
+def open_scene(
+    path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | None = None
+) -> Opened:
+    """Open a run folder, a ``scene.dyngs`` with the ``config.yaml`` of its run, an avatar, or a
+    file of Gaussians.
 
     Args:
         nonfinite: of a file of Gaussians, as ``dyngs.splats.formats.read_splats``.
@@ -308,10 +343,14 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    if (path.is_dir() and format_to_read(path) is None) or (path.name == SCENE_FILE and path.exists()):
+    if (path.is_dir() and format_to_read(path) is None) or (
+        path.name == SCENE_FILE and path.exists()
+    ):
         return open_run(path if path.is_dir() else path.parent, data_root=data_root)
     if not path.exists():
-        raise DyngsError(f"{path}: no such file or folder; give what `dyngs train` or `dyngs export` wrote")
+        raise DyngsError(
+            f"{path}: no such file or folder; give what `dyngs train` or `dyngs export` wrote"
+        )
     if data_root is not None:
         raise DyngsError(f"{path}: a file, not a run, so it has no capture; leave out data.root")
     if path.suffix.lower() == AVATAR_SUFFIX:
@@ -321,7 +360,9 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
         other = command_for(path)
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path, nonfinite=nonfinite)
-    opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), path)
+    opened = opened_scene(
+        StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), path
+    )
     scaled = splat.edited.scale != 1
     opened = replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
     if splat.edited != UNMOVED:  # then its own frame is the one that people mean
@@ -331,9 +372,11 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
 
 
 def open_run(folder: Path, capture: Capture | None = None, data_root: Path | None = None) -> Opened:
-    """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it is read already."""
+    """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it
+    is read already."""
     run = load_run(folder, data_root)
-    edited, captured = read_frame(folder), Captured(run.config.data, run.info, capture)
+    edited = read_frame(folder)
+    captured = Captured(run.config.data, run.info, capture)
     opened = Opened(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
     if edited is None:
         return opened
@@ -348,31 +391,41 @@ def opened_scene(scene: GaussianScene, file: Path = Path("scene")) -> Opened:
 
 
 def cameras_for_paths(views: Sequence[View], data: DataConfig) -> Cameras:
-    """Return the cameras of V views, all with size and intrinsics of the first (downscaled, undistorted)."""
+    """Return the cameras of V views, all with size and intrinsics of the first (downscaled,
+    undistorted)."""
     (first,) = training_cameras(views[:1], data)
-    poses = torch.from_numpy(np.stack([view.cam_from_world for view in views])).to(first.cam_from_world)
-    return Cameras(poses, first.intrinsics.expand(len(views), 3, 3).clone(), first.width, first.height)
+    poses = torch.from_numpy(np.stack([view.cam_from_world for view in views])).to(
+        first.cam_from_world
+    )
+    return Cameras(
+        poses, first.intrinsics.expand(len(views), 3, 3).clone(), first.width, first.height
+    )
 
 
 def split_views(capture: Capture, split: str) -> Sequence[View]:
-    """Return the views of a split, at least one. Raises DyngsError that lists the splits there are."""
+    """Return the views of a split, at least one. Raises DyngsError that lists the splits there
+    are."""
     views = {str(name): views for name, views in capture.splits.items() if views}
     if split in views:
         return views[split]
     there = ", ".join(f"{name} ({counted(len(found), 'view')})" for name, found in views.items())
-    raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
+    raise DyngsError(
+        f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}"
+    )
 
 
 def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
-    """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that split.
+    """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that
+    split.
 
-    The split pose, and splits with body parameters of their own, have the poses of their files. Others show the clip of
-    training with its refined poses, interpolated at times between.
+    The split pose, and splits with body parameters of their own, have the poses of their files.
+    Others show the clip of training with its refined poses, interpolated at times between.
     """
     avatar = avatar_of(run.renderable)
     if avatar is None or capture.body is None:
         return run.renderable
-    own, trained = capture.body[cast(Split, split)], capture.body["train"]
+    own = capture.body[cast(Split, split)]
+    trained = capture.body["train"]
     if split != "pose" and same_bodies(own, trained):
         return run.renderable
     shown = captured_motion(capture.root, own, split_views(capture, split), avatar.skeleton.joints)

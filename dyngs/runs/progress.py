@@ -20,15 +20,17 @@ PLAIN_LINES = 10
 
 
 class Progress:
-    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; a context manager.
+    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; a
+    context manager.
 
-    Where there is no terminal, plain lines. Prints nothing where ``total`` steps are already done. Output that cannot
-    be written is dropped: a terminal that was closed must not end the run.
+    Where there is no terminal, plain lines. Prints nothing where ``total`` steps are already done.
+    Output that cannot be written is dropped: a terminal that was closed must not end the run.
 
     Args:
         every: steps between updates; the last step has one, too.
         stream: where to; None: standard error.
-        config: returns the configuration as it is now, whose schedule decides the time left; None: steps all alike.
+        config: returns the configuration as it is now, whose schedule decides the time left; None:
+            steps all alike.
     """
 
     def __init__(
@@ -52,7 +54,9 @@ class Progress:
     def __call__(self, event: Event) -> None:
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
-                self.update(record_of(event), event.report.truth.shape[0] * event.report.truth.shape[1])
+                self.update(
+                    record_of(event), event.report.truth.shape[0] * event.report.truth.shape[1]
+                )
             case StepDone() if not self._has_stepped:
                 self._has_stepped = True
                 self._forecast.restart(event.step, time.perf_counter())
@@ -64,10 +68,13 @@ class Progress:
                 self.say(event.text)
 
     def update(self, record: LogRecord, pixels: int = 0) -> None:
-        """Show ``record``, of a step that drew ``pixels``; PSNR is averaged over the last few of them."""
+        """Show ``record``, of a step that drew ``pixels``; PSNR is averaged over the last few of
+        them."""
         # One image says little: views differ by several dB.
         if record.psnr is not None:
-            self._psnr = record.psnr if self._psnr is None else 0.95 * self._psnr + 0.05 * record.psnr
+            self._psnr = (
+                record.psnr if self._psnr is None else 0.95 * self._psnr + 0.05 * record.psnr
+            )
         now = time.perf_counter()
         rate = (record.step - self._start) / max(now - self._since, 1e-9)
         config = None if self._config is None else self._config()
@@ -123,8 +130,10 @@ def _rich_bar(total: int, done: int, stream: IO[str]) -> tuple[Any, Any]:
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as RichProgress
 
-    steps, text = TextColumn("{task.completed:.0f}/{task.total:.0f}"), TextColumn("{task.fields[text]}")
-    columns = (steps, BarColumn(bar_width=6), text, TextColumn("{task.fields[left]}"))  # fits 80 characters
+    steps = TextColumn("{task.completed:.0f}/{task.total:.0f}")
+    text = TextColumn("{task.fields[text]}")
+    # fits 80 characters
+    columns = (steps, BarColumn(bar_width=6), text, TextColumn("{task.fields[left]}"))
     bar = RichProgress(*columns, console=Console(file=stream), refresh_per_second=4)
     return bar, bar.add_task("train", total=total, completed=done, text="", left="")
 

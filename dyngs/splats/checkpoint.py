@@ -1,4 +1,5 @@
-"""Checkpoints of nerfstudio's splatfacto (``.ckpt``) and of gsplat's examples (``.pt``): read, never written."""
+"""Checkpoints of nerfstudio's splatfacto (``.ckpt``) and of gsplat's examples (``.pt``): read,
+never written."""
 
 from __future__ import annotations
 
@@ -23,11 +24,14 @@ _GSPLAT = "sh0", "shN"
 
 
 def read_checkpoint(path: Path) -> SplatFile:
-    """Read the Gaussians of a checkpoint of torch. Raises DyngsError: it holds none, or is damaged."""
+    """Read the Gaussians of a checkpoint of torch. Raises DyngsError: it holds none, or is
+    damaged."""
     found = _tensors_of(_load(path))
     names = _NERFSTUDIO if _NERFSTUDIO[0] in found else _GSPLAT
     if not {*_SHAPES, *names} <= found.keys():
-        raise DyngsError(f"{path}: holds no Gaussians as nerfstudio's splatfacto and gsplat store them; {_HINT}")
+        raise DyngsError(
+            f"{path}: holds no Gaussians as nerfstudio's splatfacto and gsplat store them; {_HINT}"
+        )
     count = found["means"].shape[0] if found["means"].shape else 0
     require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
 
@@ -38,10 +42,13 @@ def read_checkpoint(path: Path) -> SplatFile:
         return tensor.detach().float().reshape(count, width).numpy()
 
     values = {name: torch.from_numpy(numbers(name, width)) for name, width in _SHAPES.items()}
-    base, shape = numbers(names[0], 3), found[names[1]].shape
+    base = numbers(names[0], 3)
+    shape = found[names[1]].shape
     terms = 1 + (shape[1] if len(shape) == 3 else 0)
     if terms not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
-        raise DyngsError(f"{path}: {terms} harmonics for each Gaussian are of no degree that is known; {_HINT}")
+        raise DyngsError(
+            f"{path}: {terms} harmonics for each Gaussian are of no degree that is known; {_HINT}"
+        )
     if terms == 1 and names == _NERFSTUDIO:  # then splatfacto stores logits of colours
         base = (1 / (1 + np.exp(-base)) - 0.5) / SH_C0
     rest = numbers(names[1], 3 * (terms - 1)).reshape(count, terms - 1, 3)
@@ -57,19 +64,25 @@ def read_checkpoint(path: Path) -> SplatFile:
 
 
 def _load(path: Path) -> object:
-    """Load a file of ``torch.save`` without executing code in it. Raises DyngsError: it is damaged, or needs code."""
+    """Load a file of ``torch.save`` without executing code in it. Raises DyngsError: it is damaged,
+    or needs code."""
     if not zipfile.is_zipfile(path):
-        raise DyngsError(f"{path}: is no file of torch.save (a zip, since torch 1.6), or is cut off; copy it again")
+        raise DyngsError(
+            f"{path}: is no file of torch.save (a zip, since torch 1.6), or is cut off; copy it again"
+        )
     try:
         return torch.load(path, map_location="cpu", mmap=True, weights_only=True)
     except OSError:
         raise
     except Exception as error:  # a damaged pickle may raise any
-        raise DyngsError(f"{path}: is damaged, or holds objects that only code could restore; {_HINT}") from error
+        raise DyngsError(
+            f"{path}: is damaged, or holds objects that only code could restore; {_HINT}"
+        ) from error
 
 
 def _tensors_of(contents: object) -> dict[str, Tensor]:
-    """Return the tensors beside that called ``means``, by their names without what stands before that one."""
+    """Return the tensors beside that called ``means``, by their names without what stands before
+    that one."""
     for key in ("pipeline", "splats"):
         if isinstance(contents, Mapping) and isinstance(contents.get(key), Mapping):
             contents = contents[key]
@@ -78,9 +91,17 @@ def _tensors_of(contents: object) -> dict[str, Tensor]:
     tensors = {
         str(name): value
         for name, value in contents.items()
-        if isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
+        if isinstance(value, Tensor)
+        and value.layout == torch.strided
+        and value.device.type == "cpu"
     }
-    prefixes = [name.removesuffix("means") for name in tensors if name == "means" or name.endswith(".means")]
+    prefixes = [
+        name.removesuffix("means") for name in tensors if name == "means" or name.endswith(".means")
+    ]
     if len(prefixes) != 1:
         return {}
-    return {name.removeprefix(prefixes[0]): tensor for name, tensor in tensors.items() if name.startswith(prefixes[0])}
+    return {
+        name.removeprefix(prefixes[0]): tensor
+        for name, tensor in tensors.items()
+        if name.startswith(prefixes[0])
+    }

@@ -20,11 +20,14 @@ def note_path(path: Path) -> Path:
 
 def write_note(path: Path, edited: Similarity) -> None:
     """Write the note of the file ``path``, which it knows by its digest, atomically."""
-    write_text(note_path(path), json.dumps({"edited": edited.numbers, "sha256": _digest(path)}) + "\n")
+    write_text(
+        note_path(path), json.dumps({"edited": edited.numbers, "sha256": _digest(path)}) + "\n"
+    )
 
 
 def read_note(path: Path) -> Similarity:
-    """Return what the note of the file ``path`` says; no change without one, or where it is about another file.
+    """Return what the note of the file ``path`` says; no change without one, or where it is about
+    another file.
 
     Raises DyngsError: it is damaged.
     """
@@ -35,9 +38,12 @@ def read_note(path: Path) -> Similarity:
         if note.stat().st_size > _MOST_BYTES:
             raise ValueError("too large")
         told = json.loads(note.read_bytes())
-        edited, digest = similarity_of([float(x) for x in told["edited"]]), str(told["sha256"])
+        edited = similarity_of([float(x) for x in told["edited"]])
+        digest = str(told["sha256"])
     except (ValueError, KeyError, TypeError, RecursionError):
-        raise DyngsError(f"{note}: is no note of `dyngs edit`; remove it, or write {path.name} again") from None
+        raise DyngsError(
+            f"{note}: is no note of `dyngs edit`; remove it, or write {path.name} again"
+        ) from None
     return edited if digest == _digest(path) else UNMOVED
 
 

@@ -45,7 +45,8 @@ class Format:
 
     @property
     def holds_comments(self) -> bool:
-        """Return whether its files say how they were turned and edited; beside others lies a note about edits."""
+        """Return whether its files say how they were turned and edited; beside others lies a note
+        about edits."""
         return self.home[0] in ("ply", "gltf", "usd", "sog")
 
     @property
@@ -60,25 +61,40 @@ class Format:
 
 
 FORMATS = (
-    Format("compressed-ply", (".compressed.ply",), "-y", 3, True, ("ply", "read_ply", "write_compressed")),
+    Format(
+        "compressed-ply",
+        (".compressed.ply",),
+        "-y",
+        3,
+        True,
+        ("ply", "read_ply", "write_compressed"),
+    ),
     Format("ply", (".ply",), "-y", 4, True, ("ply", "read_ply", "write_ply")),
     Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz"), (-10.0, 5.9375)),
-    Format("splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")),
+    Format(
+        "splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")
+    ),
     Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
     Format("glb", (".glb",), "y", 3, False, ("gltf", "read_gltf", "write_gltf")),
     Format("usd", (".usdc", ".usd", ".usda"), "y", 4, False, ("usd", "read_usd", "write_usd")),
 )
 """All formats; a suffix that ends another one stands after it."""
 SPZ_4 = Format("spz", (".spz",), "y", 4, True, ("spz", "read_spz", "write_spz_4"), (-10.0, 5.9375))
-GLB_OF_SPZ = Format("glb", (".glb",), "y", 3, True, ("gltf", "read_gltf", "write_compressed"), (-10.0, 5.9375))
+GLB_OF_SPZ = Format(
+    "glb", (".glb",), "y", 3, True, ("gltf", "read_gltf", "write_compressed"), (-10.0, 5.9375)
+)
 """Other ways to write files of a suffix."""
 SOG_META, SOG_INDEX = "meta.json", "lod-meta.json"
 """Files of a .sog as a folder, and of one in levels of detail."""
-CHECKPOINT = Format("checkpoint", (".ckpt", ".pt"), "z", 4, False, ("checkpoint", "read_checkpoint", ""))
+CHECKPOINT = Format(
+    "checkpoint", (".ckpt", ".pt"), "z", 4, False, ("checkpoint", "read_checkpoint", "")
+)
 """Read, never written."""
 SYSTEM_OF_UP = {"y": 4, "-y": 6, "z": 12, "-z": 14}
-"""Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot state others."""
-_MOST_LOST = 0.01  # fraction of the Gaussians that may be of a size that a format does not hold, without a note
+"""Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot
+state others."""
+# fraction of the Gaussians that may be of a size that a format does not hold, without a note
+_MOST_LOST = 0.01
 
 
 @dataclass(frozen=True)
@@ -91,10 +107,13 @@ class Written:
 
 
 def format_of(path: Path) -> Format:
-    """Return the format that the suffix of ``path`` names. Raises DyngsError: none does; names all of them."""
+    """Return the format that the suffix of ``path`` names. Raises DyngsError: none does; names all
+    of them."""
     found = known_format(path)
     if found is None:
-        given = f"the suffix {path.suffix!r} names" if path.suffix else "a name without a suffix names"
+        given = (
+            f"the suffix {path.suffix!r} names" if path.suffix else "a name without a suffix names"
+        )
         raise DyngsError(f"{path}: {given} no format of Gaussians; use one of {all_suffixes()}")
     return found
 
@@ -109,7 +128,8 @@ def known_format(path: Path) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if it is none.
+    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if
+    it is none.
 
     A run is none, whatever lies in its folder. Raises DyngsError as of ``sog_meta``.
     """
@@ -140,7 +160,9 @@ def format_named(name: str) -> Format:
     for candidate in FORMATS:
         if candidate.name == name:
             return candidate
-    raise DyngsError(f"no format {name!r:.30} of Gaussians; use one of {', '.join(f.name for f in FORMATS)}")
+    raise DyngsError(
+        f"no format {name!r:.30} of Gaussians; use one of {', '.join(f.name for f in FORMATS)}"
+    )
 
 
 def all_suffixes() -> str:
@@ -151,10 +173,10 @@ def all_suffixes() -> str:
 def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFile:
     """Read a file of Gaussians; its suffix names the format.
 
-    ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the file. Opacities of
-    exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError: an unknown suffix, or not such a file,
-    cut off, empty or non-finite; nothing large is allocated before the header has been compared with the size of the
-    file.
+    ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the
+    file. Opacities of exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError:
+    an unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated
+    before the header has been compared with the size of the file.
     """
     path = Path(path)
     own = format_to_read(path) or format_of(path)
@@ -188,11 +210,13 @@ def chosen_variant(usual: Format, spz_version: int | None, compress: str | None)
 def write_splats(
     path: Path | str, splat: SplatFile, *, sh_degree: int | None = None, own: Format | None = None
 ) -> Written:
-    """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names the format.
+    """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names
+    the format.
 
-    ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None: up to what the
-    format holds. ``own``: ``SPZ_4`` or ``GLB_OF_SPZ`` instead of the usual format of the suffix. Raises DyngsError: an
-    unknown suffix, no Gaussians, non-finite values, or a degree that the format does not hold.
+    ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None:
+    up to what the format holds. ``own``: ``SPZ_4`` or ``GLB_OF_SPZ`` instead of the usual format of
+    the suffix. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree
+    that the format does not hold.
     """
     path = Path(path)
     own = own or format_of(path)
@@ -207,40 +231,55 @@ def write_splats(
         whole = upright(whole, own.up, path)  # as its reader turns what states its axes
     if not own.holds_comments and whole.edited != UNMOVED:
         write_note(path, whole.edited)
-        notes += (f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does",)
+        notes += (
+            f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does",
+        )
     return Written(path, whole, notes)
 
 
-def fitted(path: Path, own: Format, splat: SplatFile, sh_degree: int | None) -> tuple[SplatFile, tuple[str, ...]]:
-    """Return what a format can hold of a scene, on the CPU, and a line about each thing that it cannot.
+def fitted(
+    path: Path, own: Format, splat: SplatFile, sh_degree: int | None
+) -> tuple[SplatFile, tuple[str, ...]]:
+    """Return what a format can hold of a scene, on the CPU, and a line about each thing that it
+    cannot.
 
     ``path``: for messages. ``sh_degree`` and errors: as of ``write_splats``.
     """
-    gaussians, notes = splat.gaussians.detach().to(device="cpu", dtype=torch.float32), []
+    gaussians = splat.gaussians.detach().to(device="cpu", dtype=torch.float32)
+    notes = []
     require_writable(path, gaussians)
     if sh_degree is not None and sh_degree > own.max_degree:
-        raise DyngsError(f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}")
+        raise DyngsError(
+            f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}"
+        )
     degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree
     if degree < gaussians.sh_degree and bool(gaussians.sh[:, (degree + 1) ** 2 :].any()):
         why = f"{own.name} holds no more" if sh_degree is None else "as asked for"
         notes.append(f"harmonics above degree {degree} are left out: {why}")
     if splat.mode is RasterizeMode.ANTIALIASED and not own.states_mode:
-        notes.append(f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker")
+        notes.append(
+            f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker"
+        )
     smallest, largest = own.log_scales
     longest = gaussians.log_scales.amax(1)
     lost = int(((longest < smallest) | (longest > largest)).sum())
     if lost > _MOST_LOST * len(gaussians):
         held = f"{own.name} holds sizes from {math.exp(smallest):.2g} to {math.exp(largest):.2g}"
-        notes.append(f"{held}, those of {lost:,} Gaussians are changed: `dyngs edit --scale` gives another unit")
-    notes += offset_notes(splat, "the file states it" if own.holds_comments else f"{own.name} cannot state it")
+        notes.append(
+            f"{held}, those of {lost:,} Gaussians are changed: `dyngs edit --scale` gives another unit"
+        )
+    notes += offset_notes(
+        splat, "the file states it" if own.holds_comments else f"{own.name} cannot state it"
+    )
     return replace(splat, gaussians=_unit(with_degree(gaussians, degree))), tuple(notes)
 
 
 def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
-    """Return the contents turned so that what points up in them points along the axis ``up`` of a file.
+    """Return the contents turned so that what points up in them points along the axis ``up`` of a
+    file.
 
-    ``splat``: unchanged where it does not say what points up. ``up``: axis such as "-y"; None: what viewers of the
-    format of ``path`` take for up; "keep": nothing is turned.
+    ``splat``: unchanged where it does not say what points up. ``up``: axis such as "-y"; None: what
+    viewers of the format of ``path`` take for up; "keep": nothing is turned.
     """
     if up == "keep" or splat.up is None:
         return splat
@@ -248,8 +287,11 @@ def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
     return turned_file(splat, turn_between(axis_of(splat.up), axis_of(wanted)), wanted)
 
 
-def turned_file(splat: SplatFile, turn: tuple[float, float, float, float], up: str | None) -> SplatFile:
-    """Return the contents turned by a quaternion wxyz about the origin, ``up`` being what then points up."""
+def turned_file(
+    splat: SplatFile, turn: tuple[float, float, float, float], up: str | None
+) -> SplatFile:
+    """Return the contents turned by a quaternion wxyz about the origin, ``up`` being what then
+    points up."""
     if splat.edited == UNMOVED:
         gaussians = Similarity(turn).gaussians(splat.gaussians)
         return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
@@ -257,21 +299,32 @@ def turned_file(splat: SplatFile, turn: tuple[float, float, float, float], up: s
 
 
 def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
-    """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what then points up."""
-    edited = replace(splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited))
+    """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what
+    then points up."""
+    edited = replace(
+        splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited)
+    )
     return edited if how == UNMOVED else _without_offset(edited)
 
 
 def undone_file(splat: SplatFile) -> SplatFile:
-    """Return the contents as they lay before all of ``moved_file``; up is known where it was an axis."""
+    """Return the contents as they lay before all of ``moved_file``; up is known where it was an
+    axis."""
     back = splat.edited.inverse()
     before = None if splat.up is None else back.rotation @ axis_of(splat.up)
-    up = next((name for name, axis in AXES.items() if before is not None and before @ axis > 1 - 1e-6), None)
-    return _without_offset(replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED))
+    up = next(
+        (name for name, axis in AXES.items() if before is not None and before @ axis > 1 - 1e-6),
+        None,
+    )
+    return _without_offset(
+        replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
+    )
 
 
 def _without_offset(splat: SplatFile) -> SplatFile:
-    return replace(splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET)))
+    return replace(
+        splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET))
+    )
 
 
 def _unit(gaussians: Gaussians) -> Gaussians:

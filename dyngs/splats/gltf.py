@@ -1,10 +1,12 @@
-"""glTF's ``KHR_gaussian_splatting`` (release candidate of July 2026) in a ``.glb``: float32, nothing is lost.
+"""glTF's ``KHR_gaussian_splatting`` (release candidate of July 2026) in a ``.glb``: float32,
+nothing is lost.
 
-A primitive of points with the attributes ``KHR_gaussian_splatting:ROTATION`` (xyzw), ``SCALE`` (linear), ``OPACITY``
-and ``SH_DEGREE_l_COEF_n`` up to degree 3, and ``COLOR_0`` (linear RGB) for viewers that know only points. y is up.
+A primitive of points with the attributes ``KHR_gaussian_splatting:ROTATION`` (xyzw), ``SCALE``
+(linear), ``OPACITY`` and ``SH_DEGREE_l_COEF_n`` up to degree 3, and ``COLOR_0`` (linear RGB) for
+viewers that know only points. y is up.
 
-With ``KHR_gaussian_splatting_compression_spz_2`` (a draft of 2025), all of them are in a .spz within the file, whose
-axes are those of the document, as CesiumJS takes them.
+With ``KHR_gaussian_splatting_compression_spz_2`` (a draft of 2025), all of them are in a .spz
+within the file, whose axes are those of the document, as CesiumJS takes them.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ from dyngs.splats.splat_file import (
 from dyngs.splats.spz import packed_spz, unpacked_spz
 
 EXTENSION = "KHR_gaussian_splatting"
-_COMPRESSIONS = f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz"  # the draft has both names
+# the draft has both names
+_COMPRESSIONS = f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz"
 _PROPERTIES = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -41,14 +44,15 @@ _PROPERTIES = {
     "sortingMethod": "cameraDistance",
 }
 _POINTS = 0
-_MOST_NODES, _MOST_DEPTH = 4096, 32  # limits on the nodes that are visited, and on those above one another
+# limits on the nodes that are visited, and on those above one another
+_MOST_NODES, _MOST_DEPTH = 4096, 32
 
 
 def read_gltf(path: Path) -> SplatFile:
     """Read all Gaussians of a .glb, placed as its nodes say.
 
-    Raises DyngsError: no primitive of Gaussians, a kernel or colour space other than those of 3DGS, or damaged
-    contents.
+    Raises DyngsError: no primitive of Gaussians, a kernel or colour space other than those of 3DGS,
+    or damaged contents.
     """
     file = GltfFile(path)
     found: list[Gaussians] = []
@@ -57,13 +61,19 @@ def read_gltf(path: Path) -> SplatFile:
         compressed = _compressed(file, primitive)
         if compressed is not None:
             mode = compressed.mode
-        own = placed(_gaussians(file, primitive) if compressed is None else compressed.gaussians, world)
+        own = placed(
+            _gaussians(file, primitive) if compressed is None else compressed.gaussians, world
+        )
         if own is None:
-            raise file.error("a node distorts or mirrors its Gaussians; apply its transform before exporting")
+            raise file.error(
+                "a node distorts or mirrors its Gaussians; apply its transform before exporting"
+            )
         found.append(own)
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
-    return described(SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras)), path)
+    return described(
+        SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras)), path
+    )
 
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
@@ -74,27 +84,38 @@ def write_gltf(path: Path, splat: SplatFile) -> None:
 
 
 def write_compressed(path: Path, splat: SplatFile) -> None:
-    """Write a .glb whose Gaussians are compressed as a .spz; readers that do not know that show nothing.
+    """Write a .glb whose Gaussians are compressed as a .spz; readers that do not know that show
+    nothing.
 
     Raises DyngsError as ``packed_spz`` does.
     """
     document = GlbDocument()
     view = document.add_bytes(packed_spz(splat))
     gaussians = splat.gaussians
-    arrays = {"POSITION": gaussians.means, "COLOR_0": gaussians.quats}  # of which only the shapes count
+    # of which only the shapes count
+    arrays = {"POSITION": gaussians.means, "COLOR_0": gaussians.quats}
     arrays |= {f"{EXTENSION}:SCALE": gaussians.means, f"{EXTENSION}:ROTATION": gaussians.quats}
     for degree in range(1, gaussians.sh_degree + 1):
-        arrays |= {f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}": gaussians.means for k in range(2 * degree + 1)}
+        arrays |= {
+            f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}": gaussians.means
+            for k in range(2 * degree + 1)
+        }
     attributes = {
-        name: document.add_placeholder(array.numpy(), limits=name == "POSITION") for name, array in arrays.items()
+        name: document.add_placeholder(array.numpy(), limits=name == "POSITION")
+        for name, array in arrays.items()
     }
     own = _PROPERTIES | {"extensions": {_COMPRESSIONS[0]: {"bufferView": view}}}
-    document.json["extensionsUsed"] = document.json["extensionsRequired"] = [EXTENSION, _COMPRESSIONS[0]]
+    document.json["extensionsUsed"] = document.json["extensionsRequired"] = [
+        EXTENSION,
+        _COMPRESSIONS[0],
+    ]
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
     _write_primitive(path, splat, document, primitive)
 
 
-def _write_primitive(path: Path, splat: SplatFile, document: GlbDocument, primitive: dict[str, Any]) -> None:
+def _write_primitive(
+    path: Path, splat: SplatFile, document: GlbDocument, primitive: dict[str, Any]
+) -> None:
     """Write a document with one mesh in one node."""
     document.json["asset"]["extras"] = header_comments(splat)
     document.json |= {
@@ -107,7 +128,8 @@ def _write_primitive(path: Path, splat: SplatFile, document: GlbDocument, primit
 
 
 def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]:
-    """Add the numbers of Gaussians to a document, harmonics up to degree 3; return their primitive."""
+    """Add the numbers of Gaussians to a document, harmonics up to degree 3; return their
+    primitive."""
     sh = gaussians.sh.numpy()
     linear = srgb_decoded((sh[:, 0] * SH_C0 + 0.5).clip(0, 1))
     arrays = {
@@ -122,7 +144,9 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
         for k in range(first, num_sh_terms(degree)):
             arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - first}"] = sh[:, k]
     attributes = {
-        name: document.add_numbers(values.astype(np.float32, copy=False), VERTICES, limits=name == "POSITION")
+        name: document.add_numbers(
+            values.astype(np.float32, copy=False), VERTICES, limits=name == "POSITION"
+        )
         for name, values in arrays.items()
     }
     return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _PROPERTIES}}
@@ -130,7 +154,8 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
 
 def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
     """Yield the primitives of Gaussians, and the matrices (4, 4) by which nodes place them."""
-    document, visited = file.document, 0
+    document = file.document
+    visited = 0
     if document.scenes and document.scene >= len(document.scenes):
         raise file.error(f"scene {document.scene} is missing; export it again")
     roots = document.scenes[document.scene].nodes if document.scenes else range(len(document.nodes))
@@ -139,7 +164,9 @@ def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
         index, above, depth = waiting.pop()
         visited += 1
         if depth > _MOST_DEPTH or visited > _MOST_NODES:
-            raise file.error(f"has more than {_MOST_NODES} nodes or {_MOST_DEPTH} of them above one another")
+            raise file.error(
+                f"has more than {_MOST_NODES} nodes or {_MOST_DEPTH} of them above one another"
+            )
         if index >= len(document.nodes):
             raise file.error(f"node {index} is missing; export it again")
         node = document.nodes[index]
@@ -168,7 +195,8 @@ def _matrix(node: Node) -> np.ndarray:
 def _compressed(file: GltfFile, primitive: Primitive) -> SplatFile | None:
     """Return the Gaussians of the .spz that a primitive names; None: they are not compressed.
 
-    Raises DyngsError: compressed in another way, or a kernel or colour space other than those of 3DGS.
+    Raises DyngsError: compressed in another way, or a kernel or colour space other than those of
+    3DGS.
     """
     own = primitive.extensions[EXTENSION]
     if not isinstance(own, dict):
@@ -184,7 +212,9 @@ def _compressed(file: GltfFile, primitive: Primitive) -> SplatFile | None:
             raise file.error(f"{key} {own.get(key)!r:.40} is not supported, only {known}")
     for name, value in more.items():
         if name not in _COMPRESSIONS:
-            raise file.error(f"its Gaussians need the extension {name!r:.80}, which is not supported")
+            raise file.error(
+                f"its Gaussians need the extension {name!r:.80}, which is not supported"
+            )
         view = value.get("bufferView") if isinstance(value, dict) else None
         return unpacked_spz(file.path, file.view_bytes(view, name))
     return None
@@ -207,8 +237,11 @@ def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
         if degree and keys[0] not in names:
             break
         terms += [numbers(key, "VEC3") for key in keys]
-    scales, opacities = numbers(f"{EXTENSION}:SCALE", "VEC3"), numbers(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0]
+    scales = numbers(f"{EXTENSION}:SCALE", "VEC3")
+    opacities = numbers(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0]
     rotations = numbers(f"{EXTENSION}:ROTATION", "VEC4")
     if any(len(x) != len(means) for x in (*terms, scales, opacities, rotations)):
         raise file.error("the attributes of its Gaussians have different lengths; export it again")
-    return from_linear(means, rotations[:, [3, 0, 1, 2]], scales, opacities, np.stack(terms, axis=1))
+    return from_linear(
+        means, rotations[:, [3, 0, 1, 2]], scales, opacities, np.stack(terms, axis=1)
+    )

@@ -32,7 +32,8 @@ _MOST_ELEMENTS = 256
 
 @dataclass(frozen=True)
 class _Element:
-    """One element: ``properties`` are (name, numpy type) pairs; a list property makes its size unknown."""
+    """One element: ``properties`` are (name, numpy type) pairs; a list property makes its size
+    unknown."""
 
     name: str
     count: int
@@ -68,14 +69,19 @@ class PlyHeader:
         Raises DyngsError: the file is truncated, or list properties hide where the element is.
         """
         index = self.names.index(name)
-        wanted, earlier = self.elements[index], self.elements[:index]
+        wanted = self.elements[index]
+        earlier = self.elements[:index]
         if any(element.has_list for element in self.elements[: index + 1]):
-            raise DyngsError(f"{path}: has list properties in or before its {name:.60}, so it is not a 3DGS .ply")
+            raise DyngsError(
+                f"{path}: has list properties in or before its {name:.60}, so it is not a 3DGS .ply"
+            )
         file.seek(0, os.SEEK_END)
         available = file.tell() - self.data_start
         file.seek(self.data_start)
         if self.byte_order is None:
-            return _read_ascii(file, path, wanted, sum(element.count for element in earlier), available)
+            return _read_ascii(
+                file, path, wanted, sum(element.count for element in earlier), available
+            )
         skipped = sum(e.count * e.dtype(self.byte_order).itemsize for e in earlier)
         dtype = wanted.dtype(self.byte_order)
         expected = skipped + wanted.count * dtype.itemsize
@@ -88,7 +94,9 @@ class PlyHeader:
         return np.fromfile(file, dtype=dtype, count=wanted.count)
 
 
-def _read_ascii(file: BinaryIO, path: Path, wanted: _Element, skipped: int, available: int) -> np.ndarray:
+def _read_ascii(
+    file: BinaryIO, path: Path, wanted: _Element, skipped: int, available: int
+) -> np.ndarray:
     """Return the rows of an element after ``skipped`` lines, float64."""
     width = len(wanted.properties)
     # The shortest possible row is one character and one separator per value.
@@ -106,7 +114,9 @@ def _read_ascii(file: BinaryIO, path: Path, wanted: _Element, skipped: int, avai
     return rows.view([(name, "f8") for name, _ in wanted.properties])[:, 0]
 
 
-def header_bytes(elements: Sequence[tuple[str, int, Sequence[tuple[str, str]]]], comments: Iterable[str] = ()) -> bytes:
+def header_bytes(
+    elements: Sequence[tuple[str, int, Sequence[tuple[str, str]]]], comments: Iterable[str] = ()
+) -> bytes:
     """Return the header of a binary little-endian .ply.
 
     ``elements``: name, count, and properties as (type, name), such as ("float", "x").
@@ -123,7 +133,8 @@ def header_bytes(elements: Sequence[tuple[str, int, Sequence[tuple[str, str]]]],
 
 
 def read_header(file: BinaryIO, path: Path) -> PlyHeader:
-    """Read the header of a .ply opened at its start. Raises DyngsError with ``path`` and the wrong line."""
+    """Read the header of a .ply opened at its start. Raises DyngsError with ``path`` and the wrong
+    line."""
     if file.readline(16).rstrip(b"\r\n") != b"ply":
         raise DyngsError(f"{path}: is not a .ply file (it does not start with 'ply')")
     byte_order: str | None = None
@@ -139,8 +150,11 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
             break
         if keyword in ("comment", "obj_info"):
             comments.append(line[len(keyword) :].strip())
-        elif keyword == "format" and len(words) == 3 and words[1] in _BYTE_ORDERS and not seen_format:
-            byte_order, seen_format = _BYTE_ORDERS[words[1]], True
+        elif (
+            keyword == "format" and len(words) == 3 and words[1] in _BYTE_ORDERS and not seen_format
+        ):
+            byte_order = _BYTE_ORDERS[words[1]]
+            seen_format = True
         elif keyword == "element" and len(words) == 3 and re.fullmatch("[0-9]{1,18}", words[2]):
             require_at_most(path, len(elements) + 1, _MOST_ELEMENTS, "elements of a .ply")
             elements.append(_Element(words[1], int(words[2])))
@@ -153,7 +167,12 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
                 raise DyngsError(f"{path}: bad .ply header line {_shown(line)}")
             if words[2] in properties[-1]:
                 raise DyngsError(f"{path}: the .ply header has the property {words[2]:.60} twice")
-            require_at_most(path, len(properties[-1]) + 1, _MOST_PROPERTIES, "properties of an element of a .ply")
+            require_at_most(
+                path,
+                len(properties[-1]) + 1,
+                _MOST_PROPERTIES,
+                "properties of an element of a .ply",
+            )
             properties[-1][words[2]] = _SCALARS[words[1]]
         elif keyword:
             raise DyngsError(f"{path}: bad .ply header line {_shown(line)}")
@@ -162,16 +181,23 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise DyngsError(f"{path}: has no vertices, so it is not a 3DGS .ply")
-    whole = tuple(replace(e, properties=tuple(own.items())) for e, own in zip(elements, properties, strict=True))
+    whole = tuple(
+        replace(e, properties=tuple(own.items()))
+        for e, own in zip(elements, properties, strict=True)
+    )
     return PlyHeader(byte_order, whole, tuple(comments), file.tell())
 
 
 def _next_line(file: BinaryIO, path: Path) -> str:
     if file.tell() > _MAX_HEADER_BYTES:
-        raise DyngsError(f"{path}: the .ply header is longer than {_MAX_HEADER_BYTES} bytes, the file is damaged")
+        raise DyngsError(
+            f"{path}: the .ply header is longer than {_MAX_HEADER_BYTES} bytes, the file is damaged"
+        )
     raw = file.readline(_MAX_HEADER_BYTES)
     if not raw.endswith(b"\n"):
-        raise DyngsError(f"{path}: the .ply header has no end_header, the file is truncated or damaged")
+        raise DyngsError(
+            f"{path}: the .ply header has no end_header, the file is truncated or damaged"
+        )
     return raw.decode("utf-8", errors="replace").strip()
 
 
@@ -197,7 +223,10 @@ def double_ply(xyz: np.ndarray, rgb: np.ndarray, faces: np.ndarray | None = None
     rows = np.empty(len(xyz), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
     rows["xyz"] = xyz
     rows["rgb"] = rgb
-    properties = [*(("double", name) for name in "xyz"), *(("uchar", name) for name in ("red", "green", "blue"))]
+    properties = [
+        *(("double", name) for name in "xyz"),
+        *(("uchar", name) for name in ("red", "green", "blue")),
+    ]
     elements = [("vertex", len(rows), properties)]
     if faces is None:
         return header_bytes(elements) + rows.tobytes()

@@ -27,16 +27,22 @@ _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
 
 def turned(
-    gaussians: Gaussians, rotation: tuple[float, ...], scale: float = 1.0, shift: Tensor | None = None
+    gaussians: Gaussians,
+    rotation: tuple[float, ...],
+    scale: float = 1.0,
+    shift: Tensor | None = None,
 ) -> Gaussians:
     """Return the Gaussians rotated about the origin, then scaled, then shifted.
 
-    ``gaussians``: N Gaussians, harmonics of degree 0 to 4. ``rotation``: (4,) unit quaternion wxyz. ``scale``: positive
-    factor of positions and sizes. ``shift``: (3,) added to the centres; None: nothing.
+    ``gaussians``: N Gaussians, harmonics of degree 0 to 4. ``rotation``: (4,) unit quaternion wxyz.
+    ``scale``: positive factor of positions and sizes. ``shift``: (3,) added to the centres; None:
+    nothing.
     """
     if rotation == _NO_TURN and scale == 1 and shift is None:
         return gaussians
-    means, quats, sh = gaussians.means.double(), gaussians.quats, gaussians.sh
+    means = gaussians.means.double()
+    quats = gaussians.quats
+    sh = gaussians.sh
     if rotation != _NO_TURN:
         wide = torch.tensor(rotation, dtype=torch.float64, device="cpu")
         matrix = rotation_matrices(wide)
@@ -59,8 +65,8 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
     """Return the mirror image of Gaussians, x becoming -x."""
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=gaussians.means.dtype, device="cpu")
     turn = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=gaussians.quats.dtype, device="cpu")
-    # Of degree l and order m, a harmonic with a cosine of m times the azimuth changes its sign for odd m, one with a
-    # sine for even m.
+    # Of degree l and order m, a harmonic with a cosine of m times the azimuth changes its sign for
+    # odd m, one with a sine for even m.
     signs = [
         (-1.0) ** order if order >= 0 else -((-1.0) ** order)
         for degree in range(gaussians.sh_degree + 1)
@@ -71,7 +77,8 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
 
 
 def placed(gaussians: Gaussians, world: np.ndarray) -> Gaussians | None:
-    """Return the Gaussians where an affine matrix (4, 4) puts them, None where that distorts or mirrors them.
+    """Return the Gaussians where an affine matrix (4, 4) puts them, None where that distorts or
+    mirrors them.
 
     Their means are float64: the matrix may put them far away.
     """
@@ -99,8 +106,9 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
 def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
 
-    A rotation mixes the harmonics of one degree only among themselves; how, is solved for from their values in many
-    directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation, float64.
+    A rotation mixes the harmonics of one degree only among themselves; how, is solved for from
+    their values in many directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation,
+    float64.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
     if degree == 0:
@@ -108,7 +116,8 @@ def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     generator = torch.Generator(device="cpu").manual_seed(0)
     directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, device="cpu", generator=generator)
     directions = torch.nn.functional.normalize(directions, dim=1)
-    here, before = harmonics_basis(directions, degree), harmonics_basis(directions @ matrix, degree)
+    here = harmonics_basis(directions, degree)
+    before = harmonics_basis(directions @ matrix, degree)
     parts = [sh[:, :1]]
     for d in range(1, degree + 1):
         rows = slice(num_sh_terms(d - 1), num_sh_terms(d))
@@ -118,16 +127,21 @@ def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     return torch.cat(parts, dim=1).contiguous()
 
 
-def turn_between(start: tuple[float, ...], end: tuple[float, ...]) -> tuple[float, float, float, float]:
-    """Return the smallest rotation, a quaternion wxyz, from one direction to another; about x where they are opposite.
+def turn_between(
+    start: tuple[float, ...], end: tuple[float, ...]
+) -> tuple[float, float, float, float]:
+    """Return the smallest rotation, a quaternion wxyz, from one direction to another; about x where
+    they are opposite.
 
     Opposite directions along x are turned about z.
     """
     a, b = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (start, end))
-    real, axis = 1 + float(a @ b), np.cross(a, b)
+    real = 1 + float(a @ b)
+    axis = np.cross(a, b)
     if real < 1e-9:
         about = np.array([1.0, 0, 0]) if abs(a[0]) < 0.9 else np.array([0, 0, 1.0])
-        real, axis = 0.0, about - a * float(about @ a)
+        real = 0.0
+        axis = about - a * float(about @ a)
     quat = np.array([real, *axis])
     w, x, y, z = (quat / np.linalg.norm(quat)).tolist()
     return w, x, y, z
@@ -143,7 +157,9 @@ def product(
     left: tuple[float, float, float, float], right: tuple[float, float, float, float]
 ) -> tuple[float, float, float, float]:
     """Return the rotation ``right`` followed by ``left``, as a unit quaternion."""
-    both = quat_product(*(torch.tensor(q, dtype=torch.float64, device="cpu") for q in (left, right)))
+    both = quat_product(
+        *(torch.tensor(q, dtype=torch.float64, device="cpu") for q in (left, right))
+    )
     w, x, y, z = (both / both.norm()).tolist()
     return w, x, y, z
 

@@ -1,4 +1,5 @@
-"""Similarities: one rotation, one scale and one shift for all that a scene consists of; exact, with an inverse."""
+"""Similarities: one rotation, one scale and one shift for all that a scene consists of; exact, with
+an inverse."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ class Similarity:
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3) go, float64."""
-        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + np.array(self.shift)
+        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + np.array(
+            self.shift
+        )
 
     def after(self, first: Similarity) -> Similarity:
         """Return ``first`` followed by this one."""
@@ -64,11 +67,14 @@ class Similarity:
 
         A 3D filter must be fused already, as in ``GaussianScene.at``.
         """
-        shift = torch.tensor(self.shift, dtype=torch.float64, device="cpu") if any(self.shift) else None
+        shift = (
+            torch.tensor(self.shift, dtype=torch.float64, device="cpu") if any(self.shift) else None
+        )
         return turned(gaussians, self.turn, self.scale, shift)
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Return the cameras that see the moved scene as ``cameras`` see the scene: depths are scaled, too."""
+        """Return the cameras that see the moved scene as ``cameras`` see the scene: depths are
+        scaled, too."""
         if self == UNMOVED:
             return cameras
         poses = cameras.cam_from_world.double()
@@ -83,23 +89,30 @@ UNMOVED = Similarity()
 
 
 def similarity_of(numbers: Sequence[float]) -> Similarity:
-    """Return what ``numbers`` (8,) of a file say, as of ``Similarity.numbers``. Raises ValueError: no such numbers."""
+    """Return what ``numbers`` (8,) of a file say, as of ``Similarity.numbers``. Raises ValueError:
+    no such numbers."""
     a, b, c, d, scale, x, y, z = (float(value) for value in numbers)
-    if not (np.isfinite(numbers).all() and scale > 0 and abs(a * a + b * b + c * c + d * d - 1) < 1e-3):
+    if not (
+        np.isfinite(numbers).all() and scale > 0 and abs(a * a + b * b + c * c + d * d - 1) < 1e-3
+    ):
         raise ValueError(f"{numbers} are no similarity")
     return Similarity((a, b, c, d), scale, (x, y, z))
 
 
 def fitted(points: np.ndarray, wanted: np.ndarray) -> Similarity:
-    """Return the similarity that brings points nearest to where they are wanted, least squares (Umeyama 1991).
+    """Return the similarity that brings points nearest to where they are wanted, least squares
+    (Umeyama 1991).
 
-    ``points``, ``wanted``: (P, 3) float64. Raises DyngsError: fewer than three, or on a line: they leave the rotation
-    about it open.
+    ``points``, ``wanted``: (P, 3) float64. Raises DyngsError: fewer than three, or on a line: they
+    leave the rotation about it open.
     """
     if len(points) < 3:
-        raise DyngsError(f"{len(points)} control points do not determine a similarity; give three or more")
+        raise DyngsError(
+            f"{len(points)} control points do not determine a similarity; give three or more"
+        )
     middles = points.mean(axis=0), wanted.mean(axis=0)
-    here, there = points - middles[0], wanted - middles[1]
+    here = points - middles[0]
+    there = wanted - middles[1]
     for rows, where in ((here, "the scene"), (there, "the world")):
         spread = np.linalg.svd(rows, compute_uv=False)
         if not spread[1] > _STRAIGHT * spread[0]:
@@ -113,9 +126,11 @@ def fitted(points: np.ndarray, wanted: np.ndarray) -> Similarity:
 
 
 def far_offset(points: np.ndarray, detail: float) -> np.ndarray:
-    """Return (3,) to be subtracted from points (N, 3) that are too far from the origin for float32; 0 if none are.
+    """Return (3,) to be subtracted from points (N, 3) that are too far from the origin for float32;
+    0 if none are.
 
-    ``detail``: the smallest length that counts, such as the size of a usual Gaussian. All in float64.
+    ``detail``: the smallest length that counts, such as the size of a usual Gaussian. All in
+    float64.
     """
     points = points[(np.abs(points) < _FARTHEST).all(axis=1)]
     if not len(points):

@@ -1,8 +1,10 @@
-"""PlayCanvas' streamed ``.sog``: a folder of a still scene in levels of detail, of which viewers fetch what they see.
+"""PlayCanvas' streamed ``.sog``: a folder of a still scene in levels of detail, of which viewers
+fetch what they see.
 
-``lod-meta.json`` (version 1) holds a tree of boxes; its leaves name, for each level, a file and a range of Gaussians
-in it. Files are ``.sog`` as folders: ``LEVEL_NUMBER/meta.json`` and images. The order of ``dyngs.gaussians.levels``
-makes what a leaf shows consecutive at each level. Format: PlayCanvas, "The Streamed SOG Format", 2026.
+``lod-meta.json`` (version 1) holds a tree of boxes; its leaves name, for each level, a file and a
+range of Gaussians in it. Files are ``.sog`` as folders: ``LEVEL_NUMBER/meta.json`` and images. The
+order of ``dyngs.gaussians.levels`` makes what a leaf shows consecutive at each level. Format:
+PlayCanvas, "The Streamed SOG Format", 2026.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ _REACH = 3.0  # standard deviations of a Gaussian that its box holds
 
 
 def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
-    """Write a new folder of what ``fitted`` made fit a .sog, and return the Gaussians by level, the finest first.
+    """Write a new folder of what ``fitted`` made fit a .sog, and return the Gaussians by level, the
+    finest first.
 
     Raises DyngsError: the folder holds something, or cannot be written.
     """
@@ -45,7 +48,9 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
         for number, level in enumerate(levels):
             first.append(len(names))
             for i, start in enumerate(range(0, len(level), PER_FILE)):
-                part = level.select(torch.arange(start, min(start + PER_FILE, len(level)), device="cpu"))
+                part = level.select(
+                    torch.arange(start, min(start + PER_FILE, len(level)), device="cpu")
+                )
                 names.append(f"{number}_{i}/meta.json")
                 (started / f"{number}_{i}").mkdir()
                 for name, data in sog_parts(replace(splat, gaussians=part)):
@@ -68,8 +73,13 @@ def _leaves(tree: Levels, counts: tuple[int, ...], first: list[int]) -> Iterator
     for start in range(0, counts[0], PER_LEAF):
         lods = {}
         for level, count in enumerate(counts):
-            own, size = start // MERGED**level, PER_LEAF // MERGED**level
-            where = {"file": first[level] + own // PER_FILE, "offset": own % PER_FILE, "count": min(size, count - own)}
+            own = start // MERGED**level
+            size = PER_LEAF // MERGED**level
+            where = {
+                "file": first[level] + own // PER_FILE,
+                "offset": own % PER_FILE,
+                "count": min(size, count - own),
+            }
             lods[str(level)] = where
         rows = torch.arange(start, min(start + PER_LEAF, counts[0]), device="cpu")
         yield {"bound": _box(tree.levels[0].select(rows)), "lods": lods}
@@ -79,7 +89,8 @@ def _box(gaussians: Gaussians) -> dict[str, list[float]]:
     """Return the box around Gaussians, to three standard deviations."""
     axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None]
     reach = _REACH * axes.square().sum(2).sqrt()
-    low, high = (gaussians.means - reach).amin(0), (gaussians.means + reach).amax(0)
+    low = (gaussians.means - reach).amin(0)
+    high = (gaussians.means + reach).amax(0)
     return {"min": low.tolist(), "max": high.tolist()}
 
 
@@ -87,10 +98,14 @@ def _joined(nodes: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the root above nodes that follow each other, four below each."""
     while len(nodes) > 1:
         groups = [nodes[i : i + MERGED] for i in range(0, len(nodes), MERGED)]
-        nodes = [{"bound": _around([node["bound"] for node in group]), "children": group} for group in groups]
+        nodes = [
+            {"bound": _around([node["bound"] for node in group]), "children": group}
+            for group in groups
+        ]
     return nodes[0]
 
 
 def _around(boxes: list[dict[str, list[float]]]) -> dict[str, list[float]]:
-    low, high = np.min([box["min"] for box in boxes], axis=0), np.max([box["max"] for box in boxes], axis=0)
+    low = np.min([box["min"] for box in boxes], axis=0)
+    high = np.max([box["max"] for box in boxes], axis=0)
     return {"min": low.tolist(), "max": high.tolist()}

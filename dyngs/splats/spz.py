@@ -1,9 +1,9 @@
 """Niantic's ``.spz``: 20 bytes per Gaussian and one per number of the harmonics, compressed.
 
-Versions 1 to 3 are one gzip stream of a 16-byte header and the attributes one after the other; version 4 is a 32-byte
-header, a table of sizes, and a Zstandard stream per attribute, which needs ``pip install 'dyngs[zstd]'``. Version 3 is
-written by default, which most readers of today know. y is up: axes are right, up, back, unless an extension of the
-header states other ones.
+Versions 1 to 3 are one gzip stream of a 16-byte header and the attributes one after the other;
+version 4 is a 32-byte header, a table of sizes, and a Zstandard stream per attribute, which needs
+``pip install 'dyngs[zstd]'``. Version 3 is written by default, which most readers of today know. y
+is up: axes are right, up, back, unless an extension of the header states other ones.
 """
 
 from __future__ import annotations
@@ -71,8 +71,11 @@ def unpacked_spz(path: Path, data: bytes) -> SplatFile:
     more = _MOST_EXTENSION_BYTES if flags & _HAS_EXTENSIONS else 0
     content = _inflated(path, data, total + more)
     if len(content) < total:
-        raise DyngsError(f"{path}: is truncated: {count:,} Gaussians need {total:,} bytes, found {len(content):,}")
-    parts, start = {}, _HEADER.size
+        raise DyngsError(
+            f"{path}: is truncated: {count:,} Gaussians need {total:,} bytes, found {len(content):,}"
+        )
+    parts = {}
+    start = _HEADER.size
     for name, size in sizes.items():
         parts[name] = np.frombuffer(content, np.uint8, size, start)
         start += size
@@ -99,8 +102,12 @@ def write_spz_4(path: Path, splat: SplatFile) -> None:
     _, _, count, degree, fraction_bits, flags, _ = _HEADER.unpack(head)
     flags |= _HAS_EXTENSIONS if extensions else 0
     start = _WHOLE_HEADER + len(extensions)
-    head = _HEADER.pack(_MAGIC, 4, count, degree, fraction_bits, flags, len(streams)) + struct.pack("<I12x", start)
-    sizes = [(len(stream), len(part)) for stream, part in zip(streams, filter(None, parts), strict=True)]
+    head = _HEADER.pack(_MAGIC, 4, count, degree, fraction_bits, flags, len(streams)) + struct.pack(
+        "<I12x", start
+    )
+    sizes = [
+        (len(stream), len(part)) for stream, part in zip(streams, filter(None, parts), strict=True)
+    ]
     table = b"".join(struct.pack("<QQ", *size) for size in sizes)
     path.write_bytes(b"".join([head, extensions, table, *streams]))
 
@@ -111,7 +118,9 @@ def packed_spz(splat: SplatFile) -> bytes:
     Raises DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
     """
     compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
-    return b"".join([*(compressor.compress(part) for part in _packed_parts(splat)), compressor.flush()])
+    return b"".join(
+        [*(compressor.compress(part) for part in _packed_parts(splat)), compressor.flush()]
+    )
 
 
 def _packed_parts(splat: SplatFile) -> list[bytes]:
@@ -121,12 +130,17 @@ def _packed_parts(splat: SplatFile) -> list[bytes]:
     extent = float(np.abs(means).max())
     octave = int(np.floor(np.log2(max(extent, 2.0**-_MOST_FRACTION_BITS))))
     # As fine as needed: more bits for scenes smaller than 1, fewer for what would leave 24 bits.
-    fraction_bits = min(22 - octave, max(_FRACTION_BITS, _FRACTION_BITS - octave), _MOST_FRACTION_BITS)
+    fraction_bits = min(
+        22 - octave, max(_FRACTION_BITS, _FRACTION_BITS - octave), _MOST_FRACTION_BITS
+    )
     if fraction_bits < 0:
         raise DyngsError(f"a .spz holds positions up to 8e6, these reach {extent:.2g}")
-    fixed = np.clip(np.round(means * (1 << fraction_bits)), -(1 << 23) + 1, (1 << 23) - 1).astype("<i4")
+    fixed = np.clip(np.round(means * (1 << fraction_bits)), -(1 << 23) + 1, (1 << 23) - 1).astype(
+        "<i4"
+    )
     sh = gaussians.sh[:, 1:].numpy()
-    step = np.full((sh.shape[1], 1), 8, np.float32)  # 5 bits, 6 for degree 1; Niantic's default is one less: -5 dB
+    # 5 bits, 6 for degree 1; Niantic's default is one less: -5 dB
+    step = np.full((sh.shape[1], 1), 8, np.float32)
     step[:3] = 4
     coded_sh = np.clip(np.round(sh * 128 / step) * step + 128, 0, 255).astype(np.uint8)
     colours = gaussians.sh[:, 0].numpy() * (_COLOUR_SCALE * 255) + 0.5 * 255
@@ -144,21 +158,36 @@ def _packed_parts(splat: SplatFile) -> list[bytes]:
 
 def _sizes(path: Path, version: int, count: int, degree: int) -> dict[str, int]:
     if degree > MAX_SH_DEGREE:
-        raise DyngsError(f"{path}: has harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known")
-    each = {"means": 6 if version == 1 else 9, "alphas": 1, "colours": 3, "scales": 3, "quats": 3 if version < 3 else 4}
-    return {name: count * size for name, size in (each | {"sh": 3 * (num_sh_terms(degree) - 1)}).items()}
+        raise DyngsError(
+            f"{path}: has harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known"
+        )
+    each = {
+        "means": 6 if version == 1 else 9,
+        "alphas": 1,
+        "colours": 3,
+        "scales": 3,
+        "quats": 3 if version < 3 else 4,
+    }
+    return {
+        name: count * size for name, size in (each | {"sh": 3 * (num_sh_terms(degree) - 1)}).items()
+    }
 
 
 def _inflated(path: Path, data: bytes, most: int) -> bytes:
-    """Return at most ``most`` bytes of a gzip stream; where it ends there, its checksum has been compared."""
+    """Return at most ``most`` bytes of a gzip stream; where it ends there, its checksum has been
+    compared."""
     stream = zlib.decompressobj(31)
     try:
         content = stream.decompress(data, most)
         more = stream.decompress(stream.unconsumed_tail, 1)
     except zlib.error as error:
-        raise DyngsError(f"{path}: its gzip stream is damaged ({error}); copy or export it again") from error
+        raise DyngsError(
+            f"{path}: its gzip stream is damaged ({error}); copy or export it again"
+        ) from error
     if not more and not stream.eof:
-        raise DyngsError(f"{path}: is truncated: its gzip stream does not end; copy or export it again")
+        raise DyngsError(
+            f"{path}: is truncated: its gzip stream does not end; copy or export it again"
+        )
     return content
 
 
@@ -169,28 +198,42 @@ def _read_streams(path: Path, data: bytes) -> SplatFile:
     start = int.from_bytes(data[16:20], "little")
     if version != 4:
         raise DyngsError(f"{path}: is a .spz of version {version}, only 1 to 4 are known")
-    sizes = {name: size for name, size in _sizes(path, version, count, degree).items() if size or name != "sh"}
+    sizes = {
+        name: size
+        for name, size in _sizes(path, version, count, degree).items()
+        if size or name != "sh"
+    }
     require_at_most(path, sum(sizes.values()), _MOST_BYTES, "bytes of Gaussians")
     require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
     if streams < len(sizes) or start + 16 * streams > len(data):
-        raise DyngsError(f"{path}: is truncated or damaged: its table of streams does not fit; copy or export it again")
+        raise DyngsError(
+            f"{path}: is truncated or damaged: its table of streams does not fit; copy or export it again"
+        )
     table = np.frombuffer(data, "<u8", 2 * streams, start).reshape(-1, 2).tolist()
-    begin, parts = start + 16 * streams, {}
+    begin = start + 16 * streams
+    parts = {}
     for (name, size), (packed, whole) in zip(sizes.items(), table, strict=False):
         if begin + packed > len(data) or whole != size:
-            raise DyngsError(f"{path}: is truncated or damaged in its {name}; copy or export it again")
+            raise DyngsError(
+                f"{path}: is truncated or damaged in its {name}; copy or export it again"
+            )
         parts[name] = np.frombuffer(_unpacked(path, data[begin : begin + packed], size), np.uint8)
         begin += packed
     parts.setdefault("sh", np.zeros(0, np.uint8))
     splat = _splat(path, parts, version, degree, fraction_bits, flags)
-    return _standard_axes(path, splat, data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b"")
+    return _standard_axes(
+        path, splat, data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b""
+    )
 
 
 def _standard_axes(path: Path, splat: SplatFile, extensions: bytes) -> SplatFile:
-    """Return the contents with x right, y up and z back, given the extensions of the file: type, size and value."""
+    """Return the contents with x right, y up and z back, given the extensions of the file: type,
+    size and value."""
     start = 0
     while start < len(extensions):
-        kind, size = (int.from_bytes(extensions[start + i : start + i + 4], "little") for i in (0, 4))
+        kind, size = (
+            int.from_bytes(extensions[start + i : start + i + 4], "little") for i in (0, 4)
+        )
         value = extensions[start + 8 : start + 8 + size]
         start += 8 + size
         if start > len(extensions):
@@ -201,10 +244,11 @@ def _standard_axes(path: Path, splat: SplatFile, extensions: bytes) -> SplatFile
 
 
 def _from_system(path: Path, splat: SplatFile, number: int) -> SplatFile:
-    """Return the contents in standard axes, given in the coordinate system of that number; 0 states none.
+    """Return the contents in standard axes, given in the coordinate system of that number; 0 states
+    none.
 
-    Bits of the number, less one: x points right, y up, z to the front; with the fourth bit z is the vertical axis, and
-    the third bit is y to the back.
+    Bits of the number, less one: x points right, y up, z to the front; with the fourth bit z is the
+    vertical axis, and the third bit is y to the back.
     """
     if number > _NUM_SYSTEMS:
         raise DyngsError(
@@ -241,14 +285,21 @@ def _unpacked(path: Path, data: bytes, size: int) -> bytes:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
             content = stream.read(size)
     except zstandard.ZstdError as error:
-        raise DyngsError(f"{path}: a stream of it is damaged ({error}); copy or export it again") from error
+        raise DyngsError(
+            f"{path}: a stream of it is damaged ({error}); copy or export it again"
+        ) from error
     if len(content) < size:
         raise DyngsError(f"{path}: is truncated: a stream holds {len(content):,} of {size:,} bytes")
     return content
 
 
 def _splat(
-    path: Path, parts: Mapping[str, np.ndarray], version: int, degree: int, fraction_bits: int, flags: int
+    path: Path,
+    parts: Mapping[str, np.ndarray],
+    version: int,
+    degree: int,
+    fraction_bits: int,
+    flags: int,
 ) -> SplatFile:
     count = len(parts["alphas"])
     if fraction_bits > _MOST_FRACTION_BITS:
@@ -276,11 +327,14 @@ def _splat(
         logit_opacities=torch.from_numpy(logit(parts["alphas"].astype(np.float32) / 255)),
         sh=torch.from_numpy(np.concatenate([base, rest], axis=1).astype(np.float32)),
     )
-    return SplatFile(gaussians, RasterizeMode.ANTIALIASED if flags & _ANTIALIASED else RasterizeMode.CLASSIC)
+    return SplatFile(
+        gaussians, RasterizeMode.ANTIALIASED if flags & _ANTIALIASED else RasterizeMode.CLASSIC
+    )
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """Return (N,) uint32: which of xyzw is largest in 2 bits, the sign and 9 bits of each of the others."""
+    """Return (N,) uint32: which of xyzw is largest in 2 bits, the sign and 9 bits of each of the
+    others."""
     largest, others = largest_and_others(quats[:, [1, 2, 3, 0]])
     size = np.minimum(np.abs(others) / _ROOT_HALF * _TOP + 0.5, _TOP).astype(np.uint32)
     coded = size | ((others < 0).astype(np.uint32) << np.uint32(9))
@@ -291,7 +345,9 @@ def _packed_rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
-    fields = np.stack([(words >> np.uint32(shift)) & np.uint32(1023) for shift in (20, 10, 0)], axis=1)
+    fields = np.stack(
+        [(words >> np.uint32(shift)) & np.uint32(1023) for shift in (20, 10, 0)], axis=1
+    )
     size = (fields & np.uint32(_TOP)).astype(np.float32) / _TOP * _ROOT_HALF
     others = np.where(fields >> np.uint32(9), -size, size)
     return with_largest(words >> np.uint32(30), others)[:, [3, 0, 1, 2]]

@@ -1,7 +1,7 @@
 """OpenUSD's ``ParticleField3DGaussianSplat`` (26.03): float32. Needs ``pip install 'dyngs[usd]'``.
 
-One prim with ``positions``, ``orientations``, linear ``scales``, ``opacities`` in [0, 1] and, per Gaussian, all terms
-of its harmonics. y is up, and the stage says so; stages of others may say z.
+One prim with ``positions``, ``orientations``, linear ``scales``, ``opacities`` in [0, 1] and, per
+Gaussian, all terms of its harmonics. y is up, and the stage says so; stages of others may say z.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ _UP = {"Y": "y", "Z": "z"}
 
 
 def read_usd(path: Path) -> SplatFile:
-    """Read all Gaussians of a .usd, .usda or .usdc, placed as their prims say, at the stage's default time.
+    """Read all Gaussians of a .usd, .usda or .usdc, placed as their prims say, at the stage's
+    default time.
 
-    Raises DyngsError: usd-core is missing, the file refers to others, holds no Gaussians, or is damaged.
+    Raises DyngsError: usd-core is missing, the file refers to others, holds no Gaussians, or is
+    damaged.
     """
     _packages(path)
     require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of a USD file")
@@ -44,12 +46,20 @@ def read_usd(path: Path) -> SplatFile:
         environment = os.environ | {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
         command = python_command(usd_child.__name__, str(path.resolve()), str(out))
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=_SECONDS, check=False, env=environment, errors="replace"
+            command,
+            capture_output=True,
+            text=True,
+            timeout=_SECONDS,
+            check=False,
+            env=environment,
+            errors="replace",
         )
         if done.returncode == 2 and done.stdout.strip():
             raise DyngsError(f"{path}: {done.stdout.strip().splitlines()[-1]:.200}")
         if done.returncode or not out.is_file():
-            raise DyngsError(f"{path}: the USD library cannot read it, or not in bounded memory; export it again")
+            raise DyngsError(
+                f"{path}: the USD library cannot read it, or not in bounded memory; export it again"
+            )
         with np.load(out, allow_pickle=False) as arrays:
             read = {name: arrays[name] for name in arrays.files}
     count = int(read["count"])
@@ -57,7 +67,9 @@ def read_usd(path: Path) -> SplatFile:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
     found = [_gaussians(path, {name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
     up = _UP.get(str(read["up"]), "y")
-    return described(SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())), path)
+    return described(
+        SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())), path
+    )
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
@@ -74,7 +86,8 @@ def write_usd(path: Path, splat: SplatFile) -> None:
     prim = vol.ParticleField3DGaussianSplat.Define(stage, "/Gaussians")
     stage.SetDefaultPrim(prim.GetPrim())
     prim.CreatePositionsAttr(vt.Vec3fArray.FromNumpy(gaussians.means.numpy()))
-    xyzw = np.ascontiguousarray(gaussians.quats.numpy()[:, [1, 2, 3, 0]])  # USD keeps the real part last in memory
+    # USD keeps the real part last in memory
+    xyzw = np.ascontiguousarray(gaussians.quats.numpy()[:, [1, 2, 3, 0]])
     prim.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(xyzw))
     prim.CreateScalesAttr(vt.Vec3fArray.FromNumpy(gaussians.scales.numpy()))
     prim.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(gaussians.opacities.numpy()))
@@ -82,7 +95,10 @@ def write_usd(path: Path, splat: SplatFile) -> None:
     terms = np.ascontiguousarray(gaussians.sh.numpy().reshape(-1, 3))
     prim.CreateRadianceSphericalHarmonicsCoefficientsAttr(vt.Vec3fArray.FromNumpy(terms))
     reach = 3 * gaussians.scales.amax(1, keepdim=True)
-    corners = [(gaussians.means - reach).amin(0).tolist(), (gaussians.means + reach).amax(0).tolist()]
+    corners = [
+        (gaussians.means - reach).amin(0).tolist(),
+        (gaussians.means + reach).amax(0).tolist(),
+    ]
     prim.CreateExtentAttr(corners)
     with suppress(RuntimeError):  # its own, of many lines
         if layer.Export(str(path)):
@@ -92,7 +108,9 @@ def write_usd(path: Path, splat: SplatFile) -> None:
 
 def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
     try:
-        sdf, usd, geom, vol = (import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol"))
+        sdf, usd, geom, vol = (
+            import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol")
+        )
         _ = vol.ParticleField3DGaussianSplat
     except (ImportError, AttributeError):
         raise DyngsError(
@@ -103,14 +121,28 @@ def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
 
 def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     """Return the Gaussians of a prim, in the axes of the stage."""
-    degree, means, sh = int(arrays["degree"]), arrays["means"], arrays["sh"]
+    degree = int(arrays["degree"])
+    means = arrays["means"]
+    sh = arrays["sh"]
     if not 0 <= degree <= MAX_SH_DEGREE:
-        raise DyngsError(f"{path}: harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known")
-    n, terms = len(means), num_sh_terms(degree)
-    if any(len(arrays[name]) != n for name in ("scales", "opacities", "quats")) or len(sh) != n * terms:
-        raise DyngsError(f"{path}: the attributes of its Gaussians have different lengths; export it again")
-    found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3))
+        raise DyngsError(
+            f"{path}: harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known"
+        )
+    n = len(means)
+    terms = num_sh_terms(degree)
+    if (
+        any(len(arrays[name]) != n for name in ("scales", "opacities", "quats"))
+        or len(sh) != n * terms
+    ):
+        raise DyngsError(
+            f"{path}: the attributes of its Gaussians have different lengths; export it again"
+        )
+    found = from_linear(
+        means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3)
+    )
     moved = placed(found, arrays["world"])
     if moved is None:
-        raise DyngsError(f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting")
+        raise DyngsError(
+            f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting"
+        )
     return moved

@@ -1,7 +1,8 @@
-"""The part of reading USD that runs in a process of its own: ``python -m dyngs.splats.usd_child IN OUT.npz``.
+"""The part of reading USD that runs in a process of its own: ``python -m dyngs.splats.usd_child IN
+OUT.npz``.
 
-The USD library takes unbounded memory for damaged binary files, or ends the process. Here that harms nothing else.
-Prints one line and exits with 2 where the file is refused.
+The USD library takes unbounded memory for damaged binary files, or ends the process. Here that
+harms nothing else. Prints one line and exits with 2 where the file is refused.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ class RefusedError(Exception):
 
 def main() -> int:
     """Read the file named on the command line; return the exit code."""
-    path, out = Path(sys.argv[1]), Path(sys.argv[2])
+    path = Path(sys.argv[1])
+    out = Path(sys.argv[2])
     try:
         _limit(path.stat().st_size)
         np.savez(out, allow_pickle=False, **arrays_of(path))
@@ -36,7 +38,8 @@ def main() -> int:
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
-    """Return the attributes of all prims of Gaussians as ``0.means`` and so on, with their ``world`` matrices.
+    """Return the attributes of all prims of Gaussians as ``0.means`` and so on, with their
+    ``world`` matrices.
 
     And ``up`` and ``comments`` of the stage.
 
@@ -49,7 +52,9 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
             raise RefusedError("is no USD file; export it again")
         others = layer.GetCompositionAssetDependencies()
         if others:
-            raise RefusedError(f"refers to other files ({others[0]!s:.60}); flatten it into one file first")
+            raise RefusedError(
+                f"refers to other files ({others[0]!s:.60}); flatten it into one file first"
+            )
         stage = usd.Stage.Open(layer, usd.Stage.LoadNone)
         prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == PRIM]
         up = str(geom.GetStageUpAxis(stage))
@@ -60,7 +65,9 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
         for i, prim in enumerate(prims):
             found |= {f"{i}.{name}": values for name, values in _attributes(prim, geom).items()}
     except tf.ErrorException as error:
-        raise RefusedError(f"cannot be read as USD ({str(error).strip()[-100:]!r}); export it again") from error
+        raise RefusedError(
+            f"cannot be read as USD ({str(error).strip()[-100:]!r}); export it again"
+        ) from error
     return found
 
 
@@ -92,8 +99,15 @@ def _limit(size: int) -> None:
     except ImportError:
         return
     most = _BASE_BYTES + _BYTES_PER_BYTE * size
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * 4096 if Path("/proc/self/statm").exists() else 0
-    for kind, limit in ((resource.RLIMIT_AS, used + most), (resource.RLIMIT_CPU, _SECONDS + size // 10**6)):
+    used = (
+        int(Path("/proc/self/statm").read_text().split()[0]) * 4096
+        if Path("/proc/self/statm").exists()
+        else 0
+    )
+    for kind, limit in (
+        (resource.RLIMIT_AS, used + most),
+        (resource.RLIMIT_CPU, _SECONDS + size // 10**6),
+    ):
         hard = resource.getrlimit(kind)[1]
         bound = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
         resource.setrlimit(kind, (bound, hard))

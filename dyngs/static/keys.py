@@ -14,4 +14,6 @@ class StaticModel(SceneModel):
 
     begins_with_points: ClassVar[bool] = True
 
-    kind: Literal["static"] = Field(default="static", description="3D Gaussians of a static scene (3DGS)")
+    kind: Literal["static"] = Field(
+        default="static", description="3D Gaussians of a static scene (3DGS)"
+    )

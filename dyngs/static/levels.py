@@ -23,7 +23,8 @@ class LevelScene(Renderable):
 
     Attributes:
         scene: without a 3D filter, which the levels have in them.
-        most: so many Gaussians are drawn at most, but for those of the coarsest level; None: all that are needed.
+        most: so many Gaussians are drawn at most, but for those of the coarsest level; None: all
+            that are needed.
     """
 
     scene: StaticScene
@@ -35,13 +36,17 @@ class LevelScene(Renderable):
         """Return the levels of a still scene. Raises DyngsError for any other one."""
         still = require_gaussians(scene, "the scene")
         if not isinstance(still, StaticScene):
-            raise DyngsError("levels of detail are for still scenes; export one time of it as .ply, and take that")
+            raise DyngsError(
+                "levels of detail are for still scenes; export one time of it as .ply, and take that"
+            )
         if still.sides is not None:
             raise DyngsError(
                 "levels of detail are for scenes that look the same from all sides; this one has a surface each"
             )
         gaussians = still.at(None)
-        return LevelScene(replace(still, gaussians=gaussians, filter_std=None), levels_of(gaussians), most)
+        return LevelScene(
+            replace(still, gaussians=gaussians, filter_std=None), levels_of(gaussians), most
+        )
 
     @property
     def options(self) -> Any:
@@ -71,10 +76,15 @@ class LevelScene(Renderable):
         options: Any = None,
         background: Tensor | None = None,
     ) -> Rendering:
-        """Return images as ``Renderable.render``, each of the cut that its camera needs; not differentiable."""
+        """Return images as ``Renderable.render``, each of the cut that its camera needs; not
+        differentiable."""
         images = []
-        for one, behind in single_views(cameras, self.background if background is None else background):
-            seen = self.scene.with_gaussians(self.levels.seen_by(one, self.most).to(device=self.device))
+        for one, behind in single_views(
+            cameras, self.background if background is None else background
+        ):
+            seen = self.scene.with_gaussians(
+                self.levels.seen_by(one, self.most).to(device=self.device)
+            )
             images.append(seen.render(one, options=options, background=behind))
         return joined_renderings([Rendering(x.rgb, x.transmittance, x.depth) for x in images])
 

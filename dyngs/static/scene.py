@@ -20,11 +20,13 @@ from dyngs.static.sides import Sides
 
 @dataclass(frozen=True, kw_only=True)
 class StaticScene(GaussianScene):
-    """The same N Gaussians at every time; with ``sides`` each camera sees those of the side nearest to it."""
+    """The same N Gaussians at every time; with ``sides`` each camera sees those of the side nearest
+    to it."""
 
     filter_std: Tensor | None = None
     sides: Sides | None = None
-    # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing moves
+    # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing
+    # moves
     seen_at: tuple[float, ...] = ()
 
     @staticmethod
@@ -66,15 +68,20 @@ class StaticScene(GaussianScene):
         probe: Tensor | None = None,
     ) -> GaussianRendering:
         if self.sides is None:
-            return super().render(cameras, time, options=options, background=background, probe=probe)
+            return super().render(
+                cameras, time, options=options, background=background, probe=probe
+            )
         now = time if isinstance(time, GaussianTimeStep) else self.time_step(None)
-        cameras, found = cameras.to(device=self.device, dtype=now.gaussians.means.dtype), []
+        cameras = cameras.to(device=self.device, dtype=now.gaussians.means.dtype)
+        found = []
         for i, (camera, behind) in enumerate(
             single_views(cameras, self.background if background is None else background)
         ):
             own = GaussianTimeStep(self.sides.seen_by(camera, now.gaussians), now.time)
             signal = None if probe is None else probe[i : i + 1]
-            found.append(super().render(camera, own, options=options, background=behind, probe=signal))
+            found.append(
+                super().render(camera, own, options=options, background=behind, probe=signal)
+            )
         return joined_renderings(found)
 
     def edited(self, edit: TopologyEdit) -> StaticScene:

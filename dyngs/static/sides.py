@@ -1,6 +1,8 @@
-"""Gaussians that were found from several sides, each of which is drawn for the cameras that stand nearest to it.
+"""Gaussians that were found from several sides, each of which is drawn for the cameras that stand
+nearest to it.
 
-What two neighbouring views show is right for the views between them; errors of its depth are seen from the side.
+What two neighbouring views show is right for the views between them; errors of its depth are seen
+from the side.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ class Sides:
 
     @staticmethod
     def joined(parts: Sequence[Gaussians], centers: Sequence[Tensor]) -> Sides:
-        """Return those of ``parts`` one after another; ``centers``: (3,) where each is seen from, on average."""
+        """Return those of ``parts`` one after another; ``centers``: (3,) where each is seen from,
+        on average."""
         device = centers[0].device
         middle = Gaussians.joined(parts).means.mean(0)
         sizes = torch.tensor([len(part) for part in parts], device=device)
@@ -38,9 +41,12 @@ class Sides:
         return Sides(of, normalize(torch.stack([*centers]) - middle, dim=1), middle)
 
     def seen_by(self, camera: Cameras, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians as one camera is to see them: those of other sides are transparent."""
+        """Return the Gaussians as one camera is to see them: those of other sides are
+        transparent."""
         side = (self.toward @ normalize(camera.centers[0] - self.middle, dim=0)).argmax()
-        return gaussians.replace(logit_opacities=gaussians.logit_opacities.where(self.of == side, _UNSEEN))
+        return gaussians.replace(
+            logit_opacities=gaussians.logit_opacities.where(self.of == side, _UNSEEN)
+        )
 
     def edited(self, edit: TopologyEdit) -> Sides:
         return Sides(edit.apply(self.of), self.toward, self.middle)
@@ -53,7 +59,8 @@ class Sides:
 
     @staticmethod
     def stored(tensors: Mapping[str, Tensor], count: int) -> Sides | None:
-        """Return those of a state for N = ``count``, None without. Raises KeyError, ValueError: they do not fit."""
+        """Return those of a state for N = ``count``, None without. Raises KeyError, ValueError:
+        they do not fit."""
         if "sides.of" not in tensors:
             return None
         toward = require_tensor("toward", tensors["sides.toward"], (None, 3))

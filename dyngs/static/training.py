@@ -1,4 +1,5 @@
-"""Training of a static scene: on every image, with its 3D filter kept up to date, and rid of what no image shows."""
+"""Training of a static scene: on every image, with its 3D filter kept up to date, and rid of what
+no image shows."""
 
 from __future__ import annotations
 
@@ -26,14 +27,16 @@ from dyngs.state import Role, State, StateTensor
 from dyngs.static.scene import StaticScene
 from dyngs.tensor_checks import require_tensor
 
-SURVEYED = 200  # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
+# Training views, evenly spaced, in which a Gaussian is looked for before it is removed
+SURVEYED = 200
 
 
 @dataclass(frozen=True)
 class SmallRemoval:
     """Removal, once, of Gaussians that amount to less than ``pixels`` in every one of some views.
 
-    What a Gaussian amounts to is its blending weight, summed over an image: 1 for a pixel that shows nothing else.
+    What a Gaussian amounts to is its blending weight, summed over an image: 1 for a pixel that
+    shows nothing else.
     """
 
     step: int = 0  # after which that happens; 0: it does not
@@ -41,8 +44,10 @@ class SmallRemoval:
     cameras: Sequence[Cameras] = ()
 
     def edit(self, scene: StaticScene, stays: Tensor | None = None) -> EditResult | None:
-        """Return the removal; None where all Gaussians, or none, amount to that much; ``stays`` (N,) bool: these do."""
-        drawn, most = scene.time_step(None).gaussians, torch.zeros(len(scene), device=scene.device)
+        """Return the removal; None where all Gaussians, or none, amount to that much; ``stays``
+        (N,) bool: these do."""
+        drawn = scene.time_step(None).gaussians
+        most = torch.zeros(len(scene), device=scene.device)
         for cameras in self.cameras:
             found = contributions(drawn, cameras.to(device=scene.device), scene.options)
             most = torch.maximum(most, found.amax(0))
@@ -58,7 +63,8 @@ class SmallRemoval:
 
 def small_removal(run: RunStart) -> SmallRemoval:
     """Return when and by which views Gaussians of a run are removed: when no more are added."""
-    config, strategy = run.config, run.config.strategy
+    config = run.config
+    strategy = run.config.strategy
     if not (isinstance(strategy, DefaultStrategy) and strategy.prune_pixels > 0):
         return SmallRemoval()
     views = run.capture.splits["train"]
@@ -73,7 +79,10 @@ class StaticTraining(SceneTraining[StaticScene]):
     """
 
     def __init__(
-        self, update: FilterUpdate, removal: SmallRemoval = SmallRemoval(), still: Still | None = None
+        self,
+        update: FilterUpdate,
+        removal: SmallRemoval = SmallRemoval(),
+        still: Still | None = None,
     ) -> None:
         self._update, self._removal, self._still = update, removal, still
 
@@ -126,5 +135,7 @@ def start(run: RunStart) -> GaussianModel:
 
 def restore(model: StaticModel, checkpoint: Checkpoint) -> StaticScene:
     """Return the scene of a checkpoint."""
-    scene = StaticScene.restored(Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
+    scene = StaticScene.restored(
+        Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
+    )
     return drawn_as_trained(scene, model, checkpoint)

@@ -1,1 +1,2 @@
-"""Trained models in one small file: quantised by how much the image may change, and entropy-coded."""
+"""Trained models in one small file: quantised by how much the image may change, and
+entropy-coded."""

@@ -6,8 +6,8 @@
     data      of the tensors in the order of the header, then zeros
     32 bytes  SHA-256 of all before
 
-Nothing in it is run. The checksum finds accidents; everything in the header is checked besides, and no more memory is
-taken than a file of this size can need.
+Nothing in it is run. The checksum finds accidents; everything in the header is checked besides, and
+no more memory is taken than a file of this size can need.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ from dyngs.storage.tensors import (
 _SAMPLE = 2**15  # number of values by which the layout of an array is chosen
 _FEW = 512  # number of values below which the layout is not changed
 _MAX_PLANES = 8
-_SMALLEST_DICTIONARY, _LARGEST_DICTIONARY = 2**12, 2**24
+_SMALLEST_DICTIONARY = 2**12
+_LARGEST_DICTIONARY = 2**24
 
 
 @dataclass(frozen=True)
@@ -72,16 +73,25 @@ def packed(whole: np.ndarray) -> tuple[Packing, bytes]:
         return packing, compressed(plain)
     sample = whole[: max(_SAMPLE // max(whole[:1].size, 1), 64)]
     axes = [-1, *(axis for axis in range(min(whole.ndim, 2)) if whole.shape[axis] > 1)]
-    ways = [(axis, by_rows) for axis in axes for by_rows in ((True, False) if whole.ndim > 1 else (True,))]
-    sizes = [len(compressed(_laid_out(sample, axis, by_rows)[1], quick=True)) for axis, by_rows in ways]
+    ways = [
+        (axis, by_rows)
+        for axis in axes
+        for by_rows in ((True, False) if whole.ndim > 1 else (True,))
+    ]
+    sizes = [
+        len(compressed(_laid_out(sample, axis, by_rows)[1], quick=True)) for axis, by_rows in ways
+    ]
     packing, plain = _laid_out(whole, *ways[int(np.argmin(sizes))])
     return packing, compressed(plain)
 
 
 def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Return int64 numbers of ``shape``. Raises DyngsError if the bytes do not hold that many numbers."""
+    """Return int64 numbers of ``shape``. Raises DyngsError if the bytes do not hold that many
+    numbers."""
     count = math.prod(shape)
-    plain = np.frombuffer(decompressed(data, packing.planes * count), dtype=np.uint8).reshape(packing.planes, count)
+    plain = np.frombuffer(decompressed(data, packing.planes * count), dtype=np.uint8).reshape(
+        packing.planes, count
+    )
     stored = np.zeros(count, dtype=np.uint64)
     for index, plane in enumerate(plain):
         stored |= plane.astype(np.uint64) << np.uint64(8 * index)
@@ -91,7 +101,11 @@ def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarra
     if not packing.by_rows and count:
         whole = whole.reshape(-1, shape[0]).T
     whole = whole.reshape(shape)
-    return whole if packing.axis < 0 or packing.axis >= len(shape) else np.cumsum(whole, axis=packing.axis)
+    return (
+        whole
+        if packing.axis < 0 or packing.axis >= len(shape)
+        else np.cumsum(whole, axis=packing.axis)
+    )
 
 
 def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) -> bytes:
@@ -99,11 +113,14 @@ def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) ->
 
     ``room``: the size that it will be read with, where that is not its own.
     """
-    return lzma.compress(plain, format=lzma.FORMAT_RAW, filters=_filters(1 if quick else 6, room or len(plain)))
+    return lzma.compress(
+        plain, format=lzma.FORMAT_RAW, filters=_filters(1 if quick else 6, room or len(plain))
+    )
 
 
 def decompressed(data: bytes, size: int, *, exact: bool = True) -> bytes:
-    """Return the ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never takes memory for more.
+    """Return the ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never
+    takes memory for more.
 
     Raises DyngsError: there are not so many, or something else follows them.
     """
@@ -124,24 +141,47 @@ def _laid_out(whole: np.ndarray, axis: int, by_rows: bool) -> tuple[Packing, byt
     stored = (whole << 1 ^ whole >> 63 if signed else whole).view(np.uint64)
     stored = stored.ravel() if by_rows else stored.reshape(len(stored), -1).T.ravel()
     planes = max(1, (int(stored.max(initial=0)).bit_length() + 7) // 8)
-    plain = b"".join((stored >> np.uint64(8 * index)).astype(np.uint8).tobytes() for index in range(planes))
+    plain = b"".join(
+        (stored >> np.uint64(8 * index)).astype(np.uint8).tobytes() for index in range(planes)
+    )
     return Packing(axis, by_rows, signed, planes), plain
 
 
 def _filters(preset: int, size: int) -> list[dict[str, int]]:
-    """Return LZMA2 filters with a dictionary for ``size`` bytes: a larger one only costs time and memory."""
-    dictionary = min(max(1 << max(size - 1, 1).bit_length(), _SMALLEST_DICTIONARY), _LARGEST_DICTIONARY)
-    return [{"id": lzma.FILTER_LZMA2, "preset": preset, "dict_size": dictionary, "lc": 4, "lp": 0, "pb": 0}]
+    """Return LZMA2 filters with a dictionary for ``size`` bytes: a larger one only costs time and
+    memory."""
+    dictionary = min(
+        max(1 << max(size - 1, 1).bit_length(), _SMALLEST_DICTIONARY), _LARGEST_DICTIONARY
+    )
+    return [
+        {
+            "id": lzma.FILTER_LZMA2,
+            "preset": preset,
+            "dict_size": dictionary,
+            "lc": 4,
+            "lp": 0,
+            "pb": 0,
+        }
+    ]
 
 
 MAGIC = b"dyngs\x00\x01\n"
 MAX_HEADER = 2**20
-FREE_VALUES, VALUES_PER_BYTE = 2**22, 64  # largest number of values in any file, and of further values per byte of it
+FREE_VALUES = 2**22
+VALUES_PER_BYTE = 64  # largest number of values in any file, and of further values per byte of it
 _CHECKSUM = 32
 _FAR_BYTES = 16  # bytes of an index and a value
 _DTYPES = {
     str(dtype).removeprefix("torch."): dtype
-    for dtype in (torch.float16, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8, torch.bool)
+    for dtype in (
+        torch.float16,
+        torch.float32,
+        torch.float64,
+        torch.int32,
+        torch.int64,
+        torch.uint8,
+        torch.bool,
+    )
 }
 _DAMAGED = "damaged or cut off, its checksum differs; copy it again, or export it again"
 
@@ -162,7 +202,8 @@ class _Info(_Part):
 
 
 class _Entry(_Part):
-    """A tensor: fields of ``Coding`` and ``Packing``, bytes of its numbers, and how many values are out of reach."""
+    """A tensor: fields of ``Coding`` and ``Packing``, bytes of its numbers, and how many values are
+    out of reach."""
 
     name: str
     dtype: str
@@ -197,7 +238,8 @@ def write_scene(path: Path, data: bytes) -> None:
 def read_scene(path: Path) -> Checkpoint:
     """Return the checkpoint in a file: the tensors that drawing needs.
 
-    Raises DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
+    Raises DyngsError: a file that is missing, truncated, altered, or of another version; one line
+    that names it.
     """
     require_regular(path)
     try:
@@ -209,23 +251,32 @@ def read_scene(path: Path) -> Checkpoint:
 
 
 def encoded(
-    info: CheckpointInfo, scene: Renderable, steps: Mapping[str, float], coarseness: Tensor | None = None
+    info: CheckpointInfo,
+    scene: Renderable,
+    steps: Mapping[str, float],
+    coarseness: Tensor | None = None,
 ) -> bytes:
-    """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is not finite.
+    """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is
+    not finite.
 
-    ``steps`` are of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.
-    ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are stored alike.
+    ``steps`` are of groups of tensors, see ``dyngs.storage.precision``; others are stored in half
+    precision. ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are
+    stored alike.
     """
-    kept = _ordered(scene, steps, coarseness) if isinstance(scene, GaussianScene) else drawable(scene)
+    kept = (
+        _ordered(scene, steps, coarseness) if isinstance(scene, GaussianScene) else drawable(scene)
+    )
     scale = None if coarseness is None else checked_coarseness(kept[COARSENESS], len(coarseness))
-    entries, blocks = [], []
+    entries = []
+    blocks = []
     for name in sorted(kept):
         coding = coding_of(name, kept[name], steps, by_coarseness=scale is not None)
         entry, block = _stored(name, kept[name], coding, scale)
         entries.append(entry)
         blocks.append(block)
     header = compressed(
-        _Header(info=_Info(**asdict(info)), tensors=tuple(entries)).model_dump_json().encode(), room=MAX_HEADER
+        _Header(info=_Info(**asdict(info)), tensors=tuple(entries)).model_dump_json().encode(),
+        room=MAX_HEADER,
     )
     body = b"".join([MAGIC, len(header).to_bytes(4, "little"), header, *blocks])
     num_values = sum(math.prod(entry.shape) for entry in entries)
@@ -233,8 +284,11 @@ def encoded(
     return body + hashlib.sha256(body).digest()
 
 
-def _ordered(scene: GaussianScene, steps: Mapping[str, float], coarseness: Tensor | None) -> dict[str, Tensor]:
-    """Return the tensors of ``drawable``, and ``coarseness``, in the order in which Gaussians are stored."""
+def _ordered(
+    scene: GaussianScene, steps: Mapping[str, float], coarseness: Tensor | None
+) -> dict[str, Tensor]:
+    """Return the tensors of ``drawable``, and ``coarseness``, in the order in which Gaussians are
+    stored."""
     means = scene.gaussians.means.detach()
     if not bool(means.isfinite().all()):
         raise DyngsError("means is not finite; it cannot be stored")
@@ -244,11 +298,15 @@ def _ordered(scene: GaussianScene, steps: Mapping[str, float], coarseness: Tenso
 
 
 def decoded(data: bytes) -> Checkpoint:
-    """Return the checkpoint in the bytes of a file. Raises DyngsError: anything but what ``encoded`` makes."""
+    """Return the checkpoint in the bytes of a file. Raises DyngsError: anything but what
+    ``encoded`` makes."""
     if data[: len(MAGIC)] != MAGIC:
         is_other = data.startswith(MAGIC[:6]) and len(data) > len(MAGIC)
-        raise DyngsError("written by another version of dyngs" if is_other else "not a stored scene of dyngs")
-    body, checksum = data[:-_CHECKSUM], data[-_CHECKSUM:]
+        raise DyngsError(
+            "written by another version of dyngs" if is_other else "not a stored scene of dyngs"
+        )
+    body = data[:-_CHECKSUM]
+    checksum = data[-_CHECKSUM:]
     if hashlib.sha256(body).digest() != checksum:
         raise DyngsError(_DAMAGED)
     start = len(MAGIC) + 4
@@ -277,7 +335,9 @@ def decoded(data: bytes) -> Checkpoint:
     return Checkpoint(CheckpointInfo(**header.info.model_dump()), full)
 
 
-def _stored(name: str, x: Tensor, coding: Coding, coarseness: np.ndarray | None) -> tuple[_Entry, bytes]:
+def _stored(
+    name: str, x: Tensor, coding: Coding, coarseness: np.ndarray | None
+) -> tuple[_Entry, bytes]:
     whole = to_whole(x, coding, coarseness)
     packing, block = packed(whole.numbers)
     entry = _Entry(
@@ -299,5 +359,9 @@ def _tensor(entry: _Entry, block: bytes, coarseness: Tensor | None) -> Tensor:
     numbers = unpacked(packing, block[: entry.size], entry.stored_shape)
     far = np.frombuffer(block[entry.size :], dtype="<i8").astype(np.int64).reshape(entry.far, 2)
     coding = Coding(entry.kind, entry.step, entry.by_coarseness)
-    rows = checked_coarseness(coarseness, entry.shape[0]) if entry.by_coarseness and coarseness is not None else None
+    rows = (
+        checked_coarseness(coarseness, entry.shape[0])
+        if entry.by_coarseness and coarseness is not None
+        else None
+    )
     return from_whole(Whole(numbers, far), coding, _DTYPES[entry.dtype], rows)

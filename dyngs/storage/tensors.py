@@ -1,7 +1,7 @@
 """The tensors that a .dyngs file stores of a scene, and their conversion to integers and back.
 
-They have the names of checkpoints (``gaussians.means``, ``model.rows``), but for the harmonics, which are stored as
-``gaussians.sh_base`` (N, 3) and ``gaussians.sh_rest`` (N, K - 1, 3).
+They have the names of checkpoints (``gaussians.means``, ``model.rows``), but for the harmonics,
+which are stored as ``gaussians.sh_base`` (N, 3) and ``gaussians.sh_rest`` (N, K - 1, 3).
 """
 
 from __future__ import annotations
@@ -24,11 +24,15 @@ from dyngs.ops.quaternions import quat_product
 from dyngs.state import tensors_of
 
 LIMIT = 2**20  # bound on the magnitude of the integers; larger values are stored as they are
-SMALLEST_STEP, LARGEST_STEP = 2.0**-100, 2.0**60
+SMALLEST_STEP = 2.0**-100
+LARGEST_STEP = 2.0**60
 NEAREST, SPARSE = 0.5, 0.35
-"""Added before rounding down: to the nearest integer, or biased to zero, which costs least to store."""
-ROTATION_STEP = 1 / 32  # coarsest step for rotations, at which the component left out stays the largest
-FINEST_ROTATION = 2.0**-19  # finest step for rotations, at which the components of a unit quaternion are within LIMIT
+"""Added before rounding down: to the nearest integer, or biased to zero, which costs least to
+store."""
+# coarsest step for rotations, at which the component left out stays the largest
+ROTATION_STEP = 1 / 32
+# finest step for rotations, at which the components of a unit quaternion are within LIMIT
+FINEST_ROTATION = 2.0**-19
 OPACITY_STEPS = 2.0**-12, 1 / 8  # finest and coarsest step for opacities
 
 
@@ -46,8 +50,11 @@ def is_step(step: float) -> bool:
 Steps = float | np.ndarray  # one step for all, or one per row, of a shape that broadcasts
 
 
-def to_grid(values: np.ndarray, step: Steps, rounding: float = NEAREST) -> tuple[np.ndarray, np.ndarray]:
-    """Return int32 multiples of ``step`` nearest to ``values``, and where they are out of reach (there they are 0).
+def to_grid(
+    values: np.ndarray, step: Steps, rounding: float = NEAREST
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return int32 multiples of ``step`` nearest to ``values``, and where they are out of reach
+    (there they are 0).
 
     ``rounding``: ``NEAREST`` or ``SPARSE``.
     """
@@ -69,17 +76,19 @@ def opacities_to_grid(logits: np.ndarray, step: float) -> np.ndarray:
 
 
 def opacities_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
-    """Return float64 logits; finite, as 0 becomes an eighth of a step (not drawn) and 1 a little less than 1."""
+    """Return float64 logits; finite, as 0 becomes an eighth of a step (not drawn) and 1 a little
+    less than 1."""
     opacities = np.clip(from_grid(whole, step), step / 8, 1 - step / 64)
     return np.log(opacities) - np.log1p(-opacities)
 
 
 def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
-    """Return (N, 3) int32 multiples of ``step``: vector parts of unit quaternions with an about largest scalar part.
+    """Return (N, 3) int32 multiples of ``step``: vector parts of unit quaternions with an about
+    largest scalar part.
 
-    Half turns about its own axes do not change a Gaussian: of the four quaternions one with a large scalar part is
-    taken. A zero quaternion is the identity. Coded again, the result stays the same. ``step``: at most
-    ``ROTATION_STEP``.
+    Half turns about its own axes do not change a Gaussian: of the four quaternions one with a large
+    scalar part is taken. A zero quaternion is the identity. Coded again, the result stays the same.
+    ``step``: at most ``ROTATION_STEP``.
     """
     turned = quats.astype(np.float64)
     while True:
@@ -107,10 +116,13 @@ def sorted_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, 
     turns = np.zeros((27, 4))
     for (first, second, third), turn in _AXIS_TURNS.items():
         turns[9 * first + 3 * second + third] = turn
-    return _product(_unit(quats), turns[order @ (9, 3, 1)]), np.take_along_axis(log_scales, order, axis=1)
+    return _product(_unit(quats), turns[order @ (9, 3, 1)]), np.take_along_axis(
+        log_scales, order, axis=1
+    )
 
 
-_HALF, _ROOT = 0.5, math.sqrt(0.5)
+_HALF = 0.5
+_ROOT = math.sqrt(0.5)
 _AXIS_TURNS = {
     (0, 1, 2): (1.0, 0.0, 0.0, 0.0),
     (0, 2, 1): (_ROOT, _ROOT, 0.0, 0.0),
@@ -119,11 +131,13 @@ _AXIS_TURNS = {
     (1, 2, 0): (_HALF, _HALF, _HALF, _HALF),
     (2, 0, 1): (_HALF, -_HALF, -_HALF, -_HALF),
 }
-"""For each order of the axes, the rotation wxyz whose columns are the axes in this order, up to signs."""
+"""For each order of the axes, the rotation wxyz whose columns are the axes in this order, up to
+signs."""
 
 
 def _scalar_largest(quats: np.ndarray, margin: float) -> np.ndarray:
-    """Return (N, 4) unit quaternions of the same axes, scalar part positive, at most ``margin`` below the largest."""
+    """Return (N, 4) unit quaternions of the same axes, scalar part positive, at most ``margin``
+    below the largest."""
     unit = _unit(quats)
     size = np.abs(unit)
     size[:, 0] += margin
@@ -157,7 +171,8 @@ class TensorKind(str, Enum):
 FIELD = "model.field.learned."  # prefix of the learned tensors of a deformation field
 TRIANGLES = "triangles.points"  # what a scene of triangles has in place of Gaussians
 GAUSSIANS = tuple(field.name for field in fields(Gaussians))
-MAX_COARSENESS = 6  # most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
+# most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
+MAX_COARSENESS = 6
 COARSENESS = "gaussians.coarseness"
 _BY_COARSENESS = ("gaussians.sh_base", "gaussians.sh_rest")
 _KINDS = {
@@ -169,10 +184,12 @@ _KINDS = {
 _LIMITS = {TensorKind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), TensorKind.OPACITY: OPACITY_STEPS}
 FEW = 64  # number of values up to which tensors are stored as they are
 LARGEST_HALF = 65504.0
-MOST_FAR = 1 / 8  # largest fraction of values out of the integer range; with more, all are stored as they are
+# largest fraction of values out of the integer range; with more, all are stored as they are
+MOST_FAR = 1 / 8
 RELATIVE = "model.filter_std"  # stored in half precision: it spans orders of magnitude
 POSITIVE = "model.field.buffers.radii"
-"""Stored as they are: a radius of influence that is rounded to 0 has no meaning, and there are few."""
+"""Stored as they are: a radius of influence that is rounded to 0 has no meaning, and there are
+few."""
 FIXED_STEPS = {
     "model.anchors.points": 2.0**-9,
     "model.anchors.size": 2.0**-13,
@@ -195,7 +212,9 @@ class Coding:
         has_step = self.kind not in (TensorKind.EXACT, TensorKind.HALF)
         low, high = _LIMITS.get(self.kind, (SMALLEST_STEP, LARGEST_STEP))
         fits = is_step(self.step) and low <= self.step <= high if has_step else self.step == 0
-        if not fits or (self.by_coarseness and self.kind not in (TensorKind.GRID, TensorKind.SPARSE)):
+        if not fits or (
+            self.by_coarseness and self.kind not in (TensorKind.GRID, TensorKind.SPARSE)
+        ):
             raise ValueError(f"no such coding: {self}")
 
     def steps(self, coarseness: np.ndarray | None, num_axes: int) -> Steps:
@@ -212,15 +231,17 @@ class Whole:
     """A tensor as integers."""
 
     numbers: np.ndarray  # int64, the shape of the tensor; (N, 3) for rotations
-    # (K, 2) int64, index into the flat numbers and float32 bits of the values that no whole number reaches
+    # (K, 2) int64, index into the flat numbers and float32 bits of the values that no whole number
+    # reaches
     far: np.ndarray
 
 
 def drawable(scene: Renderable) -> dict[str, Tensor]:
-    """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by length.
+    """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by
+    length.
 
-    Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not finite, or there are
-    neither Gaussians nor triangles.
+    Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not
+    finite, or there are neither Gaussians nor triangles.
     """
     kept = tensors_of(scene.drawing_state())
     for name, x in kept.items():
@@ -233,7 +254,9 @@ def drawable(scene: Renderable) -> dict[str, Tensor]:
     kept |= {"gaussians.sh_base": sh[:, 0], "gaussians.sh_rest": sh[:, 1:]}
     sorts = torch.ones(len(sh), dtype=torch.bool, device=sh.device)
     sorts[scene.offset_rows] = False
-    quats, log_scales = sorted_axes(kept["gaussians.quats"][sorts].numpy(), kept["gaussians.log_scales"][sorts].numpy())
+    quats, log_scales = sorted_axes(
+        kept["gaussians.quats"][sorts].numpy(), kept["gaussians.log_scales"][sorts].numpy()
+    )
     for name, values in (("gaussians.quats", quats), ("gaussians.log_scales", log_scales)):
         kept[name] = kept[name].clone()
         kept[name][sorts] = torch.from_numpy(values).to(kept[name])
@@ -243,20 +266,22 @@ def drawable(scene: Renderable) -> dict[str, Tensor]:
 def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors of a checkpoint that can be drawn, but not trained on, from stored ones.
 
-    Raises KeyError: one is missing that every scene of Gaussians has. ValueError: the tensors of these do not fit
-    together. Those of triangles are looked at where they are restored.
+    Raises KeyError: one is missing that every scene of Gaussians has. ValueError: the tensors of
+    these do not fit together. Those of triangles are looked at where they are restored.
     """
     full = dict(tensors)
     if TRIANGLES in full:
         return full
-    base, rest = full.pop("gaussians.sh_base"), full.pop("gaussians.sh_rest")
+    base = full.pop("gaussians.sh_base")
+    rest = full.pop("gaussians.sh_rest")
     full["gaussians.sh"] = torch.cat([base[:, None], rest], dim=1)
     Gaussians(**{name: full[f"gaussians.{name}"] for name in GAUSSIANS})  # they must fit together
     return full
 
 
 def stored_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
-    """Return the edit that puts Gaussians next to their neighbours in space, first those that a field moves.
+    """Return the edit that puts Gaussians next to their neighbours in space, first those that a
+    field moves.
 
     ``means``: (N, 3) as they will be read again, which decide the order.
     """
@@ -264,7 +289,8 @@ def stored_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
 
 
 def group_of(name: str, x: Tensor) -> str | None:
-    """Return the name of the group that shares a step, without the number at its end; None where there is no step."""
+    """Return the name of the group that shares a step, without the number at its end; None where
+    there is no step."""
     if x.dtype != torch.float32 or name in (RELATIVE, POSITIVE) or name in FIXED_STEPS:
         return None
     if x.numel() <= FEW and not name.startswith("gaussians."):
@@ -272,11 +298,13 @@ def group_of(name: str, x: Tensor) -> str | None:
     return name.rstrip("0123456789")
 
 
-def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness: bool = False) -> Coding:
+def coding_of(
+    name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness: bool = False
+) -> Coding:
     """Return the coding of a tensor.
 
-    ``steps``: group (or name, where it has none) to the largest step, 0 for none: stored as it is; a group that lacks
-    is stored in half precision.
+    ``steps``: group (or name, where it has none) to the largest step, 0 for none: stored as it is;
+    a group that lacks is stored in half precision.
     """
     if name == POSITIVE or steps.get(group_of(name, x) or name) == 0:
         return Coding(TensorKind.EXACT)
@@ -288,23 +316,30 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
         return Coding(TensorKind.HALF if fits else TensorKind.EXACT)
     kind = _KINDS.get(name, TensorKind.GRID)
     low, high = _LIMITS.get(kind, (SMALLEST_STEP, LARGEST_STEP))
-    low = max(low, FINEST_ROTATION) if kind is TensorKind.ROTATION else low  # files with finer ones are still read
+    # files with finer ones are still read
+    low = max(low, FINEST_ROTATION) if kind is TensorKind.ROTATION else low
     step = step_below(min(max(steps[group], low), high))
-    if kind in (TensorKind.GRID, TensorKind.SPARSE) and int((x.abs() >= LIMIT * step).sum()) > MOST_FAR * x.numel():
+    if (
+        kind in (TensorKind.GRID, TensorKind.SPARSE)
+        and int((x.abs() >= LIMIT * step).sum()) > MOST_FAR * x.numel()
+    ):
         return Coding(TensorKind.EXACT)
     return Coding(kind, step, by_coarseness and name in _BY_COARSENESS)
 
 
 def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Whole:
     """Return ``x`` as integers; ``coarseness`` (N,) of its rows, where they have any."""
-    values, far = x.detach().contiguous().numpy(), np.zeros((0, 2), dtype=np.int64)
+    values = x.detach().contiguous().numpy()
+    far = np.zeros((0, 2), dtype=np.int64)
     if coding.kind is TensorKind.ROTATION:
         numbers = rotations_to_grid(values, coding.step)
     elif coding.kind is TensorKind.OPACITY:
         numbers = opacities_to_grid(values, coding.step)
     elif coding.kind in (TensorKind.GRID, TensorKind.SPARSE):
         steps = coding.steps(coarseness, values.ndim)
-        numbers, out = to_grid(values, steps, SPARSE if coding.kind is TensorKind.SPARSE else NEAREST)
+        numbers, out = to_grid(
+            values, steps, SPARSE if coding.kind is TensorKind.SPARSE else NEAREST
+        )
         index = np.flatnonzero(out)
         bits = values.astype(np.float32).ravel()[index].view(np.int32)
         far = np.stack([index, bits.astype(np.int64)], axis=1)
@@ -313,7 +348,9 @@ def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) ->
     return Whole(numbers.astype(np.int64), far)
 
 
-def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.ndarray | None = None) -> Tensor:
+def from_whole(
+    whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.ndarray | None = None
+) -> Tensor:
     """Return the tensor that ``to_whole`` turned into integers.
 
     Raises ValueError, OverflowError: numbers that ``to_whole`` does not make.
@@ -326,7 +363,10 @@ def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.
         steps = coding.steps(coarseness, whole.numbers.ndim)
         # numbers that were laid out by columns are no flat array until they are copied into one
         values = np.ascontiguousarray(from_grid(whole.numbers, steps), dtype=np.float32)
-        if len(whole.far) and not 0 <= int(whole.far[:, 0].min()) <= int(whole.far[:, 0].max()) < values.size:
+        if (
+            len(whole.far)
+            and not 0 <= int(whole.far[:, 0].min()) <= int(whole.far[:, 0].max()) < values.size
+        ):
             raise ValueError("a value lies outside its tensor")
         values.reshape(-1)[whole.far[:, 0]] = whole.far[:, 1].astype(np.int32).view(np.float32)
         return torch.from_numpy(values).to(dtype)

@@ -1,4 +1,5 @@
-"""The files of a report, and its plot as SVG and PNG, drawn by matplotlib, of the extra ``plots``."""
+"""The files of a report, and its plot as SVG and PNG, drawn by matplotlib, of the extra
+``plots``."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ def can_plot() -> bool:
 
 
 def svg_of(figure: Figure) -> str:
-    """Return a figure as an SVG element, whose points have their labels as tooltips; equal figures give equal text."""
+    """Return a figure as an SVG element, whose points have their labels as tooltips; equal figures
+    give equal text."""
     import matplotlib
 
     file = io.StringIO()
@@ -30,7 +32,9 @@ def svg_of(figure: Figure) -> str:
         figure.savefig(file, format="svg", metadata={"Date": None})
     text = file.getvalue()
     text = text[text.index("<svg") :]
-    for tip in {str(line.get_gid()) for axes in figure.axes for line in axes.lines if line.get_gid()}:
+    for tip in {
+        str(line.get_gid()) for axes in figure.axes for line in axes.lines if line.get_gid()
+    }:
         text = text.replace(f'<g id="{tip}">', f"<g><title>{escape(tip)}</title>")
     return text
 
@@ -41,8 +45,11 @@ def png_of(figure: Figure) -> bytes:
     return file.getvalue()
 
 
-def write_files(stem: Path, texts: Mapping[str, str], svg: str, figure: Figure | None) -> list[Path]:
-    """Write ``texts`` by their suffixes and the plot, if there is one, beside each other; return their paths.
+def write_files(
+    stem: Path, texts: Mapping[str, str], svg: str, figure: Figure | None
+) -> list[Path]:
+    """Write ``texts`` by their suffixes and the plot, if there is one, beside each other; return
+    their paths.
 
     ``stem`` is the path without a suffix, ``svg`` the ``figure`` as a page has it.
     """

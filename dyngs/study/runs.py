@@ -1,4 +1,5 @@
-"""The runs of a study: one after another here, or by Ray on as many machines as a cluster has; none is made twice."""
+"""The runs of a study: one after another here, or by Ray on as many machines as a cluster has; none
+is made twice."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ R = TypeVar("R")
 
 
 def finished(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> Path:
-    """Train the run in folder ``out`` to its end, from its last checkpoint if there is one; return ``out``.
+    """Train the run in folder ``out`` to its end, from its last checkpoint if there is one; return
+    ``out``.
 
     A run that goes on keeps its own length, which a time limit may have changed.
     """
@@ -37,8 +39,9 @@ def done_in_turn(
 ) -> Iterator[tuple[T, R | DyngsError]]:
     """Yield each task and what ``do`` makes of it, or why it cannot, as they end.
 
-    ``ray_cores``: Ray does them at the same time, with so many cores set aside for each, on this machine or on the
-    cluster that ``RAY_ADDRESS`` names, whose machines share the file system; None: here, one after another.
+    ``ray_cores``: Ray does them at the same time, with so many cores set aside for each, on this
+    machine or on the cluster that ``RAY_ADDRESS`` names, whose machines share the file system;
+    None: here, one after another.
     """
     if ray_cores is None:
         for task in tasks:

@@ -34,7 +34,8 @@ class Speed:
 
     Attributes:
         ms: milliseconds per image.
-        gain: speed relative to the first drawing, over pairs of renders taken right after each other.
+        gain: speed relative to the first drawing, over pairs of renders taken right after each
+            other.
     """
 
     __pydantic_config__ = AS_STORED
@@ -42,8 +43,11 @@ class Speed:
     gain: Quartiles
 
 
-def time_interleaved(drawings: Sequence[Drawing], images: Sequence[Image], rounds: int) -> list[Speed]:
-    """Return the speed of each drawing, relative to the first one; arguments as for ``seconds_in_turn``."""
+def time_interleaved(
+    drawings: Sequence[Drawing], images: Sequence[Image], rounds: int
+) -> list[Speed]:
+    """Return the speed of each drawing, relative to the first one; arguments as for
+    ``seconds_in_turn``."""
     seconds = seconds_in_turn(drawings, images, rounds)
     return [Speed(ms=quartiles(1e3 * own), gain=quartiles(seconds[0] / own)) for own in seconds]
 

@@ -1,4 +1,5 @@
-"""Files of a study: results, so that nothing is measured twice, and what the study is about, so that none are mixed."""
+"""Files of a study: results, so that nothing is measured twice, and what the study is about, so
+that none are mixed."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ def write_stored(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def require_same_study(path: Path, facts: Mapping[str, object], compared: Sequence[str]) -> None:
-    """Note what a study is about in the file ``path`` of its folder, or compare it with what is noted there.
+    """Note what a study is about in the file ``path`` of its folder, or compare it with what is
+    noted there.
 
     Raises:
         DyngsError: one of the ``compared`` facts differs; names those that do.
@@ -42,13 +44,23 @@ def require_same_study(path: Path, facts: Mapping[str, object], compared: Sequen
     except (ValueError, RecursionError):
         known = None
     if not isinstance(known, dict):
-        raise DyngsError(f"{path}: cannot be read, so what its folder holds is not known; give another --out")
+        raise DyngsError(
+            f"{path}: cannot be read, so what its folder holds is not known; give another --out"
+        )
     here = json.loads(json.dumps(facts))
     differing = [key for key in compared if known.get(key) != here[key]]
     if differing:
-        told = (f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here" for key in differing)
-        raise DyngsError(f"{path.parent}: holds another study ({'; '.join(told)}); give another --out")
+        told = (
+            f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
+            for key in differing
+        )
+        raise DyngsError(
+            f"{path.parent}: holds another study ({'; '.join(told)}); give another --out"
+        )
 
 
 def _shown(value: object) -> str:
-    return printable(", ".join(map(str, value)) if isinstance(value, list) else str(value), 80) or "none"
+    return (
+        printable(", ".join(map(str, value)) if isinstance(value, list) else str(value), 80)
+        or "none"
+    )

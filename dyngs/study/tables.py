@@ -37,7 +37,9 @@ def _no_formula(value: object) -> object:
     return escaped(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
 
 
-def html_table(head: Sequence[str], cells: Sequence[Sequence[str]], marked: Sequence[bool] = ()) -> str:
+def html_table(
+    head: Sequence[str], cells: Sequence[Sequence[str]], marked: Sequence[bool] = ()
+) -> str:
     """Return a table; ``marked``: which rows stand out."""
     marks = marked or [False] * len(cells)
     lines = [_line("td", row, mark=mark) for row, mark in zip(cells, marks, strict=True)]

@@ -1,1 +1,2 @@
-"""Quality, speed and size of a run with other settings, measured, and the best run that meets requirements."""
+"""Quality, speed and size of a run with other settings, measured, and the best run that meets
+requirements."""

@@ -1,4 +1,5 @@
-"""Quality and speed of variants, measured by rendering them, and files of that, so that nothing is measured twice."""
+"""Quality and speed of variants, measured by rendering them, and files of that, so that nothing is
+measured twice."""
 
 from __future__ import annotations
 
@@ -28,8 +29,10 @@ class Measurement:
     Attributes:
         psnr, ssim, lpips: means over the views; LPIPS is None where it cannot be computed.
         num_gaussians: of curved triangles theirs.
-        mb: 1e6 bytes on disk: the .dyngs file, or 4 bytes per value needed for rendering where nothing is quantised.
-        memory_mb: largest growth of a process that loads and renders the variant, 1e6 bytes; None where unknown.
+        mb: 1e6 bytes on disk: the .dyngs file, or 4 bytes per value needed for rendering where
+            nothing is quantised.
+        memory_mb: largest growth of a process that loads and renders the variant, 1e6 bytes; None
+            where unknown.
         speed: None until it is measured.
     """
 
@@ -62,7 +65,8 @@ def write_measurement(path: Path, measurement: Measurement) -> None:
 
 
 def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
-    """Return which points are on the Pareto front: no other is as good in all goals and better in one."""
+    """Return which points are on the Pareto front: no other is as good in all goals and better in
+    one."""
     return [not any(_dominates(other, own) for other in goals) for own in goals]
 
 
@@ -72,12 +76,16 @@ def on_front(measurements: Sequence[Measurement]) -> list[bool]:
 
 
 def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
-    return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))
+    return all(x >= y for x, y in zip(a, b, strict=True)) and any(
+        x > y for x, y in zip(a, b, strict=True)
+    )
 
 
 def with_render_settings(variant: Variant, model: ModelSection) -> ModelSection:
     """Return the ``model`` section of a run with the render settings of a variant."""
-    changes = {"rasterize_mode" if name == "mode" else name: value for name, value in variant.drawn.items()}
+    changes = {
+        "rasterize_mode" if name == "mode" else name: value for name, value in variant.drawn.items()
+    }
     return model.model_copy(update=changes)
 
 
@@ -86,11 +94,17 @@ def variant_drawing(variant: Variant, scene: Renderable, background: Tensor) -> 
     return Drawing(scene, replace(scene.options, **variant.drawn), background, variant.scale)
 
 
-def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> tuple[float, float, float | None]:
-    """Return mean PSNR, SSIM and LPIPS (None where unknown) over images, each rendered at its own time."""
-    psnrs, ssims, distances = [], [], []
+def measure_quality(
+    drawing: Drawing, images: Iterable[Image], lpips: Lpips
+) -> tuple[float, float, float | None]:
+    """Return mean PSNR, SSIM and LPIPS (None where unknown) over images, each rendered at its own
+    time."""
+    psnrs = []
+    ssims = []
+    distances = []
     for image in images:
-        rendered, truth = drawing.image(image.cameras, image.time), image.composite(drawing.background)
+        rendered = drawing.image(image.cameras, image.time)
+        truth = image.composite(drawing.background)
         if not bool(rendered.isfinite().all()):
             raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
         psnrs.append(psnr(rendered, truth, image.mask))

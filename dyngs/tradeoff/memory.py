@@ -1,6 +1,8 @@
-"""Memory needed for rendering, measured in child processes; run as a program, this module is their parent.
+"""Memory needed for rendering, measured in child processes; run as a program, this module is their
+parent.
 
-The peak of a process never falls, so several variants measured in one process would all show that of the largest.
+The peak of a process never falls, so several variants measured in one process would all show that
+of the largest.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ class MemoryMeter:
     def peak_megabytes(
         self, folder: Path, variant: Variant, images: Sequence[Image], background: Tensor
     ) -> float | None:
-        """Return the largest growth of resident memory, 1e6 bytes, while loading a run and rendering on one thread.
+        """Return the largest growth of resident memory, 1e6 bytes, while loading a run and
+        rendering on one thread.
 
         Counted from the loaded program, before any file is read. None where it cannot be measured.
 
@@ -67,7 +70,11 @@ class MemoryMeter:
             }
             for image in images
         ]
-        request = {"folder": str(folder.absolute()), "variant": variant.changes, "background": background.tolist()}
+        request = {
+            "folder": str(folder.absolute()),
+            "variant": variant.changes,
+            "background": background.tolist(),
+        }
         try:
             process.stdin.write(json.dumps(request | {"views": views}) + "\n")
             process.stdin.flush()
@@ -76,11 +83,14 @@ class MemoryMeter:
             return None
 
     def _started(self) -> subprocess.Popen[str] | None:
-        """Return the process, started by the first measurement; in a session of its own, so that Ctrl-C spares it."""
+        """Return the process, started by the first measurement; in a session of its own, so that
+        Ctrl-C spares it."""
         if self._process is None and _STATUS.is_file():
             command = python_command("dyngs.tradeoff.memory")
             pipe = subprocess.PIPE
-            self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
+            self._process = subprocess.Popen(
+                command, stdin=pipe, stdout=pipe, text=True, start_new_session=True
+            )
         return self._process
 
 
@@ -105,13 +115,19 @@ def _measure(request: dict[str, Any]) -> None:
         background = torch.tensor(request["background"], device="cpu")
         drawing = variant_drawing(variant, run.renderable, background)
         for view in request["views"]:
-            pose, intrinsics = (torch.tensor(view[name], device="cpu") for name in ("pose", "intrinsics"))
+            pose, intrinsics = (
+                torch.tensor(view[name], device="cpu") for name in ("pose", "intrinsics")
+            )
             drawing.image(Cameras(pose, intrinsics, *view["size"]), view["time"])
     print(1024e-6 * (_kilobytes("VmHWM") - before), flush=True)
 
 
 def _kilobytes(name: str) -> int:
-    line = next(line for line in _STATUS.read_text(encoding="ascii").splitlines() if line.startswith(f"{name}:"))
+    line = next(
+        line
+        for line in _STATUS.read_text(encoding="ascii").splitlines()
+        if line.startswith(f"{name}:")
+    )
     return int(line.split()[1])
 
 

@@ -21,8 +21,8 @@ class ExchangeRate:
 
     Attributes:
         setting: its name, "prune + finetune" if fine-tuned, "storage + field_step".
-        db_per_speed, db_per_size: PSNR lost per doubled speed and per halved size; None where no value of the setting
-            gains any. Negative: quality improves as well.
+        db_per_speed, db_per_size: PSNR lost per doubled speed and per halved size; None where no
+            value of the setting gains any. Negative: quality improves as well.
         speed, size: largest gains of its values, as factors.
     """
 
@@ -40,13 +40,19 @@ def rate(loss: float, factor: float) -> float | None:
 
 
 def slope(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
-    """Return dB lost per factor 2: the least-squares line through no loss at factor 1; None if nothing is gained."""
-    pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors if math.log2(factor) >= MIN_DOUBLINGS]
+    """Return dB lost per factor 2: the least-squares line through no loss at factor 1; None if
+    nothing is gained."""
+    pairs = [
+        (loss, math.log2(factor))
+        for loss, factor in losses_and_factors
+        if math.log2(factor) >= MIN_DOUBLINGS
+    ]
     return sum(loss * x for loss, x in pairs) / sum(x * x for _, x in pairs) if pairs else None
 
 
 def exchange_rates(base: Measurement, measurements: Iterable[Measurement]) -> list[ExchangeRate]:
-    """Return the exchange rate of each setting, from the variants that change it alone, in order of appearance."""
+    """Return the exchange rate of each setting, from the variants that change it alone, in order of
+    appearance."""
     groups: dict[str, list[Measurement]] = {}
     for m in measurements:
         if m.variant.setting not in ("", SEVERAL):
@@ -66,13 +72,14 @@ def exchange_rates(base: Measurement, measurements: Iterable[Measurement]) -> li
 def combinations(base: Measurement, singles: Sequence[Measurement], count: int) -> list[Variant]:
     """Return combinations of single changes worth measuring next.
 
-    There are three greedy sequences, of ``count`` each: for speed, for size, and for both. Each starts at the run and
-    adds the change that loses the least PSNR per factor 2, then the next; a stronger value of a setting, which comes
-    later in ``singles``, replaces a weaker one.
+    There are three greedy sequences, of ``count`` each: for speed, for size, and for both. Each
+    starts at the run and adds the change that loses the least PSNR per factor 2, then the next; a
+    stronger value of a setting, which comes later in ``singles``, replaces a weaker one.
     """
     sequences: list[list[tuple[float, Measurement]]] = [[], [], []]
     for m in singles:
-        loss, smaller = base.psnr - m.psnr, base.mb / m.mb
+        loss = base.psnr - m.psnr
+        smaller = base.mb / m.mb
         if loss > MAX_LOSS_DB:
             continue
         for sequence, gain in zip(sequences, (m.gain, smaller, m.gain * smaller), strict=True):
@@ -90,14 +97,19 @@ def combinations(base: Measurement, singles: Sequence[Measurement], count: int) 
     return list(found)
 
 
-def _accumulated(start: Variant, changes: Iterable[Variant], order: Sequence[Variant]) -> list[Variant]:
-    """Return combinations of two and more changes, each with one change more than the one before."""
-    steps, now = [], start
+def _accumulated(
+    start: Variant, changes: Iterable[Variant], order: Sequence[Variant]
+) -> list[Variant]:
+    """Return combinations of two and more changes, each with one change more than the one
+    before."""
+    steps = []
+    now = start
     strongest: dict[str, int] = {}
     for change in changes:
         (setting,), strength = change.settings, order.index(change)
         if strength > strongest.get(setting, -1):
-            now, strongest[setting] = now.merged(change), strength
+            now = now.merged(change)
+            strongest[setting] = strength
             if len(now.settings) > 1:
                 steps.append(now)
     return steps

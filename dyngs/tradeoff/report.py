@@ -19,17 +19,30 @@ _UNDER_PLOT = (
     "<p>Thick lines: Pareto fronts of the two axes. Thin lines: the values of one setting in their order. "
     "Hover over a point for its name.</p>"
 )
-_HEAD = ("changed", "PSNR dB", "SSIM", "LPIPS", "fps", "times as fast (quartiles)", "MB", "memory MB", "number")
+_HEAD = (
+    "changed",
+    "PSNR dB",
+    "SSIM",
+    "LPIPS",
+    "fps",
+    "times as fast (quartiles)",
+    "MB",
+    "memory MB",
+    "number",
+)
 _COSTS = ("dB lost per doubled speed", "dB lost per halved size")
 EXCHANGE_HEAD = ("setting", *_COSTS, "most speed, times", "most size, times")
 
 
 def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
-    """Write ``tradeoff.csv``, ``.json`` and ``.html``, with matplotlib ``.svg`` and ``.png``, too; return their paths.
+    """Write ``tradeoff.csv``, ``.json`` and ``.html``, with matplotlib ``.svg`` and ``.png``, too;
+    return their paths.
 
-    The page needs no other files and no network. ``measurements`` have speeds, the run itself comes first.
+    The page needs no other files and no network. ``measurements`` have speeds, the run itself comes
+    first.
     """
-    rows, rates = table_rows(measurements), exchange_rates(measurements[0], measurements)
+    rows = table_rows(measurements)
+    rates = exchange_rates(measurements[0], measurements)
     figure = plot(rows) if can_plot() else None
     svg = "" if figure is None else svg_of(figure)
     values = {
@@ -46,7 +59,10 @@ def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
 
 
 def exchange_cells(rate: ExchangeRate) -> tuple[str, ...]:
-    costs = ("no gain" if cost is None else f"{cost:+.2f}" for cost in (rate.db_per_speed, rate.db_per_size))
+    costs = (
+        "no gain" if cost is None else f"{cost:+.2f}"
+        for cost in (rate.db_per_speed, rate.db_per_size)
+    )
     return rate.setting, *costs, f"{rate.speed:.2f}", f"{rate.size:.2f}"
 
 

@@ -1,4 +1,5 @@
-"""Measure a run and its variants: one setting at a time, then combinations. Finished measurements are kept."""
+"""Measure a run and its variants: one setting at a time, then combinations. Finished measurements
+are kept."""
 
 from __future__ import annotations
 
@@ -74,7 +75,8 @@ class Plan:
 def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Measurement]:
     """Return the measurements of all variants, the run itself first.
 
-    Each is kept as a file in ``runs.out / "points"`` and not made again; ``log`` is called with a line per measurement.
+    Each is kept as a file in ``runs.out / "points"`` and not made again; ``log`` is called with a
+    line per measurement.
 
     Raises:
         DyngsError: no such run or split, or the folder holds measurements of another run.
@@ -85,7 +87,9 @@ def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Mea
         own = run_settings(runs.run_dir)  # refuses what cannot be varied before anything is written
         session = _Session(runs, plan, meter, log)
         _require_same_source(runs, plan)
-        idle = [s.name for s in plan.settings if not any(is_change(own, s, value) for value in s.values)]
+        idle = [
+            s.name for s in plan.settings if not any(is_change(own, s, value) for value in s.values)
+        ]
         if idle:
             log(f"nothing to vary in this run: {', '.join(idle)}")
         singles = [Variant(), *single_changes(plan.settings, own, plan.finetune)]
@@ -101,17 +105,22 @@ def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Mea
 class _Session:
     """Measures variants on the views of one split."""
 
-    def __init__(self, runs: VariantRuns, plan: Plan, meter: MemoryMeter, log: Callable[[str], None]) -> None:
+    def __init__(
+        self, runs: VariantRuns, plan: Plan, meter: MemoryMeter, log: Callable[[str], None]
+    ) -> None:
         config = load_resolved(runs.run_dir)
         self._runs, self._plan, self._meter, self._log = runs, plan, meter, log
         self._capture = read_capture_of(config.data, load_run(runs.run_dir).info)
         self._loader = ImageLoader(split_views(self._capture, plan.split), config.data)
         self._loader.device = plan.device
-        self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1].to(plan.device)
+        self._background = evaluation_background(config.data.background, self._capture.has_alpha)[
+            1
+        ].to(plan.device)
         self._lpips = load_lpips("alex", plan.device)
 
     def measured(self, variants: Sequence[Variant]) -> list[Measurement]:
-        """Return measurements of all: first without their speeds, which are then measured in turn."""
+        """Return measurements of all: first without their speeds, which are then measured in
+        turn."""
         self._time([self._measurement(variant) for variant in variants])
         return [self._measurement(variant) for variant in variants]
 
@@ -120,7 +129,8 @@ class _Session:
         path = self._path(variant)
         if path.is_file():
             return read_measurement(path)
-        folder, drawing = self._runs.folder(variant), self._drawing(variant)
+        folder = self._runs.folder(variant)
+        drawing = self._drawing(variant)
         images = (self._loader[i] for i in range(len(self._loader)))
         psnr, ssim, lpips = measure_quality(drawing, images, self._lpips)
         shown = self._images(MEMORY_VIEWS)
@@ -133,7 +143,9 @@ class _Session:
             lpips=lpips,
             num_gaussians=_number_of(drawing.scene, variant),
             mb=megabytes_on_disk(folder),
-            memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background) if on_cpu else None,
+            memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background)
+            if on_cpu
+            else None,
         )
         write_measurement(path, measurement)
         noun = "triangle" if isinstance(drawing.scene, TriangleScene) else "Gaussian"
@@ -143,7 +155,8 @@ class _Session:
 
     def _time(self, measurements: Sequence[Measurement]) -> None:
         """Measure and store the missing speeds, interleaved with the first variant."""
-        first, missing = measurements[0], [m for m in measurements[1:] if m.speed is None]
+        first = measurements[0]
+        missing = [m for m in measurements[1:] if m.speed is None]
         groups = [missing[i : i + SERIES] for i in range(0, len(missing), SERIES)]
         if first.speed is None and not groups:
             groups = [[]]
@@ -151,7 +164,9 @@ class _Session:
         for group in groups:
             self._log(f"timing {counted(len(group) + 1, 'variant')} in turn")
             together = [first, *group]
-            speeds = time_interleaved([self._drawing(m.variant) for m in together], images, self._plan.rounds)
+            speeds = time_interleaved(
+                [self._drawing(m.variant) for m in together], images, self._plan.rounds
+            )
             for m, speed in zip(together, speeds, strict=True):
                 if m.speed is None:
                     write_measurement(self._path(m.variant), replace(m, speed=speed))
@@ -170,11 +185,14 @@ class _Session:
 
 
 def _number_of(scene: Renderable, variant: Variant) -> int:
-    return len(scene if isinstance(scene, TriangleScene) else require_gaussians(scene, variant.slug))
+    return len(
+        scene if isinstance(scene, TriangleScene) else require_gaussians(scene, variant.slug)
+    )
 
 
 def _require_same_source(runs: VariantRuns, plan: Plan) -> None:
-    """Compare checkpoint, split and device with those of earlier measurements in the folder, or note them there."""
+    """Compare checkpoint, split and device with those of earlier measurements in the folder, or
+    note them there."""
     newest = checkpoint_paths(runs.run_dir)[-1]
     source = {
         "run": str(runs.run_dir.absolute()),

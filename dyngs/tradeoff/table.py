@@ -1,4 +1,5 @@
-"""The table of a sweep, one row per measured variant, and the best row that meets requirements (``psnr>=30,mb<=5``)."""
+"""The table of a sweep, one row per measured variant, and the best row that meets requirements
+(``psnr>=30,mb<=5``)."""
 
 from __future__ import annotations
 
@@ -18,11 +19,14 @@ _CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
 
 @dataclass(frozen=True)
 class TableRow:
-    """A measured variant, see ``Measurement``. The fields but ``variant``, after its name, are the columns of the .csv.
+    """A measured variant, see ``Measurement``. The fields but ``variant``, after its name, are the
+    columns of the .csv.
 
     Attributes:
-        fps: frames per second of the run itself times ``gain``, so that variants timed at another hour compare.
-        gain, gain_low, gain_high: speed relative to the run: median and quartiles of interleaved pairs.
+        fps: frames per second of the run itself times ``gain``, so that variants timed at another
+            hour compare.
+        gain, gain_low, gain_high: speed relative to the run: median and quartiles of interleaved
+            pairs.
         ms: median time of one image as measured.
         on_front: on the Pareto front of PSNR, speed and size.
     """
@@ -48,7 +52,9 @@ class TableRow:
     @property
     def columns(self) -> dict[str, str | float | None]:
         """Names and values of the columns."""
-        return {"name": self.name} | {f.name: getattr(self, f.name) for f in fields(self) if f.name != "variant"}
+        return {"name": self.name} | {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name != "variant"
+        }
 
     def metric(self, name: str) -> float | None:
         """Return the value of one of ``METRICS``; None where it was not measured."""
@@ -105,7 +111,8 @@ class Goal:
     smallest: bool
 
     def cost(self, row: TableRow) -> float:
-        """Return a value that is smaller for better rows, infinite where the metric was not measured."""
+        """Return a value that is smaller for better rows, infinite where the metric was not
+        measured."""
         value = row.metric(self.name)
         return math.inf if value is None else value if self.smallest else -value
 
@@ -127,7 +134,8 @@ def _require_metric(name: str, option: str) -> None:
 
 
 def choose(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: Goal) -> TableRow:
-    """Return the best row among those that meet all requirements; of equally good ones that with the higher PSNR."""
+    """Return the best row among those that meet all requirements; of equally good ones that with
+    the higher PSNR."""
     fitting = [row for row in rows if all(r.is_met(row) for r in requirements)]
     if not fitting:
         raise DyngsError(_explanation(rows, requirements, goal))
@@ -135,9 +143,12 @@ def choose(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: 
 
 
 def _requirement(part: str) -> Requirement:
-    match, shown = _CONDITION.match(part), printable(part.strip(), 60)
+    match = _CONDITION.match(part)
+    shown = printable(part.strip(), 60)
     if match is None:
-        raise DyngsError(f"--require {shown!r} is no condition; write for instance psnr>=30,fps>=20,mb<=5")
+        raise DyngsError(
+            f"--require {shown!r} is no condition; write for instance psnr>=30,fps>=20,mb<=5"
+        )
     name, sign, number = match.groups()
     _require_metric(name, f"--require {shown}")
     try:
@@ -150,11 +161,16 @@ def _requirement(part: str) -> Requirement:
 
 
 def _explanation(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: Goal) -> str:
-    """Return one line: the best value per requirement with the others met, or, if there is none, on its own."""
+    """Return one line: the best value per requirement with the others met, or, if there is none, on
+    its own."""
     relaxed = []
     for binding in requirements:
         others = [r for r in requirements if r is not binding]
-        fitting = [row for row in rows if all(r.is_met(row) for r in others) and row.metric(binding.name) is not None]
+        fitting = [
+            row
+            for row in rows
+            if all(r.is_met(row) for r in others) and row.metric(binding.name) is not None
+        ]
         if fitting:
             own = Goal(binding.name, binding.at_most)
             nearest = min(fitting, key=lambda row: (own.cost(row), goal.cost(row)))

@@ -45,7 +45,8 @@ NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)
 
 @dataclass(frozen=True)
 class VariantRuns:
-    """The run folders of a run and of its variants; ``threads`` 0: all cores; ``device`` trains and prunes."""
+    """The run folders of a run and of its variants; ``threads`` 0: all cores; ``device`` trains and
+    prunes."""
 
     run_dir: Path
     out: Path
@@ -58,7 +59,8 @@ class VariantRuns:
         return [*NO_BUDGET, f"run.threads={self.threads}", f"run.device={self.device}"]
 
     def folder(self, variant: Variant) -> Path:
-        """Return the run folder of a variant without its render settings; it is made if it does not exist.
+        """Return the run folder of a variant without its render settings; it is made if it does not
+        exist.
 
         After Ctrl-C while training, the next call continues.
         """
@@ -93,28 +95,37 @@ class VariantRuns:
         out = self.out / "training" / wanted.slug
         run = load_resolved(self.run_dir)
         changes = [*field_changes(run, wanted)]
-        if run.model.may_move:  # a variant is what it says: nothing is chosen, and it stays a moving scene
+        if run.model.may_move:
+            # a variant is what it says: nothing is chosen, and it stays a moving scene
             changes += ["model.choose=false"]
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
         if isinstance(run.model, BgTriangleModel):
             sizes = {name: getattr(run.model, name) for name in ("max_triangles", "num_first")}
-            changes += [f"model.{name}={max(4, round(wanted.triangles * size))}" for name, size in sizes.items()]
+            changes += [
+                f"model.{name}={max(4, round(wanted.triangles * size))}"
+                for name, size in sizes.items()
+            ]
         changes += [*self._where, f"run.dir={out}"]
         return finished(load_resolved(self.run_dir, changes), out)
 
     def _finetuned(self, wanted: Variant) -> Path:
-        source, out = self.folder(wanted.trained), self.out / "training" / wanted.slug
+        source = self.folder(wanted.trained)
+        out = self.out / "training" / wanted.slug
         if checkpoint_paths(out):
             return finished(load_resolved(out), out)
         steps = [*self._where, f"prune.steps={wanted.finetune}"]
-        return prune_run(source, out, [*_pruning_overrides(wanted, load_resolved(source).prune), *steps])
+        return prune_run(
+            source, out, [*_pruning_overrides(wanted, load_resolved(source).prune), *steps]
+        )
 
     def _pruned(self, source: Path, wanted: Variant) -> tuple[Checkpoint, Config]:
         """Return the checkpoint after pruning and masking, without fine-tuning."""
         checkpoint = latest_checkpoint(source)
         changes = [f"train.steps={checkpoint.info.step}", *self._where]
-        config = load_resolved(source, [*changes, *_pruning_overrides(wanted, load_resolved(source).prune)])
+        config = load_resolved(
+            source, [*changes, *_pruning_overrides(wanted, load_resolved(source).prune)]
+        )
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, read_capture_of(config.data, checkpoint.info), restored=True)
             trainer.restore(checkpoint)
@@ -125,14 +136,22 @@ class VariantRuns:
 def run_settings(run_dir: Path) -> Settings:
     """Return what can be varied in a run. Raises DyngsError: nothing can."""
     if has_only_scene_file(run_dir):
-        raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from")
+        raise DyngsError(
+            f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from"
+        )
     config = load_resolved(run_dir)
     model = config.model
     own: dict[str, Value | None] = {"storage": None, "scale": 1.0}
     if isinstance(model, BgTriangleModel):
-        return own | {"triangles": 1.0} | {x: getattr(model, x) for x in ("sh_degree", "supersampling")}
+        return (
+            own
+            | {"triangles": 1.0}
+            | {x: getattr(model, x) for x in ("sh_degree", "supersampling")}
+        )
     if not isinstance(model, SceneModel):
-        raise DyngsError(f"{run_dir}: model.kind={model.kind} has neither Gaussians nor triangles to vary")
+        raise DyngsError(
+            f"{run_dir}: model.kind={model.kind} has neither Gaussians nor triangles to vary"
+        )
     scene = load_run(run_dir).scene
     own |= {
         "prune": 0.0,
@@ -149,7 +168,8 @@ def run_settings(run_dir: Path) -> Settings:
 
 
 def megabytes_on_disk(folder: Path) -> float:
-    """Return the size of the .dyngs file, or of what rendering needs of a checkpoint as float32, in 1e6 bytes."""
+    """Return the size of the .dyngs file, or of what rendering needs of a checkpoint as float32, in
+    1e6 bytes."""
     if has_only_scene_file(folder):
         return 1e-6 * (folder / SCENE_FILE).stat().st_size
     return 1e-6 * num_bytes_exact(load_run(folder).renderable)
@@ -160,12 +180,18 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
 
     A ``scale`` below 1 becomes a larger ``data.downscale`` and a smaller ``data.longest_side``.
     """
-    made, out = models.folder(variant), models.out / "chosen" / variant.slug
+    made = models.folder(variant)
+    out = models.out / "chosen" / variant.slug
     config = load_resolved(made)
-    model, data = with_render_settings(variant, config.model), config.data
+    model = with_render_settings(variant, config.model)
+    data = config.data
     if variant.scale < 1:
-        longest = None if data.longest_side is None else max(1, round(data.longest_side * variant.scale))
-        data = data.model_copy(update={"downscale": data.downscale / variant.scale, "longest_side": longest})
+        longest = (
+            None if data.longest_side is None else max(1, round(data.longest_side * variant.scale))
+        )
+        data = data.model_copy(
+            update={"downscale": data.downscale / variant.scale, "longest_side": longest}
+        )
     chosen = config.model_copy(update={"model": model, "data": data})
     if has_only_scene_file(made):
         write_scene(out / SCENE_FILE, (made / SCENE_FILE).read_bytes())
@@ -176,12 +202,17 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
 
 
 def _pruning_overrides(wanted: Variant, own: PruneConfig) -> Sequence[str]:
-    """Return overrides of the pruning stage; masks are those of the run where the variant has none."""
-    return f"prune.fraction={wanted.prune}", f"prune.mask_times={wanted.mask_times or own.mask_times}"
+    """Return overrides of the pruning stage; masks are those of the run where the variant has
+    none."""
+    return (
+        f"prune.fraction={wanted.prune}",
+        f"prune.mask_times={wanted.mask_times or own.mask_times}",
+    )
 
 
 def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
-    """Yield overrides for a field of another kind, which moves the same attributes, or of another size."""
+    """Yield overrides for a field of another kind, which moves the same attributes, or of another
+    size."""
     if not isinstance(config.model, DynamicModel):
         return
     field = config.model.deform
@@ -189,7 +220,11 @@ def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
     if kind != field.kind:
         given = field if isinstance(field, FieldSection) else FieldSection()
         section = section_class(DynamicModel.model_fields["deform"], kind)
-        moves = {name: getattr(given, name) for name in FieldSection.model_fields if name in section.model_fields}
+        moves = {
+            name: getattr(given, name)
+            for name in FieldSection.model_fields
+            if name in section.model_fields
+        }
         field = section(**moves)
         yield f"model.deform.kind={kind}"
         yield from (f"model.deform.{name}={str(value).lower()}" for name, value in moves.items())
@@ -200,16 +235,23 @@ def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
 
 def _with_degree(source: Path, degree: int) -> tuple[Checkpoint, Config]:
     """Return checkpoint and configuration without the spherical harmonics above ``degree``."""
-    checkpoint, config = latest_checkpoint(source), load_resolved(source)
-    name, count = "gaussians.sh", num_sh_terms(degree)
+    checkpoint = latest_checkpoint(source)
+    config = load_resolved(source)
+    name = "gaussians.sh"
+    count = num_sh_terms(degree)
     if isinstance(config.model, BgTriangleModel):
-        name, count = "triangles.harmonics", count - 1
+        name = "triangles.harmonics"
+        count = count - 1
     sh = checkpoint.tensors[name][:, :count].contiguous()
     cut = replace(checkpoint, tensors=checkpoint.tensors | {name: sh})
-    return cut, config.model_copy(update={"model": config.model.model_copy(update={"sh_degree": degree})})
+    return cut, config.model_copy(
+        update={"model": config.model.model_copy(update={"sh_degree": degree})}
+    )
 
 
-def _write(folder: Path, checkpoint: Checkpoint, config: Config, source: Path, *, whole: bool = False) -> None:
+def _write(
+    folder: Path, checkpoint: Checkpoint, config: Config, source: Path, *, whole: bool = False
+) -> None:
     """Write a run folder; the configuration comes last and marks it as complete.
 
     ``whole``: training can be resumed; otherwise optimizer, sampler and random state are left out.

@@ -27,12 +27,14 @@ class Variant:
 
     Attributes:
         colour, field: ``colour.kind`` and ``model.deform.kind`` to train with.
-        field_size: factor on the nodes, channels, neurons or frequencies of the field to train with.
+        field_size: factor on the nodes, channels, neurons or frequencies of the field to train
+            with.
         prune: fraction of the Gaussians removed, by ``sensitivity``.
         mask_times: key times of visibility masks.
         finetune: training steps after pruning and masking.
         sh_degree: higher spherical harmonics are dropped.
-        storage: allowed change of images by quantisation, grey levels of 255, or "auto"; None: float32.
+        storage: allowed change of images by quantisation, grey levels of 255, or "auto"; None:
+            float32.
         field_step: factor on the quantisation steps of the field.
         mode, alpha_min, transmittance_min: ``model.rasterize_mode`` and so on to render with.
         supersampling: the same of curved triangles.
@@ -60,27 +62,39 @@ class Variant:
     @property
     def changes(self) -> dict[str, Value]:
         """The fields that differ from the run; ``Variant(**changes)`` is the variant again."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        return {
+            f.name: getattr(self, f.name)
+            for f in fields(self)
+            if getattr(self, f.name) != f.default
+        }
 
     @property
     def name(self) -> str:
-        words = (f"{k}={value:g}" if isinstance(value, float) else f"{k}={value}" for k, value in self.changes.items())
+        words = (
+            f"{k}={value:g}" if isinstance(value, float) else f"{k}={value}"
+            for k, value in self.changes.items()
+        )
         return " ".join(words) or "as it is"
 
     @property
     def slug(self) -> str:
         """File name, different for different variants."""
-        exact = (f"{k}-{value!r}" if isinstance(value, float) else f"{k}-{value}" for k, value in self.changes.items())
+        exact = (
+            f"{k}-{value!r}" if isinstance(value, float) else f"{k}-{value}"
+            for k, value in self.changes.items()
+        )
         return "_".join(exact) or "as_it_is"
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Names of the changed settings; ``finetune`` and ``field_step`` belong to the ones before them."""
+        """Names of the changed settings; ``finetune`` and ``field_step`` belong to the ones before
+        them."""
         return tuple(name for name in self.changes if name not in ("finetune", "field_step"))
 
     @property
     def setting(self) -> str:
-        """The changed setting with what belongs to it; "" for the run itself, ``SEVERAL`` for combinations."""
+        """The changed setting with what belongs to it; "" for the run itself, ``SEVERAL`` for
+        combinations."""
         return SEVERAL if len(self.settings) > 1 else " + ".join(self.changes)
 
     @property
@@ -91,12 +105,21 @@ class Variant:
     @property
     def drawn(self) -> dict[str, Value]:
         """The changed options of a render, by name."""
-        return {name: RasterizeMode(x) if name == "mode" else x for name, x in self.changes.items() if name in _DRAWN}
+        return {
+            name: RasterizeMode(x) if name == "mode" else x
+            for name, x in self.changes.items()
+            if name in _DRAWN
+        }
 
     @property
     def trained(self) -> Variant:
         """The variant with only the changes that need training from scratch."""
-        return Variant(colour=self.colour, field=self.field, field_size=self.field_size, triangles=self.triangles)
+        return Variant(
+            colour=self.colour,
+            field=self.field,
+            field_size=self.field_size,
+            triangles=self.triangles,
+        )
 
     def merged(self, other: Variant) -> Variant:
         """Return this variant with the changes of ``other`` on top."""
@@ -177,7 +200,8 @@ def is_change(own: Settings, setting: Varied, value: Value) -> bool:
 
 
 def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Varied, ...]:
-    """Return the variations of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE``; without any, all with defaults.
+    """Return the variations of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE``; without any,
+    all with defaults.
 
     ``trains``: settings that need training from scratch are allowed.
     """
@@ -191,7 +215,9 @@ def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Varied, ...
             names = ", ".join(s.name for s in SETTINGS)
             raise DyngsError(f"--vary {printable(word, 60)}: no such setting; there are {names}")
         if setting.trains and not trains:
-            raise DyngsError(f"--vary {printable(word, 60)}: each value needs training from scratch; add --train")
+            raise DyngsError(
+                f"--vary {printable(word, 60)}: each value needs training from scratch; add --train"
+            )
         if name in found:
             raise DyngsError(f"--vary {name} is given twice; write --vary {name}=VALUE,VALUE")
         texts = re.split(r"\s*,\s*", listed.strip())
@@ -201,7 +227,8 @@ def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Varied, ...
 
 
 def single_changes(settings: Sequence[Varied], own: Settings, finetune: int) -> list[Variant]:
-    """Return one variant per setting and value that applies to a run; pruned and masked ones also with fine-tuning."""
+    """Return one variant per setting and value that applies to a run; pruned and masked ones also
+    with fine-tuning."""
     variants = []
     for setting in settings:
         name = setting.name

@@ -1,6 +1,7 @@
 """Typed events of training and their listeners.
 
-A progress bar, a log, limits on the result and a viewer are all listeners; training knows none of them.
+A progress bar, a log, limits on the result and a viewer are all listeners; training knows none of
+them.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ class Started:
 
 @dataclass(frozen=True)
 class StepDone:
-    """A step is done. Values outside the report are current when read: an earlier listener may have changed them."""
+    """A step is done. Values outside the report are current when read: an earlier listener may have
+    changed them."""
 
     report: StepReport  # of the step
     loop: Loop  # that did it; a viewer finds what is trained in ``loop.trainer``
@@ -108,7 +110,8 @@ class Saved:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Mean scores of a split after ``step``; they took ``seconds``, which do not count as training."""
+    """Mean scores of a split after ``step``; they took ``seconds``, which do not count as
+    training."""
 
     step: int
     split: str

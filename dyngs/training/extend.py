@@ -1,7 +1,9 @@
-"""A run that goes on to another number of steps: its configuration from there on, and what that means in words.
+"""A run that goes on to another number of steps: its configuration from there on, and what that
+means in words.
 
-All schedules become those of the new length, but what has begun keeps the step at which it did: nothing is begun twice,
-images do not become small again. Only harmonics (colour.kind=auto) may be measured a second time.
+All schedules become those of the new length, but what has begun keeps the step at which it did:
+nothing is begun twice, images do not become small again. Only harmonics (colour.kind=auto) may be
+measured a second time.
 """
 
 from __future__ import annotations
@@ -27,21 +29,29 @@ class Length:
     steps: int
 
     def kept(self, step: int | float) -> float:
-        """Return the fraction of the new length at which ``step`` of the old one lies, at most 1."""
+        """Return the fraction of the new length at which ``step`` of the old one lies, at most
+        1."""
         return min(step / self.steps, 1.0)
 
     def share(self, fraction: float) -> float:
-        """Return the fraction of the new length for what began, or shall begin, after ``fraction`` of a run."""
+        """Return the fraction of the new length for what began, or shall begin, after ``fraction``
+        of a run."""
         if self.done >= round(fraction * self.was):
             return self.kept(fraction * self.was)
-        return max(fraction, self.kept(self.done + 1)) if self.done >= round(fraction * self.steps) else fraction
+        return (
+            max(fraction, self.kept(self.done + 1))
+            if self.done >= round(fraction * self.steps)
+            else fraction
+        )
 
 
 def with_length(config: Config, done: int, steps: int) -> Config:
-    """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no limit of time holds.
+    """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no
+    limit of time holds.
 
     Raises:
-        DyngsError: so many steps are done already, the run was pruned, or its motion began too early for that length.
+        DyngsError: so many steps are done already, the run was pruned, or its motion began too
+            early for that length.
     """
     length = Length(done, config.train.steps, steps)
     if done > length.was:
@@ -50,7 +60,9 @@ def with_length(config: Config, done: int, steps: int) -> Config:
             "longer; go on with the run before that, and prune again"
         )
     if steps <= done:
-        raise DyngsError(f"train.steps={steps}: {counted(done, 'step')} are done already; give more than that")
+        raise DyngsError(
+            f"train.steps={steps}: {counted(done, 'step')} are done already; give more than that"
+        )
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
     match config.model:
@@ -78,11 +90,14 @@ def _require_exposures_stay(config: Config, length: Length) -> None:
 
 def told(before: Config, after: Config, done: int) -> str:
     """Return the line that says how a run goes on after ``done`` steps."""
-    was, steps = before.train.steps, after.train.steps
+    was = before.train.steps
+    steps = after.train.steps
     line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {counted(steps, 'step')}"
     if not after.model.made_of_gaussians:
         return line
-    then, now = (means_rate(learning_rates(c), rates_of(c).progress(done), 1.0) for c in (before, after))
+    then, now = (
+        means_rate(learning_rates(c), rates_of(c).progress(done), 1.0) for c in (before, after)
+    )
     stop = scaled(after.strategy.stop, steps)
     grows = after.strategy.growth_limit > 0 and stop > done + 1
     line += f": the learning rate of positions is {now / then:.3g} times what it was, "
@@ -106,7 +121,10 @@ def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicMode
     old = deform_schedule(model, Rates(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
     if length.done >= old.opens:
-        fractions |= {"time_window_grows_from": length.kept(old.opens), "time_window_full_at": length.kept(old.full)}
+        fractions |= {
+            "time_window_grows_from": length.kept(old.opens),
+            "time_window_full_at": length.kept(old.full),
+        }
     changed = model.model_copy(update=fractions)
     begins = motion_begins_after(config.model_copy(update={"model": changed}), length.steps)
     if begins is not None and old.fine <= length.done < begins:
@@ -118,7 +136,8 @@ def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicMode
 
 
 def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
-    """Return the share after which motion is learned: the step where it began, else one that is still to come."""
+    """Return the share after which motion is learned: the step where it began, else one that is
+    still to come."""
     if length.done >= old.fine:
         return length.kept(old.fine)
     new = deform_schedule(model, Rates(length.steps))

@@ -1,7 +1,7 @@
 """Limits on the number of Gaussians, and what limits together are possible (docs/budget.md).
 
-A limit on the file's size is one on the number of Gaussians first: so few that they fit when stored as exactly as is
-usual.
+A limit on the file's size is one on the number of Gaussians first: so few that they fit when stored
+as exactly as is usual.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from dyngs.errors import DyngsError
 from dyngs.training.processes import Processes
 from dyngs.triangles.keys import BgTriangleModel
 
-RANDOM_FRACTION = 0.1  # Fraction of the limit that is kept free for the random Gaussians with which motion begins
+# Fraction of the limit that is kept free for the random Gaussians with which motion begins
+RANDOM_FRACTION = 0.1
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
-"""Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in docs/storage.md."""
+"""Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in
+docs/storage.md."""
 CLOSE = 0.8  # Fraction of the limit from which the limit counts as having held growth back
 FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
@@ -26,20 +28,29 @@ FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 def require_possible(config: Config) -> None:
     """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
     if config.model.is_posed and config.camera.refine == "always":
-        raise DyngsError("camera.refine: cameras of people are not refined, their poses are; leave it out")
+        raise DyngsError(
+            "camera.refine: cameras of people are not refined, their poses are; leave it out"
+        )
     _require_whole_images(config)
     if config.camera.refine == "always" and not config.model.made_of_gaussians:
-        raise DyngsError(f"camera.refine=always: model.kind={config.model.kind} refines no cameras; leave it out")
+        raise DyngsError(
+            f"camera.refine=always: model.kind={config.model.kind} refines no cameras; leave it out"
+        )
     _require_batch(config)
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]
     is_triangles = isinstance(config.model, BgTriangleModel)
     given = [name for name in given if not (is_triangles and name == "max_mb")]
     if given and not config.model.made_of_gaussians:
-        kind, instead = config.model.kind, "give model.max_triangles" if is_triangles else "leave it out"
-        raise DyngsError(f"budget.{given[0]}: model.kind={kind} has no Gaussians that could be limited; {instead}")
+        kind = config.model.kind
+        instead = "give model.max_triangles" if is_triangles else "leave it out"
+        raise DyngsError(
+            f"budget.{given[0]}: model.kind={kind} has no Gaussians that could be limited; {instead}"
+        )
     if config.train.minutes is not None and config.model.is_network:
-        raise DyngsError(f"train.minutes: model.kind={config.model.kind} is trained for train.steps; leave it out")
+        raise DyngsError(
+            f"train.minutes: model.kind={config.model.kind} is trained for train.steps; leave it out"
+        )
     if config.train.minutes is not None and config.prune.is_wanted:
         raise DyngsError(
             "train.minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
@@ -48,7 +59,8 @@ def require_possible(config: Config) -> None:
 
 
 def shared(config: Config, processes: Processes) -> Config:
-    """Return ``config`` for so many processes: with one view for each of them where one per step was asked for."""
+    """Return ``config`` for so many processes: with one view for each of them where one per step
+    was asked for."""
     if processes.size == 1:
         return config
     minutes = config.train.minutes
@@ -57,41 +69,57 @@ def shared(config: Config, processes: Processes) -> Config:
             f"train.minutes={minutes:g}: is measured with one process; leave it out, or start without torchrun"
         )
     if config.train.batch_size == 1:
-        config = config.model_copy(update={"train": config.train.model_copy(update={"batch_size": processes.size})})
+        config = config.model_copy(
+            update={"train": config.train.model_copy(update={"batch_size": processes.size})}
+        )
     processes.share(config.train.batch_size)
     return config
 
 
 def _require_whole_images(config: Config) -> None:
-    """Raise where something is asked for that looks at whole images of a model that draws some of their pixels."""
+    """Raise where something is asked for that looks at whole images of a model that draws some of
+    their pixels."""
     if config.model.draws_whole_images:
         return
     for key, value in _of_single_images(config).items():
         if value == "always":
-            raise DyngsError(f"{key}=always: model.kind={config.model.kind} draws no whole images; leave it out")
+            raise DyngsError(
+                f"{key}=always: model.kind={config.model.kind} draws no whole images; leave it out"
+            )
 
 
 def _of_single_images(config: Config) -> dict[str, str]:
     """Return the choices that follow single images, by their keys."""
     train = config.train
-    return {"train.robust": train.robust, "train.exposure": train.exposure, "camera.refine": config.camera.refine}
+    return {
+        "train.robust": train.robust,
+        "train.exposure": train.exposure,
+        "camera.refine": config.camera.refine,
+    }
 
 
 def _require_batch(config: Config) -> None:
-    """Raise where several views per step are asked for, and something that follows single images."""
+    """Raise where several views per step are asked for, and something that follows single
+    images."""
     if config.train.batch_size == 1:
         return
     asked = f"train.batch_size={config.train.batch_size}"
     if config.model.is_network:
-        raise DyngsError(f"{asked}: a network is trained on one person per step, by one process; leave it out")
+        raise DyngsError(
+            f"{asked}: a network is trained on one person per step, by one process; leave it out"
+        )
     for key, value in _of_single_images(config).items():
         if value != "never":
-            raise DyngsError(f"{asked}: {key}={value} follows one image per step; give {key}=never, or one process")
+            raise DyngsError(
+                f"{asked}: {key}={value} follows one image per step; give {key}=never, or one process"
+            )
 
 
 def within_cap(config: Config, num_times: int) -> Config:
-    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where it has none."""
-    cap, changes = most_gaussians(config, num_times), {}
+    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where
+    it has none."""
+    cap = most_gaussians(config, num_times)
+    changes = {}
     if cap is None:
         return config
     added = config.model.added_for_motion
@@ -103,23 +131,32 @@ def within_cap(config: Config, num_times: int) -> Config:
 
 
 def most_gaussians(config: Config, num_times: int) -> int | None:
-    """Return the largest number of Gaussians at the end by the limits of the run; None without one."""
+    """Return the largest number of Gaussians at the end by the limits of the run; None without
+    one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
-    if config.budget.max_mb is not None and config.model.made_of_gaussians and not config.model.is_posed:
+    if (
+        config.budget.max_mb is not None
+        and config.model.made_of_gaussians
+        and not config.model.is_posed
+    ):
         limits.append(room(config, num_times, config.budget.max_mb))
     return min(limits, default=None)
 
 
 def room(config: Config, num_times: int, megabytes: float) -> int:
-    """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual precision.
+    """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual
+    precision.
 
     Raises:
         DyngsError: fewer than ``FEWEST``; says which size has room for them.
     """
-    fixed, moves_by = 0.0, config.model.deform if isinstance(config.model, DynamicModel) else None
+    fixed = 0.0
+    moves_by = config.model.deform if isinstance(config.model, DynamicModel) else None
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
     if moves_by is not None and num_times > 1:
-        fixed, whole = (FIELD_BYTES * num_field_values(moves_by, num_times, moving) for moving in (0, 1))
+        fixed, whole = (
+            FIELD_BYTES * num_field_values(moves_by, num_times, moving) for moving in (0, 1)
+        )
         each += whole - fixed  # if all move
     found = int((1e6 * megabytes - fixed) / each)
     if found < FEWEST:
@@ -133,5 +170,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
 
 def num_field_values(options: DeformField, num_times: int, num_moving: int = 0) -> int:
     """Return the number of values that a field learns for so many Gaussians that move."""
-    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0)
+    setup = FieldSetup(
+        torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0
+    )
     return new_field(options, setup, torch.Generator()).parameters.num_values

@@ -12,11 +12,20 @@ from dyngs.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.adam import Count
 from dyngs.training.clock import Stopwatch
-from dyngs.training.events import Event, Listener, Message, Started, StepDone, StepReport, TotalChanged
+from dyngs.training.events import (
+    Event,
+    Listener,
+    Message,
+    Started,
+    StepDone,
+    StepReport,
+    TotalChanged,
+)
 
 
 class Trainable(Protocol):
-    """Interface of the trainers that the loop runs: of a scene, or of a network that predicts scenes."""
+    """Interface of the trainers that the loop runs: of a scene, or of a network that predicts
+    scenes."""
 
     done: int
     """Steps done."""
@@ -63,7 +72,11 @@ class Loop:
     """
 
     def __init__(
-        self, trainer: Trainable, total: int, watch: Stopwatch, advice: Callable[[], str] | None = None
+        self,
+        trainer: Trainable,
+        total: int,
+        watch: Stopwatch,
+        advice: Callable[[], str] | None = None,
     ) -> None:
         self.trainer, self.total, self.watch = trainer, total, watch
         self._advice = advice
@@ -102,10 +115,11 @@ class Loop:
 
 
 class Interrupts:
-    """A context manager in which a signal only sets ``requested``: Ctrl-C, SIGTERM, or SIGHUP from a closed terminal.
+    """A context manager in which a signal only sets ``requested``: Ctrl-C, SIGTERM, or SIGHUP from
+    a closed terminal.
 
-    A second Ctrl-C raises as usual. SIGHUP stays ignored under ``nohup``. Does nothing outside the main thread, where
-    Python delivers no signals.
+    A second Ctrl-C raises as usual. SIGHUP stays ignored under ``nohup``. Does nothing outside the
+    main thread, where Python delivers no signals.
     """
 
     def __init__(self) -> None:
@@ -121,7 +135,10 @@ class Interrupts:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         for which, handler in self._before.items():
             signal.signal(which, handler)

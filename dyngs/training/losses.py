@@ -1,4 +1,5 @@
-"""Terms of the loss of a training image: colours, silhouette, what the model itself asks for; and their check."""
+"""Terms of the loss of a training image: colours, silhouette, what the model itself asks for; and
+their check."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ class ImageLoss(Loss):
         self._ssim_weight = ssim_weight
 
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
-        return {"image": l1_ssim_loss(look.rendered, look.truth, self._ssim_weight, look.image.mask)}
+        return {
+            "image": l1_ssim_loss(look.rendered, look.truth, self._ssim_weight, look.image.mask)
+        }
 
 
 class SilhouetteLoss(Loss):
@@ -64,19 +67,32 @@ class RegularizerLoss(Loss):
 class StepCheck:
     """The loss of a step, term by term, and whether what was drawn is finite."""
 
-    def __init__(self, terms: Mapping[str, Tensor], moved: Mapping[str, Tensor], device: torch.device) -> None:
-        self._terms, self._moved = tuple(terms), {name: x.detach() for name, x in moved.items() if x.numel()}
+    def __init__(
+        self, terms: Mapping[str, Tensor], moved: Mapping[str, Tensor], device: torch.device
+    ) -> None:
+        self._terms, self._moved = (
+            tuple(terms),
+            {name: x.detach() for name, x in moved.items() if x.numel()},
+        )
         numbers = [sent(x.detach(), device).double().reshape(1) for x in terms.values()]
         # sums, in which NaN and infinity show: a thirtieth of the time of isfinite
-        numbers += [torch.stack([x.sum() for x in self._moved.values()]).double()] if self._moved else []
+        numbers += (
+            [torch.stack([x.sum() for x in self._moved.values()]).double()] if self._moved else []
+        )
         self._read = ReadBack(torch.cat(numbers) if len(numbers) > 1 else numbers[0])
 
     def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:
         """Return the sum of the terms; waits for them."""
         numbers = self._read.numbers().tolist()
-        values, sums = numbers[: len(self._terms)], numbers[len(self._terms) :]
-        suspects = [x for x, total in zip(self._moved.items(), sums, strict=True) if not math.isfinite(total)]
-        broken = [name for name, x in suspects if not bool(x.isfinite().all())]  # others only add up to too much
+        values = numbers[: len(self._terms)]
+        sums = numbers[len(self._terms) :]
+        suspects = [
+            x
+            for x, total in zip(self._moved.items(), sums, strict=True)
+            if not math.isfinite(total)
+        ]
+        # others only add up to too much
+        broken = [name for name, x in suspects if not bool(x.isfinite().all())]
         where = f"step {step}, view {image.name!r}"
         if broken:
             what, section = moves_by

@@ -1,4 +1,5 @@
-"""The memory that a run will take: its images, its Gaussians with the state of Adam, and what a step draws into."""
+"""The memory that a run will take: its images, its Gaussians with the state of Adam, and what a
+step draws into."""
 
 from __future__ import annotations
 
@@ -32,29 +33,36 @@ from dyngs.training.limits import num_field_values
 from dyngs.training.trainer import Trainer
 
 COPIES = 7
-"""Float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more when their set
-changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values take 0.24 kB."""
+"""Float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more
+when their set changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values
+take 0.24 kB."""
 NEEDED_COPIES = 4  # Of these, what is there in every step: value, gradient, two moments
 POSING_BYTES = 2600
-"""Bytes of a Gaussian of a person next to that, where the body fit is refined: its anchor, weights of joints, their
-gradients, and the Gaussian in a pose."""
-MOVING_BYTES = 200  # Bytes next to that of a Gaussian that control nodes move: the Gaussian at a time
-LOOKUP_COPIES = 12  # Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice
+"""Bytes of a Gaussian of a person next to that, where the body fit is refined: its anchor, weights
+of joints, their gradients, and the Gaussian in a pose."""
+# Bytes next to that of a Gaussian that control nodes move: the Gaussian at a time
+MOVING_BYTES = 200
+# Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice
+LOOKUP_COPIES = 12
 ACTIVATION_COPIES = 3
-"""Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a gradient."""
+"""Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a
+gradient."""
 FIELD_COPIES = 5
-"""Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for the penalties."""
+"""Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for
+the penalties."""
 SHAPE_VALUES = 11  # Values of a Gaussian next to its harmonics: position, rotation, sizes, opacity
 DRAWING_BYTES = 200
-"""Bytes per pixel of the largest image that a step takes next to them: rendering, truth, windows of SSIM."""
+"""Bytes per pixel of the largest image that a step takes next to them: rendering, truth, windows of
+SSIM."""
 STEP_BYTES = 30_000_000  # Bytes of any step: code and buffers that the first one touches
 DECODING_BYTES = 45
-"""Bytes per pixel of the file that decoding takes for a while: floats for shrinking and undistorting. Measured, as that
-above, on photos of 12 megapixels."""
+"""Bytes per pixel of the file that decoding takes for a while: floats for shrinking and
+undistorting. Measured, as that above, on photos of 12 megapixels."""
 USUAL_GAUSSIANS, USUAL_CHANGES = 250_000, 34
-"""Gaussians that photos led to in 7,000 steps (fox 268,000, cup 204,000, lego 173,000: docs/benchmarks.md), in which
-their set changes so often; fewer in proportion in shorter runs."""
-USUAL_SIDE = 400  # Longest side of the images, px, from which on that holds; below it goes with the root of the side
+"""Gaussians that photos led to in 7,000 steps (fox 268,000, cup 204,000, lego 173,000:
+docs/benchmarks.md), in which their set changes so often; fewer in proportion in shorter runs."""
+# Longest side of the images, px, from which on that holds; below it goes with the root of the side
+USUAL_SIDE = 400
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _SWAP = "/sys/fs/cgroup/memory.swap.max"
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
@@ -73,8 +81,10 @@ class MemoryForecast:
     least: int  # Gaussians that there will certainly be at some time
     each: int
     least_each: int
-    free: int | None  # of this machine and this process's limits, next to what is taken already; None: not known
-    whole: int | None  # of this machine with its swap, or the limit of its container; None: not known
+    # of this machine and this process's limits, next to what is taken already; None: not known
+    free: int | None
+    # of this machine with its swap, or the limit of its container; None: not known
+    whole: int | None
     all_kept: bool  # every image has its place in the cache
     processes: int = 1
     longest_side: int = 0
@@ -88,7 +98,8 @@ class MemoryForecast:
 
     @property
     def certain(self) -> int:
-        """What a process takes at least: without the room that an allocator needs, and whatever is drawn."""
+        """What a process takes at least: without the room that an allocator needs, and whatever is
+        drawn."""
         return self.program + self.images + self.least * self.least_each
 
     def __str__(self) -> str:
@@ -97,7 +108,11 @@ class MemoryForecast:
         parts = f"{_gb(self.program)} program, " if self.program else ""
         parts += f"{_gb(self.images)} images ({kept}), {_gb(self.drawing)} drawing, "
         parts += f"{_gb(self.field)} field, " if self.field else ""
-        parts += f"{_gb(self.count * self.each)} for some {self.count:,} Gaussians" if self.count else "no Gaussians"
+        parts += (
+            f"{_gb(self.count * self.each)} for some {self.count:,} Gaussians"
+            if self.count
+            else "no Gaussians"
+        )
         if self.most > 2 * self.count:
             parts += f"; {_gb(self.most * self.each)} for the {self.most:,} that strategy.max_gaussians allows"
             room = self._gaussians_that_fit()
@@ -108,7 +123,8 @@ class MemoryForecast:
         return f"{self._place}: about {_gb(self.total)} GB{each}{there}: {parts}"
 
     def warning(self) -> str | None:
-        """Return a line where that is likely to be more than is there; what to set to which value is in it."""
+        """Return a line where that is likely to be more than is there; what to set to which value
+        is in it."""
         if self.free is None or self._growth <= self.free:
             return None
         needed = self.program + self._growth
@@ -116,7 +132,8 @@ class MemoryForecast:
         return f"about {_gb(needed)} GB of {self._place} are needed, and {there}: give {self._advice()}"
 
     def require_possible(self) -> None:
-        """Raise where the run certainly needs more than this machine, or its container, can ever give it."""
+        """Raise where the run certainly needs more than this machine, or its container, can ever
+        give it."""
         needed = self.program + self.processes * (self.certain - self.program)
         if self.whole is None or needed <= self.whole:
             return
@@ -143,15 +160,21 @@ class MemoryForecast:
         """Return how many Gaussians there is room for next to the rest; None: not known."""
         if self.free is None:
             return None
-        return max(self._fraction - (self.total - self.program - self.count * self.each), 0) // self.each
+        return (
+            max(self._fraction - (self.total - self.program - self.count * self.each), 0)
+            // self.each
+        )
 
     def _advice(self) -> str:
-        """Return the keys to lower, with values that make the run fit, the least that does first."""
+        """Return the keys to lower, with values that make the run fit, the least that does
+        first."""
         rest = self.total - self.program - self.images
-        room, gaussians = 0.95 * self._fraction, self.count * self.each
+        room = 0.95 * self._fraction
+        gaussians = self.count * self.each
         if rest < room and not self.on_gpu:
             return f"data.cache_mb={1e-6 * (room - rest):.0f} (images are then decoded again and again)"
-        found, left = [], room - 0.2 * room
+        found = []
+        left = room - 0.2 * room
         if self.images > 0.2 * room and not self.on_gpu:
             found.append(f"data.cache_mb={0.2e-6 * room:.0f}")
         else:
@@ -174,9 +197,11 @@ class MemoryForecast:
 
 
 def memory_forecasts(trainer: Trainer, processes: int = 1) -> list[MemoryForecast]:
-    """Return the memory that the run of ``trainer``, which has not begun to step, is expected to take.
+    """Return the memory that the run of ``trainer``, which has not begun to step, is expected to
+    take.
 
-    On a GPU first that of the GPU, with the scene, and then that of the machine, with what stays on the CPU.
+    On a GPU first that of the GPU, with the scene, and then that of the machine, with what stays on
+    the CPU.
     """
     whole = memory_forecast(trainer, processes)
     gpu = gpu_memory(trainer.device)
@@ -198,11 +223,13 @@ def memory_forecasts(trainer: Trainer, processes: int = 1) -> list[MemoryForecas
 
 def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
     """Return what ``memory_forecasts`` says of the machine, as if the scene were there."""
-    images, config = trainer.images, trainer.config
+    images = trainer.images
+    config = trainer.config
     pixels = max((width * height for width, height in images.sizes), default=0)
     files = max((view.width * view.height for view in images.views), default=0)
     waiting = (images.decoded_ahead // 2 or 1) * DECODING_BYTES * files
-    now, side = trainer.num_gaussians, max((max(size) for size in images.sizes), default=0)
+    now = trainer.num_gaussians
+    side = max((max(size) for size in images.sizes), default=0)
     return MemoryForecast(
         program=resident_memory(),
         images=images.bytes_to_come + waiting,
@@ -238,7 +265,8 @@ def require_room(config: Config) -> None:
     """Raise where the random Gaussians that a run is to begin with cannot fit on this machine."""
     if not config.model.made_of_gaussians:
         return
-    whole, each = whole_memory(), 4 * NEEDED_COPIES * stored_values(config)
+    whole = whole_memory()
+    each = 4 * NEEDED_COPIES * stored_values(config)
     match config.init:
         case RandomInit() if whole is not None and config.init.num_random * each > whole:
             raise DyngsError(
@@ -255,8 +283,10 @@ def stored_values(config: Config) -> int:
 
 
 def gaussian_bytes(config: Config) -> int:
-    """Return the bytes of memory that a Gaussian takes in training, where it moves if anything may."""
-    each, field = 4 * COPIES * stored_values(config), _field(config)
+    """Return the bytes of memory that a Gaussian takes in training, where it moves if anything
+    may."""
+    each = 4 * COPIES * stored_values(config)
+    field = _field(config)
     if config.model.is_posed:
         return each + POSING_BYTES
     match field:
@@ -277,7 +307,8 @@ def _field(config: Config) -> DeformField | None:
 
 
 def field_bytes(config: Config, num_times: int) -> int:
-    """Return the bytes of memory of what a deformation field learns next to its Gaussians; 0 where there is none."""
+    """Return the bytes of memory of what a deformation field learns next to its Gaussians; 0 where
+    there is none."""
     field = _field(config)
     if field is None or num_times < 2:
         return 0
@@ -296,19 +327,25 @@ def num_changes(config: Config, steps: int | None = None) -> int:
 
 
 def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE) -> int:
-    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before anything is seen."""
+    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before
+    anything is seen."""
     match config.strategy:
         case McmcStrategy():
             return _mcmc_gaussians(config, config.strategy, now)
         case _:
             changes = num_changes(config) / USUAL_CHANGES
             detail = min(longest_side / USUAL_SIDE, 1.0) ** 0.5
-            usual = round(USUAL_GAUSSIANS * detail * (changes if changes < 1 else min(changes, 4.0) ** 0.5))
-            return max(now, min(usual, config.strategy.growth_limit)) + config.model.added_for_motion
+            usual = round(
+                USUAL_GAUSSIANS * detail * (changes if changes < 1 else min(changes, 4.0) ** 0.5)
+            )
+            return (
+                max(now, min(usual, config.strategy.growth_limit)) + config.model.added_for_motion
+            )
 
 
 def _mcmc_gaussians(config: Config, strategy: McmcStrategy, now: int) -> int:
-    """Return how many Gaussians the strategy ends with: each change adds the same share, up to the cap."""
+    """Return how many Gaussians the strategy ends with: each change adds the same share, up to the
+    cap."""
     grown = now * (1 + growth_per_change(config.train.steps)) ** min(num_changes(config), 200)
     return max(int(min(strategy.max_gaussians, grown)), now)
 
@@ -320,7 +357,8 @@ def resident_memory() -> int:
 
 
 def peak_memory() -> int:
-    """Return the largest number of bytes of memory that this process has taken; 0 where that is not known."""
+    """Return the largest number of bytes of memory that this process has taken; 0 where that is not
+    known."""
     if sys.platform == "win32":
         return 0
     import resource
@@ -330,9 +368,12 @@ def peak_memory() -> int:
 
 
 def whole_memory() -> int | None:
-    """Return the bytes of memory and swap that this machine, or its container, has at all; None: not known."""
+    """Return the bytes of memory and swap that this machine, or its container, has at all; None:
+    not known."""
     found = []
-    memory, swap = (re.search(rf"{x}:\s+(\d+) kB", _text("/proc/meminfo")) for x in ("MemTotal", "SwapTotal"))
+    memory, swap = (
+        re.search(rf"{x}:\s+(\d+) kB", _text("/proc/meminfo")) for x in ("MemTotal", "SwapTotal")
+    )
     if memory and swap:
         found.append(1024 * (int(memory[1]) + int(swap[1])))
     limits = [_text(_LIMITS[0]).strip(), _text(_SWAP).strip()]
@@ -342,7 +383,8 @@ def whole_memory() -> int | None:
 
 
 def free_memory() -> int | None:
-    """Return the bytes that this process may still take, by the machine and the limit of its container."""
+    """Return the bytes that this process may still take, by the machine and the limit of its
+    container."""
     found = []
     available = re.search(r"MemAvailable:\s+(\d+) kB", _text("/proc/meminfo"))
     if available:

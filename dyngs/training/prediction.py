@@ -1,4 +1,5 @@
-"""Training of networks that predict people from a few images, on captures of several: one trainer for all kinds."""
+"""Training of networks that predict people from a few images, on captures of several: one trainer
+for all kinds."""
 
 from __future__ import annotations
 
@@ -49,9 +50,12 @@ class NetworkTrainer:
         example = self.learner.example(person, step, self.generator)
         value = float(example.loss.detach())
         if not math.isfinite(value):
-            raise DyngsError(f"step {step}, {self.learner.names[person]}: the loss is {value}; lower model.lr")
+            raise DyngsError(
+                f"step {step}, {self.learner.names[person]}: the loss is {value}; lower model.lr"
+            )
         self.update(example.loss, step)
-        self.done, self.num_gaussians = step, example.num_gaussians
+        self.done = step
+        self.num_gaussians = example.num_gaussians
         return StepReport(step, value, example.image, example.rendered, example.truth)
 
     def update(self, loss: Tensor, step: int) -> None:
@@ -65,8 +69,11 @@ class NetworkTrainer:
         tensors |= {f"model.{name}": x for name, x in self.learner.kept().items()}
         tensors["rng"] = self.generator.get_state()
         tensors |= {f"sampler.{name}": x for name, x in self.sampler.state().items()}
-        tensors |= {f"optimizer.{name}": x for name, x in optimizer_state(self.optimizer, network).items()}
-        mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value  # fields have none
+        tensors |= {
+            f"optimizer.{name}": x for name, x in optimizer_state(self.optimizer, network).items()
+        }
+        # fields have none
+        mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.learner.background, mode)
         stored = {name: x.detach().cpu() for name, x in tensors.items()}
         return Checkpoint(info, stored, settings=settings_of(self.config))
@@ -87,14 +94,17 @@ def network_trainer(config: Config) -> NetworkTrainer:
     return NetworkTrainer(
         config=config,
         learner=learner,
-        optimizer=torch.optim.AdamW(learner.network.parameters(), lr=config.model.lr, weight_decay=WEIGHT_DECAY),
+        optimizer=torch.optim.AdamW(
+            learner.network.parameters(), lr=config.model.lr, weight_decay=WEIGHT_DECAY
+        ),
         sampler=ViewSampler(len(learner.names)),
         generator=generator,
     )
 
 
 def rate_at(highest: float, step: int, steps: int) -> float:
-    """Return the learning rate of AdamW: a linear rise, then a linear fall (one cycle; Smith and Topin 2017)."""
+    """Return the learning rate of AdamW: a linear rise, then a linear fall (one cycle; Smith and
+    Topin 2017)."""
     top = max(1, round(WARM_UP * steps))
     fraction = step / top if step <= top else (steps - step) / max(steps - top, 1)
     return highest * max(fraction, _LOWEST)

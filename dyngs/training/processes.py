@@ -1,8 +1,9 @@
-"""The processes that train one scene together, as ``torchrun`` starts them: each takes its fraction of a step's views.
+"""The processes that train one scene together, as ``torchrun`` starts them: each takes its fraction
+of a step's views.
 
-All hold the same scene and make the same changes to it, from gradients that are summed over them. Sums are formed in
-the order of the processes, whatever arrives first: a run repeats byte by byte, and where each process takes one view,
-the bytes are those of one process that takes them all.
+All hold the same scene and make the same changes to it, from gradients that are summed over them.
+Sums are formed in the order of the processes, whatever arrives first: a run repeats byte by byte,
+and where each process takes one view, the bytes are those of one process that takes them all.
 """
 
 from __future__ import annotations
@@ -20,17 +21,20 @@ from torch.distributed.rendezvous import rendezvous
 
 from dyngs.errors import DyngsError
 
-TIMEOUT = timedelta(days=30)  # The others wait while the first one reads, evaluates, or tries settings in small runs
+# The others wait while the first one reads, evaluates, or tries settings in small runs
+TIMEOUT = timedelta(days=30)
 CHUNK = 2**22  # Most values that are summed at once: the memory that a sum takes for a while, twice
 FAILED = "dyngs/failed"  # Key of the store that counts the processes that have said why they end
 STOP = "dyngs/stop"  # Key of the store that counts the processes that were told to stop
 EXIT_INTERRUPTED = 130  # Exit code of a process that was told to stop, as after Ctrl-C
-EXIT_FAILED = 2  # Exit code of a process that ends because another one has failed, which has said why
+# Exit code of a process that ends because another one has failed, which has said why
+EXIT_FAILED = 2
 _NAMES = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
 
 
 def numbers_of_torchrun() -> tuple[int, int, int] | None:
-    """Return rank, number of processes, and number of those on this machine; None where ``torchrun`` did not start us.
+    """Return rank, number of processes, and number of those on this machine; None where
+    ``torchrun`` did not start us.
 
     Raises:
         DyngsError: one of the variables is not a number.
@@ -59,7 +63,8 @@ class Processes:
 
     @staticmethod
     def of_torchrun() -> Processes:
-        """Return the processes that ``torchrun`` has started, this one alone without it. Raises DyngsError."""
+        """Return the processes that ``torchrun`` has started, this one alone without it. Raises
+        DyngsError."""
         return Processes(*(numbers_of_torchrun() or (0, 1, 1)))
 
     @property
@@ -77,15 +82,23 @@ class Processes:
         try:
             store, _, _ = next(iter(rendezvous("env://", timeout=TIMEOUT)))
             self._store = PrefixStore("dyngs", store)
-            distributed.init_process_group(backend, store=store, rank=self.rank, world_size=self.size, timeout=TIMEOUT)
+            distributed.init_process_group(
+                backend, store=store, rank=self.rank, world_size=self.size, timeout=TIMEOUT
+            )
         except (RuntimeError, ValueError) as error:
-            raise DyngsError(f"the {self.size} processes cannot reach each other: {error}") from None
+            raise DyngsError(
+                f"the {self.size} processes cannot reach each other: {error}"
+            ) from None
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
-        """Leave the others; raise SystemExit instead of an error where another process has told one already."""
+        """Leave the others; raise SystemExit instead of an error where another process has told one
+        already."""
         if self.size == 1:
             return
         if isinstance(error, Exception) and not self._speaks_first():
@@ -104,11 +117,16 @@ class Processes:
         return range(self.rank * each, (self.rank + 1) * each)
 
     def sum_(self, tensors: Sequence[Tensor]) -> None:
-        """Replace float32 tensors, of the same shapes in all processes, by their sums over the processes."""
+        """Replace float32 tensors, of the same shapes in all processes, by their sums over the
+        processes."""
         if self.size == 1:
             return
         for bucket in _buckets(tensors):
-            flat = bucket[0].reshape(-1) if len(bucket) == 1 else torch.cat([x.reshape(-1) for x in bucket])
+            flat = (
+                bucket[0].reshape(-1)
+                if len(bucket) == 1
+                else torch.cat([x.reshape(-1) for x in bucket])
+            )
             for chunk in flat.split(CHUNK):
                 chunk.copy_(self._summed(chunk))
             for x, values in zip(bucket, flat.split([x.numel() for x in bucket]), strict=True):
@@ -116,7 +134,8 @@ class Processes:
                     x.copy_(values.view_as(x))
 
     def sum_gradients_(self, leaves: Sequence[Tensor], report: Tensor) -> None:
-        """Replace the gradients of ``leaves`` and the values of ``report`` (R,), in place, by their sums.
+        """Replace the gradients of ``leaves`` and the values of ``report`` (R,), in place, by their
+        sums.
 
         A leaf without a gradient in all processes keeps none.
         """
@@ -126,7 +145,11 @@ class Processes:
         head = torch.cat([report, counts])
         self.sum_([head])
         report.copy_(head[: len(report)])
-        used = [x for x, count in zip(leaves, head[len(report) :].cpu().tolist(), strict=True) if count > 0]
+        used = [
+            x
+            for x, count in zip(leaves, head[len(report) :].cpu().tolist(), strict=True)
+            if count > 0
+        ]
         for x in used:
             x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
         self.sum_([x.grad for x in used if x.grad is not None])
@@ -163,7 +186,8 @@ class Processes:
             )
 
     def _summed(self, x: Tensor) -> Tensor:
-        """Return the sum (n,) over the processes: each sums a part of the values, in the order of the processes."""
+        """Return the sum (n,) over the processes: each sums a part of the values, in the order of
+        the processes."""
         length = -(-len(x) // self.size)
         own = torch.nn.functional.pad(x, (0, self.size * length - len(x)))
         parts = torch.empty_like(own)
@@ -191,7 +215,8 @@ class Processes:
     def _speaks_first(self) -> bool:
         """Return whether no other process has said yet why it ends.
 
-        Without torchrun's agent the first process keeps the store: if it is gone, that process has ended before.
+        Without torchrun's agent the first process keeps the store: if it is gone, that process has
+        ended before.
         """
         try:
             return self._store is None or self._store.add(FAILED, 1) == 1

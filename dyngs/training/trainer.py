@@ -43,7 +43,8 @@ class ViewSampler:
         self._position = 0
 
     def next(self, generator: torch.Generator, wanted: Callable[[int], bool]) -> int:
-        """Return the index of the next view that is ``wanted``, of which there must be one; others are passed over.
+        """Return the index of the next view that is ``wanted``, of which there must be one; others
+        are passed over.
 
         ``generator`` is drawn from once per epoch.
         """
@@ -57,7 +58,8 @@ class ViewSampler:
                 return index
 
     def coming(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
-        """Return up to ``count`` views of this epoch that come next, by what is ``wanted`` now; nothing is drawn."""
+        """Return up to ``count`` views of this epoch that come next, by what is ``wanted`` now;
+        nothing is drawn."""
         found: list[int] = []
         for index in self._order[self._position :].tolist():
             if len(found) == count:
@@ -87,18 +89,25 @@ class Trainer(Generic[M]):
     capture: Capture
     images: ImageLoader
     sampler: ViewSampler
-    background: str  # "white", "black" or "random" (a new colour in each step, behind render and truth alike)
+    # "white", "black" or "random" (a new colour in each step, behind render and truth alike)
+    background: str
     extent: float
-    losses: Sequence[Loss]  # terms of the loss, in an order that decides the last bits of its gradients
+    # terms of the loss, in an order that decides the last bits of its gradients
+    losses: Sequence[Loss]
     generator: torch.Generator
     findings: list[str] = field(default_factory=list)  # lines that are told with the next step
-    robust: RobustMasks | None = None  # masks of what disagrees with the other views; None: all pixels count
-    exposures: ViewExposures | None = None  # affine colours of the training images; None: they agree
-    refinement: CameraRefinement | None = None  # of the cameras; None: they stay as the capture has them
+    # masks of what disagrees with the other views; None: all pixels count
+    robust: RobustMasks | None = None
+    # affine colours of the training images; None: they agree
+    exposures: ViewExposures | None = None
+    # of the cameras; None: they stay as the capture has them
+    refinement: CameraRefinement | None = None
     done: int = 0
-    bad_gradients: Count = 0  # how often something was left out of a step because its gradient was not finite
+    # how often something was left out of a step because its gradient was not finite
+    bad_gradients: Count = 0
     held_out: frozenset[int] = frozenset()  # indices of the training views that are not trained on
-    processes: Processes = field(default_factory=Processes)  # that take a fraction of the views of each step; one: this
+    # that take a fraction of the views of each step; one: this
+    processes: Processes = field(default_factory=Processes)
     device: torch.device = CPU  # where the model is trained; see ``place``
 
     @property
@@ -114,7 +123,8 @@ class Trainer(Generic[M]):
         return self.model.num_moving
 
     def step(self) -> StepReport:
-        """Train on this process's fraction of the images of a step; the report is of the first of them."""
+        """Train on this process's fraction of the images of a step; the report is of the first of
+        them."""
         step = self.done + 1
         reports = []
         for index, seed in self._next_views(step):
@@ -122,10 +132,14 @@ class Trainer(Generic[M]):
                 reports.append(self._backward(step, index))
         loss = self._averaged(step, [report.loss for report in reports])
         updated = self.model.update(step)
-        self.bad_gradients, self.done = self.bad_gradients + updated.bad, step
+        self.bad_gradients = self.bad_gradients + updated.bad
+        self.done = step
         if updated.is_rearranged:
             self.processes.require_same(tensors_of(self.model.scene.state()), f"after step {step}")
-        finding = "\n".join([*self.findings, *([] if updated.finding is None else [updated.finding])]) or None
+        finding = (
+            "\n".join([*self.findings, *([] if updated.finding is None else [updated.finding])])
+            or None
+        )
         self.findings.clear()
         return replace(reports[0], loss=loss, finding=finding)
 
@@ -144,18 +158,27 @@ class Trainer(Generic[M]):
         return float(loss) / batch
 
     def _backward(self, step: int, index: int) -> StepReport:
-        """Add the gradients of the image of view ``index`` to those that are there, and return how it was drawn."""
+        """Add the gradients of the image of view ``index`` to those that are there, and return how
+        it was drawn."""
         image = self._image(index, step)
         background = sent(background_colour(self.background, self.generator), self.device)
         depth = any(loss.needs_depth(image) for loss in self.losses)
         drawn = self.model.draw(image, step, background, depth=depth)
-        rendering, image = drawn.rendering, drawn.image or image
+        rendering = drawn.rendering
+        image = drawn.image or image
         if self.robust is not None:
-            draw, time = self._drawn_with_depth(background), image.time
+            draw = self._drawn_with_depth(background)
+            time = image.time
             image = self.robust.masked(
-                index, step, image, rendering.rgb[0], background, lambda cameras: draw(cameras, time)
+                index,
+                step,
+                image,
+                rendering.rgb[0],
+                background,
+                lambda cameras: draw(cameras, time),
             )
-        rendered, truth = rendering.rgb[0], image.composite(background)
+        rendered = rendering.rgb[0]
+        truth = image.composite(background)
         if self.exposures is not None:
             self.exposures.begin(step, self._wanted(step), self._drawn_with_depth(background))
             rendered = self.exposures.applied((index, step), image, rendering, background)
@@ -164,21 +187,26 @@ class Trainer(Generic[M]):
         for loss in self.losses:
             terms |= loss(look)
         check = StepCheck(terms, drawn.moved, self.device)
-        with torch.autograd.set_multithreading_enabled(False):  # a GPU's nodes in this thread, too: no handing over
+        with torch.autograd.set_multithreading_enabled(False):
+            # a GPU's nodes in this thread, too: no handing over
             reduce(add, terms.values()).backward()
         value = check.loss(step, image, self.model.moves_by)
         drawn.after_backward()
         if self.exposures is not None:
             self.bad_gradients = self.bad_gradients + self.exposures.optimize(index, step)
         if self.refinement is not None:
-            self.bad_gradients = self.bad_gradients + self.refinement.optimize(step, index, image.cameras)
+            self.bad_gradients = self.bad_gradients + self.refinement.optimize(
+                step, index, image.cameras
+            )
         return StepReport(step, value, image, rendered.detach(), truth)
 
     @property
     def info(self) -> CheckpointInfo:
         x, y, z = (float(value) for value in self.capture.world_offset)
         mode = self.model.rasterize_mode.value
-        return CheckpointInfo(self.done, self.extent, (x, y, z), self.background, mode, self.capture.world_scale)
+        return CheckpointInfo(
+            self.done, self.extent, (x, y, z), self.background, mode, self.capture.world_scale
+        )
 
     def checkpoint(self) -> Checkpoint:
         state = self.model.state()
@@ -204,7 +232,8 @@ class Trainer(Generic[M]):
     def place(self, device: torch.device) -> None:
         """Go on on ``device``: with the model and the images.
 
-        What belongs to single images stays on the CPU: exposures, corrections of cameras, random numbers.
+        What belongs to single images stays on the CPU: exposures, corrections of cameras, random
+        numbers.
         """
         self.device = self.images.device = device
         self.model.place(device)
@@ -221,14 +250,19 @@ class Trainer(Generic[M]):
 
     def _drawn_with_depth(self, background: Tensor) -> Callable[[Cameras, float | None], Rendering]:
         scene = self.model.scene
-        return partial(scene.render, options=replace(scene.options, depth="expected"), background=background)
+        return partial(
+            scene.render, options=replace(scene.options, depth="expected"), background=background
+        )
 
     def _next_views(self, step: int) -> list[tuple[int, int | None]]:
-        """Return the indices of the views that ``step`` trains on here, each with the seed of its random numbers.
+        """Return the indices of the views that ``step`` trains on here, each with the seed of its
+        random numbers.
 
-        Without a seed they are those of the run. All processes draw the same views and seeds, and take their share.
+        Without a seed they are those of the run. All processes draw the same views and seeds, and
+        take their share.
         """
-        batch, wanted = self.config.train.batch_size, self._wanted(step)
+        batch = self.config.train.batch_size
+        wanted = self._wanted(step)
         drawn = [self.sampler.next(self.generator, wanted) for _ in range(batch)]
         fraction = self.processes.share(batch)
         if batch == 1:
@@ -240,8 +274,10 @@ class Trainer(Generic[M]):
         """Return the image of view ``index`` for ``step``; those after it begin to be decoded."""
         image = self.images.shrunk(index, image_divisor(self.config.train, step))
         if self.images.decoded_ahead:
-            batch, count = self.config.train.batch_size, self.images.decoded_ahead * self.processes.size
-            fraction, coming = self.processes.share(batch), self.sampler.coming(count, self._wanted(step))
+            batch = self.config.train.batch_size
+            count = self.images.decoded_ahead * self.processes.size
+            fraction = self.processes.share(batch)
+            coming = self.sampler.coming(count, self._wanted(step))
             self.images.expect([view for i, view in enumerate(coming) if i % batch in fraction])
         if self.refinement is not None:
             image = replace(image, cameras=watched(image.cameras))
@@ -254,7 +290,11 @@ class Trainer(Generic[M]):
             return self.model.trains_on(times[index], step)
 
         def is_wanted(index: int) -> bool:
-            return may_train(index) and not self.model.holds_out(index, step) and index not in self.held_out
+            return (
+                may_train(index)
+                and not self.model.holds_out(index, step)
+                and index not in self.held_out
+            )
 
         return is_wanted if any(is_wanted(i) for i in range(len(self.images))) else may_train
 

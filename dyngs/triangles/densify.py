@@ -1,7 +1,9 @@
-"""Which triangles are split into four, and which removed (Wu et al. 2025), within a number of triangles.
+"""Which triangles are split into four, and which removed (Wu et al. 2025), within a number of
+triangles.
 
-The published thresholds of gradients and edges depend on the images' size; here those that come first by both are
-split, as many as lead evenly to the number that is wanted. Thresholds of size are in half sides of the scene.
+The published thresholds of gradients and edges depend on the images' size; here those that come
+first by both are split, as many as lead evenly to the number that is wanted. Thresholds of size are
+in half sides of the scene.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ SMALLEST, SMALLEST_SPLIT = 1e-4, 2e-4  # areas
 LONGEST = 20.0  # longest over middle side of the box around the corners
 RARELY = 0.05  # fraction of the views below which a triangle is seen too rarely
 HIDDEN = 8 / 36  # fraction of the cells below which it is mostly hidden
-SLIVER = 0.5  # px in the mean of the views that show a triangle, below which it is hidden but for a sliver
+# px in the mean of the views that show a triangle, below which it is hidden but for a sliver
+SLIVER = 0.5
 ENLARGED = 1.1  # children, about their middles
 CELLS_OF_TRIANGLE = CELLS * (CELLS + 1) // 2  # of the square's cells those that a triangle has
 
@@ -41,7 +44,8 @@ class Change:
 
 
 def useless(patches: Patches, tallies: Tallies, unit: float) -> Tensor:
-    """Return (P,) bool: rarely seen, tiny, needles, mostly hidden, or seen only as slivers between others."""
+    """Return (P,) bool: rarely seen, tiny, needles, mostly hidden, or seen only as slivers between
+    others."""
     views = tallies.views.clamp_min(1)
     cells = (tallies.cells > 0).sum(1)
     return (
@@ -55,7 +59,8 @@ def useless(patches: Patches, tallies: Tallies, unit: float) -> Tensor:
 
 
 def importance(tallies: Tallies) -> Tensor:
-    """Return (P,) how much is to be gained by splitting: gradients and edges, each over its mean."""
+    """Return (P,) how much is to be gained by splitting: gradients and edges, each over its
+    mean."""
     gradient = tallies.gradients / tallies.views.clamp_min(1)
     edges = tallies.edges / (tallies.seen + 1)
     return gradient / gradient.mean().clamp_min(1e-30) + edges / edges.mean().clamp_min(1e-30)

@@ -1,7 +1,8 @@
-"""Where triangles begin: on the surface that a short run of Gaussians shows, since they cannot move through each other.
+"""Where triangles begin: on the surface that a short run of Gaussians shows, since they cannot move
+through each other.
 
-What lies behind a triangle gets no gradient, so that triangles at random stay where they are in each other's way;
-Gaussians are seen through.
+What lies behind a triangle gets no gradient, so that triangles at random stay where they are in
+each other's way; Gaussians are seen through.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ def first_surface(run: RunStart, steps: int, most: int) -> FirstSurface:
 
 
 def _coloured(mesh: Mesh, seen: list[Seen], size: float) -> FirstSurface:
-    vertices, faces = torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces)
+    vertices = torch.from_numpy(mesh.vertices).float()
+    faces = torch.from_numpy(mesh.faces)
     return FirstSurface(vertices[faces], colours_of(seen, vertices, 2 * size)[faces])
 
 
@@ -66,18 +68,30 @@ def _trained(run: RunStart, steps: int) -> GaussianModel:
     config = run.config
     strategy = DefaultStrategy(max_gaussians=MOST_GAUSSIANS)
     train = config.train.model_copy(update={"steps": steps, "initial_downscale": 1})
-    changed = {"model": StaticModel(sh_degree=0), "strategy": strategy, "train": train, "colour": ShColour()}
+    changed = {
+        "model": StaticModel(sh_degree=0),
+        "strategy": strategy,
+        "train": train,
+        "colour": ShColour(),
+    }
     own = config.model_copy(update=changed)
     start = replace(run, config=own, asked=own)
     scene = StaticScene(gaussians=first_gaussians(start))
-    model = GaussianModel(start, scene, SceneTraining(), densifier_of(start), ColourTraining(ShColour()))
+    model = GaussianModel(
+        start, scene, SceneTraining(), densifier_of(start), ColourTraining(ShColour())
+    )
     order = torch.randint(len(run.images), (steps,), generator=run.generator, device="cpu")
     for step, index in enumerate(order.tolist(), 1):
         image = run.images[index]
         image = image.shrunk(_divisor(image.cameras.width, image.cameras.height))
         background = background_colour(run.background, run.generator)
         drawn = model.draw(image, step, background)
-        loss = l1_ssim_loss(drawn.rendering.rgb[0], image.composite(background), config.train.ssim_weight, image.mask)
+        loss = l1_ssim_loss(
+            drawn.rendering.rgb[0],
+            image.composite(background),
+            config.train.ssim_weight,
+            image.mask,
+        )
         loss.backward()
         drawn.after_backward()
         model.update(step)
@@ -90,7 +104,8 @@ def _divisor(width: int, height: int) -> int:
 
 @torch.no_grad()
 def _views(run: RunStart, model: GaussianModel) -> list[Seen]:
-    scene, found = replace(model.scene, options=model.options), []
+    scene = replace(model.scene, options=model.options)
+    found = []
     for index in evenly_spaced(len(run.images), VIEWS):
         image = run.images[index]
         image = image.shrunk(_divisor(image.cameras.width, image.cameras.height))

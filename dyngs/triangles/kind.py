@@ -24,7 +24,8 @@ INNER = 0.02  # Fraction of the points on either side that does not count for th
 
 
 def start(run: RunStart) -> TriangleTraining:
-    """Return triangles turned at random at the first points of a capture, in whose place those of a surface come.
+    """Return triangles turned at random at the first points of a capture, in whose place those of a
+    surface come.
 
     Raises DyngsError: the points are no scene, or ``budget.max_mb`` has no room.
     """
@@ -32,11 +33,14 @@ def start(run: RunStart) -> TriangleTraining:
     assert isinstance(model, BgTriangleModel)
     megabytes = run.config.budget.max_mb
     model = model if megabytes is None else _within(model, megabytes)
-    return TriangleTraining(run, *_at_points(run, model), model, first=_on_surface if model.gaussian_steps else None)
+    return TriangleTraining(
+        run, *_at_points(run, model), model, first=_on_surface if model.gaussian_steps else None
+    )
 
 
 def _within(model: BgTriangleModel, megabytes: float) -> BgTriangleModel:
-    """Return ``model`` with as many triangles as a file of so many 1e6 bytes holds at the usual precision."""
+    """Return ``model`` with as many triangles as a file of so many 1e6 bytes holds at the usual
+    precision."""
     values = 3 * (NUM_POINTS + lattice_size(model.texture) + num_sh_terms(model.sh_degree) - 1)
     most = int(1e6 * megabytes / (VALUE_BYTES * values))
     if most < FEWEST:
@@ -59,7 +63,9 @@ def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
             "triangles: give init.kind=random"
         )
     radius = first.log_scales.exp().amax(1).clamp(max=unit / 2) * RADIUS
-    corners = first.means[:, None] + radius[:, None, None] * _random_triangles(len(first.means), run.generator)
+    corners = first.means[:, None] + radius[:, None, None] * _random_triangles(
+        len(first.means), run.generator
+    )
     colours = 0.5 + SH_C0 * first.sh[:, 0]
     return _flat(corners, colours[:, None].repeat(1, 3, 1), model), unit
 
@@ -78,7 +84,8 @@ def _flat(corners: torch.Tensor, colours: torch.Tensor, model: BgTriangleModel) 
 
 
 def _random_triangles(count: int, generator: torch.Generator) -> torch.Tensor:
-    """Return (count, 3, 3) corners of equilateral triangles in circles of radius 1, turned at random."""
+    """Return (count, 3, 3) corners of equilateral triangles in circles of radius 1, turned at
+    random."""
     axes = torch.randn((count, 2, 3), generator=generator, device="cpu")
     one = torch.nn.functional.normalize(axes[:, 0], dim=1)
     other = torch.nn.functional.normalize(torch.linalg.cross(one, axes[:, 1]), dim=1)

@@ -12,10 +12,11 @@ from dyngs.triangles.scene import TriangleScene
 
 @torch.no_grad()
 def surface_of(scene: TriangleScene, segments: int | None = None) -> Surface:
-    """Return the surface: of each triangle ``segments``^2 flat ones, with the colours without harmonics.
+    """Return the surface: of each triangle ``segments``^2 flat ones, with the colours without
+    harmonics.
 
-    Triangles do not share vertices, as they do not in the scene. ``segments``: None: as the scene is drawn, or as many
-    as its textures need.
+    Triangles do not share vertices, as they do not in the scene. ``segments``: None: as the scene
+    is drawn, or as many as its textures need.
     """
     patches = scene.patches
     count = max(SEGMENTS, patches.texture) if segments is None else min(segments, MOST_SEGMENTS)

@@ -1,6 +1,7 @@
 """Quadratic Bezier triangles and their colours.
 
-P triangles; K colours of each: at its six control points while ``texture`` is 0, else at the points of a lattice.
+P triangles; K colours of each: at its six control points while ``texture`` is 0, else at the points
+of a lattice.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ class Patches:
 
     points: Tensor  # (P, 6, 3) control points, world
     colours: Tensor  # (P, K, 3) seen from the middle of all directions
-    harmonics: Tensor  # (P, T - 1, 3) of the direction from the camera, added to them; without the constant
+    # (P, T - 1, 3) of the direction from the camera, added to them; without the constant
+    harmonics: Tensor
     texture: int = 0  # segments of the lattice of colours; 0: those of the control points
 
     def __len__(self) -> int:
@@ -60,7 +62,8 @@ class Patches:
 
     @property
     def areas(self) -> Tensor:
-        """(P,) areas of the four flat triangles between corners and middles of the edges, world units squared."""
+        """(P,) areas of the four flat triangles between corners and middles of the edges, world
+        units squared."""
         places, faces = lattice(2)
         a, b, c = evaluated(self.points.detach(), places)[:, faces].unbind(2)
         return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1).sum(1)
@@ -84,20 +87,26 @@ class Patches:
 
     @staticmethod
     def restored(stored: Mapping[str, Tensor]) -> Patches:
-        """Return the triangles in a state. Raises KeyError or ValueError where its tensors do not fit."""
+        """Return the triangles in a state. Raises KeyError or ValueError where its tensors do not
+        fit."""
         texture = int(require_indices("texture", stored["texture"], (1,), MOST_TEXTURE + 1))
         points = require_tensor("points", stored["points"], (None, NUM_POINTS, 3))
         count = len(points)
         size = lattice_size(texture) if texture else NUM_POINTS
         colours = require_tensor("colours", stored["colours"], (count, size, 3))
         harmonics = require_tensor("harmonics", stored["harmonics"], (count, None, 3))
-        if count == 0 or harmonics.shape[1] + 1 not in {num_sh_terms(n) for n in range(MOST_DEGREE + 1)}:
-            raise ValueError(f"'points' and 'harmonics' are no triangles: {count}, {harmonics.shape[1]} terms")
+        if count == 0 or harmonics.shape[1] + 1 not in {
+            num_sh_terms(n) for n in range(MOST_DEGREE + 1)
+        }:
+            raise ValueError(
+                f"'points' and 'harmonics' are no triangles: {count}, {harmonics.shape[1]} terms"
+            )
         return Patches(points.clone(), colours.clone(), harmonics.clone(), texture)
 
 
 def evaluated(values: Tensor, places: Tensor) -> Tensor:
-    """Return (P, N, C): quadratic ``values`` (P, 6, C) of every triangle at the same ``places`` (N, 2)."""
+    """Return (P, N, C): quadratic ``values`` (P, 6, C) of every triangle at the same ``places`` (N,
+    2)."""
     count = len(values)
     ids = torch.arange(count, dtype=torch.int32, device="cpu").repeat_interleave(len(places))
     uv = places.to(values.dtype).repeat(count, 1)
@@ -105,11 +114,16 @@ def evaluated(values: Tensor, places: Tensor) -> Tensor:
 
 
 def quarters(values: Tensor) -> Tensor:
-    """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the parts that middles of edges cut a triangle into."""
+    """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the parts that middles of edges cut a
+    triangle into."""
     places, faces = lattice(2)
     corners = places[faces]  # (4, 3, 2)
-    middles = torch.stack([(corners[:, i] + corners[:, j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))], 1)
-    at = evaluated(values, torch.cat([corners, middles], 1).flatten(0, 1)).view(-1, 6, values.shape[2])
+    middles = torch.stack(
+        [(corners[:, i] + corners[:, j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))], 1
+    )
+    at = evaluated(values, torch.cat([corners, middles], 1).flatten(0, 1)).view(
+        -1, 6, values.shape[2]
+    )
     parts = torch.empty_like(at)
     parts[:, list(CORNERS)] = at[:, :3]
     for n, (between, (a, b)) in enumerate(zip(_BETWEEN, _EDGES, strict=True)):

@@ -13,7 +13,14 @@ from torch.nn.functional import avg_pool2d
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep, composited, fixed_cameras
+from dyngs.models.renderable import (
+    DrawOptions,
+    Renderable,
+    Rendering,
+    TimeStep,
+    composited,
+    fixed_cameras,
+)
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.patches import (
     SEGMENTS,
@@ -77,7 +84,9 @@ class TriangleScene(Renderable):
 
     def state(self) -> State:
         unit = torch.tensor([self.unit], dtype=torch.float64, device="cpu")
-        return prefixed("triangles", self.patches.state() | {"unit": StateTensor(unit, Role.SHARED)})
+        return prefixed(
+            "triangles", self.patches.state() | {"unit": StateTensor(unit, Role.SHARED)}
+        )
 
     def render(
         self,
@@ -95,11 +104,16 @@ class TriangleScene(Renderable):
 
     def view(self, camera: Cameras, options: TriangleOptions) -> View:
         """Return what one camera sees; differentiable."""
-        times, patches = options.supersampling, self.patches
+        times = options.supersampling
+        patches = self.patches
         camera = camera.to(device=self.device)
         fine = camera.scaled(times)
-        places = Places.of(*visible_patches(patches.points.detach(), fine, options.near, options.segments))
-        at = project_points(patch_values(patches.points, places.ids, places.uv), fine, torch.zeros_like(places.ids))
+        places = Places.of(
+            *visible_patches(patches.points.detach(), fine, options.near, options.segments)
+        )
+        at = project_points(
+            patch_values(patches.points, places.ids, places.uv), fine, torch.zeros_like(places.ids)
+        )
         colours = patches.colours_at(places.ids, places.uv)
         if patches.harmonics.shape[1]:
             colours = colours + self._by_direction(camera)[places.ids.long()]
@@ -108,23 +122,31 @@ class TriangleScene(Renderable):
             channels = torch.cat([channels, at.depths[:, None]], 1)
         crossings = outline_crossings(patches.points, fine, places)
         image, through = blend_patches(at.means, channels, crossings, places)
-        image, through = image[0], through[0]
+        image = image[0]
+        through = through[0]
         if times > 1:
             image = avg_pool2d(image.permute(2, 0, 1)[None], times)[0].permute(1, 2, 0)
             through = avg_pool2d(through[None, None], times)[0, 0]
-        return View(image[..., :3], through, image[..., 3] if options.depth != "none" else None, places)
+        return View(
+            image[..., :3], through, image[..., 3] if options.depth != "none" else None, places
+        )
 
     def _by_direction(self, camera: Cameras) -> Tensor:
-        """Return (P, 3): what harmonics add to the colours of each triangle, seen from ``camera``."""
+        """Return (P, 3): what harmonics add to the colours of each triangle, seen from
+        ``camera``."""
         patches = self.patches
         middles = patches.points.detach()[:, CORNERS].mean(1)
         constant = patches.harmonics.new_full((len(patches), 1, 3), _ABOVE / SH_C0)
         everywhere = torch.ones((1, len(patches), 2), dtype=torch.int32, device="cpu")
         sh = torch.cat([constant, patches.harmonics], 1)
-        return evaluate_harmonics(middles, camera.centers, sh, everywhere, patches.sh_degree)[0] - (_ABOVE + 0.5)
+        return evaluate_harmonics(middles, camera.centers, sh, everywhere, patches.sh_degree)[0] - (
+            _ABOVE + 0.5
+        )
 
 
-def rendering_of(views: list[View], background: Tensor | None, options: TriangleOptions) -> Rendering:
+def rendering_of(
+    views: list[View], background: Tensor | None, options: TriangleOptions
+) -> Rendering:
     """Return the images of ``views`` before ``background``; None is black."""
     rgb = torch.stack([view.colour for view in views])
     through = torch.stack([view.transmittance for view in views])
@@ -138,7 +160,8 @@ def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
 
 
 def stored_triangles(checkpoint: Checkpoint) -> tuple[Patches, float]:
-    """Return the triangles and unit of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
+    """Return the triangles and unit of a checkpoint. Raises KeyError or ValueError where its
+    tensors do not fit."""
     stored = checkpoint.part("triangles")
     unit = require_positive("unit", require_tensor("unit", stored["unit"], (1,), torch.float64))
     return Patches.restored(stored), float(unit)

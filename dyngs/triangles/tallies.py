@@ -1,4 +1,5 @@
-"""What images say about each triangle since triangles were last added or removed: for splitting and pruning."""
+"""What images say about each triangle since triangles were last added or removed: for splitting and
+pruning."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ class Tallies:
 
     def count(self, places: Places, slopes: Tensor) -> None:
         """Take in what a view shows, whose image has ``slopes`` (H, W)."""
-        ids, size = places.ids.long(), len(self.seen)
+        ids = places.ids.long()
+        size = len(self.seen)
         shown = torch.bincount(ids, minlength=size)
         self.views += 1
         self.seen += (shown > 0).to(self.seen)
@@ -55,7 +57,9 @@ class Tallies:
         self.edges += torch.bincount(ids, weights=inside.double(), minlength=size).to(self.edges)
         u, v = (places.uv * (CELLS - 1)).long().clamp(0, CELLS - 1).unbind(1)
         cell = (ids * CELLS + u) * CELLS + v
-        self.cells += torch.bincount(cell, minlength=self.cells.numel()).view_as(self.cells) / scale**2
+        self.cells += (
+            torch.bincount(cell, minlength=self.cells.numel()).view_as(self.cells) / scale**2
+        )
 
     def state(self) -> State:
         return with_role(self.tensors(), Role.TRAINING)
@@ -71,7 +75,8 @@ class Tallies:
 
 @torch.no_grad()
 def most_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
-    """Return (P,) the pixels that each triangle has in the view of ``cameras``, one each, that shows most of it."""
+    """Return (P,) the pixels that each triangle has in the view of ``cameras``, one each, that
+    shows most of it."""
     most = torch.zeros(len(scene), device="cpu")
     for camera in cameras:
         ids = scene.view(camera, scene.options).places.ids.long()
@@ -81,7 +86,8 @@ def most_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
 
 
 def outlines(places: Places) -> Tensor:
-    """Return (N,) bool: which places lie within two drawn pixels of an outline, see ``blend_patches``."""
+    """Return (N,) bool: which places lie within two drawn pixels of an outline, see
+    ``blend_patches``."""
     rows = places.rows[0]
     drawn = rows >= 0
     ids = torch.full(rows.shape, -1, dtype=places.ids.dtype, device="cpu")
@@ -93,9 +99,12 @@ def outlines(places: Places) -> Tensor:
 
 
 def slopes_of(image: Tensor) -> Tensor:
-    """Return (H, W): mean size of the slopes of ``image`` (H, W, 3) by Prewitt's operator; faint ones are 0."""
+    """Return (H, W): mean size of the slopes of ``image`` (H, W, 3) by Prewitt's operator; faint
+    ones are 0."""
     across = torch.tensor([[-1.0, 0, 1]] * 3, device="cpu") / 3
     kernels = torch.stack([across, across.T])[:, None]
-    channels = torch.nn.functional.pad(image.permute(2, 0, 1)[:, None], (1, 1, 1, 1), mode="replicate")
+    channels = torch.nn.functional.pad(
+        image.permute(2, 0, 1)[:, None], (1, 1, 1, 1), mode="replicate"
+    )
     sizes = conv2d(channels, kernels).square().sum(1).sqrt()
     return torch.where(sizes < FAINTEST_EDGE, 0.0, sizes).mean(0)

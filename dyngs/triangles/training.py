@@ -20,25 +20,38 @@ from dyngs.state import State, prefixed
 from dyngs.triangles.densify import Change, change
 from dyngs.triangles.keys import BgTriangleModel
 from dyngs.triangles.patches import Patches
-from dyngs.triangles.scene import TriangleOptions, TriangleScene, rendering_of, scene_options, stored_triangles
+from dyngs.triangles.scene import (
+    TriangleOptions,
+    TriangleScene,
+    rendering_of,
+    scene_options,
+    stored_triangles,
+)
 from dyngs.triangles.tallies import Tallies, most_pixels, slopes_of
 
 EVERY, LEAST_EVERY, UNTIL = 300, 50, 18_000
-"""Steps between changes of a 30,000-step run, the fewest in any run, and after how many of 30,000 none is changed."""
+"""Steps between changes of a 30,000-step run, the fewest in any run, and after how many of 30,000
+none is changed."""
 HARMONICS_SLOWER = 20.0  # than colours
 LAST_COLOUR = 0.1  # Of their learning rate, at the end of each stage
 LEAST_SHOWN = 1.0  # px of some training view, of each triangle that stays
 
 
 First = Callable[[RunStart, BgTriangleModel], tuple[Patches, float]]
-"""What the first step begins with, in place of what was there before: triangles, and half the side of their scene."""
+"""What the first step begins with, in place of what was there before: triangles, and half the side
+of their scene."""
 
 
 class TriangleTraining(Model[TriangleScene]):
     """See the module."""
 
     def __init__(
-        self, run: RunStart, patches: Patches, unit: float, model: BgTriangleModel, first: First | None = None
+        self,
+        run: RunStart,
+        patches: Patches,
+        unit: float,
+        model: BgTriangleModel,
+        first: First | None = None,
     ) -> None:
         self._run, self._model, self._unit, self._first = run, model, unit, first
         options = scene_options(model, unit)
@@ -52,7 +65,9 @@ class TriangleTraining(Model[TriangleScene]):
         self._adam = AdamState.zero(self._patches.tensors)
 
     def _take(self, patches: Patches) -> None:
-        self._patches = patches.of({name: x.detach().requires_grad_() for name, x in patches.tensors.items()})
+        self._patches = patches.of(
+            {name: x.detach().requires_grad_() for name, x in patches.tensors.items()}
+        )
         self._tallies, self._now = Tallies(len(patches)), Tallies(len(patches))
 
     @property
@@ -98,7 +113,8 @@ class TriangleTraining(Model[TriangleScene]):
         return [] if self.is_textured else list(self._now.tensors().values())
 
     def update(self, step: int) -> Updated:
-        steps, patches = self._run.config.train.steps, self._patches
+        steps = self._run.config.train.steps
+        patches = self._patches
         grad = patches.points.grad
         if not self.is_textured and grad is not None:
             self._now.gradients += grad.norm(dim=-1).sum(1) * self._now.views
@@ -115,12 +131,15 @@ class TriangleTraining(Model[TriangleScene]):
             if self._tallies.views >= LEAST_EVERY:
                 self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
-            return Updated(bad, f"textures are learned from now on, on {len(patches):,} triangles", True)
+            return Updated(
+                bad, f"textures are learned from now on, on {len(patches):,} triangles", True
+            )
         return self._changed(step, bad) if self._is_due(step) else Updated(bad)
 
     def _rates(self, step: int) -> dict[str, float]:
         """Return the learning rate of each tensor in ``step``."""
-        steps, model = self._run.config.train.steps, self._model
+        steps = self._run.config.train.steps
+        model = self._model
         moved = step / steps
         position = self._unit * model.lr_position ** (1 - moved) * model.lr_position_final**moved
         begun = self._first_texture if self.is_textured else 0
@@ -133,7 +152,8 @@ class TriangleTraining(Model[TriangleScene]):
         before = self._adam
         self._begin(self._patches.textured(self._model.texture))
         for name in ("points", "harmonics"):
-            self._adam.exp_avg[name], self._adam.exp_avg_sq[name] = before.exp_avg[name], before.exp_avg_sq[name]
+            self._adam.exp_avg[name] = before.exp_avg[name]
+            self._adam.exp_avg_sq[name] = before.exp_avg_sq[name]
 
     @property
     def _interval(self) -> int:
@@ -159,13 +179,16 @@ class TriangleTraining(Model[TriangleScene]):
         """Remove what no training view shows."""
         images = self._run.images
         shown = most_pixels(self.scene, (images[i].cameras for i in range(len(images))))
-        count, stays = len(self._patches), shown >= LEAST_SHOWN
+        count = len(self._patches)
+        stays = shown >= LEAST_SHOWN
         if bool(stays.all()) or not bool(stays.any()):
             return Updated(bad)
         none = {name: x.detach()[:0] for name, x in self._patches.tensors.items()}
         self._apply(Change(stays.nonzero()[:, 0], none))
         gone = f"{count - len(self._patches):,} of {counted(count, 'triangle')} are removed"
-        return Updated(bad, f"{gone}: no training view shows more than {LEAST_SHOWN:g} px of them", True)
+        return Updated(
+            bad, f"{gone}: no training view shows more than {LEAST_SHOWN:g} px of them", True
+        )
 
     def _change(self, most: int, rounds: int) -> None:
         """Remove and split; see ``change``."""
@@ -176,7 +199,9 @@ class TriangleTraining(Model[TriangleScene]):
             {name: found.of_moments(name, x) for name, x in self._adam.exp_avg.items()},
             {name: found.of_moments(name, x) for name, x in self._adam.exp_avg_sq.items()},
         )
-        self._take(self._patches.of({name: found.of(name, x) for name, x in self._patches.tensors.items()}))
+        self._take(
+            self._patches.of({name: found.of(name, x) for name, x in self._patches.tensors.items()})
+        )
         self._adam = adam
 
     def state(self) -> State:

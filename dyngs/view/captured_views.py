@@ -1,4 +1,5 @@
-"""What the viewer shows next to a scene: the views of its capture, and from where it is looked at first."""
+"""What the viewer shows next to a scene: the views of its capture, and from where it is looked at
+first."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ THUMBNAIL = 96
 
 @dataclass(frozen=True)
 class CapturedViews:
-    """V views of a capture, each with a camera of the size of training, and their images, also small ones.
+    """V views of a capture, each with a camera of the size of training, and their images, also
+    small ones.
 
     There are no images where those of the capture do not show what the scene plays.
     """
@@ -52,7 +54,8 @@ class CapturedViews:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The camera from which a scene is looked at first, the point (3,) to orbit around, its rough size, and up (3,)."""
+    """The camera from which a scene is looked at first, the point (3,) to orbit around, its rough
+    size, and up (3,)."""
 
     start: Cameras
     center: np.ndarray
@@ -61,22 +64,28 @@ class Viewpoint:
 
 
 def views_of(opened: Opened) -> CapturedViews:
-    """Return the views of a scene's capture, if there is one; without images where a person is in other poses."""
+    """Return the views of a scene's capture, if there is one; without images where a person is in
+    other poses."""
     if opened.captured is None:
         return CapturedViews()
     found = opened.captured.once("views", lambda: _views_of_capture(opened))
     return found if opened.as_captured else replace(found, images=None)
 
 
-def captured_views(views: Sequence[View], data: DataConfig, images: ImageLoader | None = None) -> CapturedViews:
+def captured_views(
+    views: Sequence[View], data: DataConfig, images: ImageLoader | None = None
+) -> CapturedViews:
     """Return views with their cameras, and what loads their images."""
     small = data.model_copy(update={"downscale": 1.0, "longest_side": THUMBNAIL, "cache_mb": 256.0})
     cameras = tuple(training_cameras(views, data))
-    return CapturedViews(tuple(views), cameras, images or ImageLoader(views, data), ImageLoader(views, small))
+    return CapturedViews(
+        tuple(views), cameras, images or ImageLoader(views, data), ImageLoader(views, small)
+    )
 
 
 def viewpoint_of(opened: Opened) -> Viewpoint:
-    """Return where to begin: at the first camera of the capture, else where all of the scene is in view."""
+    """Return where to begin: at the first camera of the capture, else where all of the scene is in
+    view."""
     return (opened.captured or opened).once("viewpoint", lambda: _viewpoint(opened))
 
 
@@ -87,10 +96,12 @@ def has_timeline(opened: Opened) -> bool:
 
 
 def _views_of_capture(opened: Opened) -> CapturedViews:
-    """Return the views of all splits that show what the scene plays: a person may be filmed in other clips, too."""
+    """Return the views of all splits that show what the scene plays: a person may be filmed in
+    other clips, too."""
     if opened.missing is not None:
         return CapturedViews()
-    capture, by_name = opened.capture, {}
+    capture = opened.capture
+    by_name = {}
     for split in ("train", "val", "test"):
         found = capture.splits.get(split, ())
         if found and scene_of_split(opened, capture, split) is opened.renderable:
@@ -99,16 +110,22 @@ def _views_of_capture(opened: Opened) -> CapturedViews:
 
 
 def _viewpoint(opened: Opened) -> Viewpoint:
-    shown, up = views_of(opened), opened.up
+    shown = views_of(opened)
+    up = opened.up
     if len(shown):
-        poses, start = torch.from_numpy(shown.poses).float(), shown.cameras[0]
-        together = Cameras(poses, start.intrinsics.expand(len(poses), 3, 3), start.width, start.height)
-        center, eyes = look_at_point(together), together.centers.double().cpu().numpy()
+        poses = torch.from_numpy(shown.poses).float()
+        start = shown.cameras[0]
+        together = Cameras(
+            poses, start.intrinsics.expand(len(poses), 3, 3), start.width, start.height
+        )
+        center = look_at_point(together)
+        eyes = together.centers.double().cpu().numpy()
         if opened.person is not None:
             center = opened.person.at(None).means.double().cpu().numpy().mean(0)
     else:
         means = points_at(opened.renderable).double().cpu().numpy()
         start = orbit_around(opened, 1)
-        center, eyes = np.median(means[np.isfinite(means).all(1)], axis=0), start.centers.double().cpu().numpy()
+        center = np.median(means[np.isfinite(means).all(1)], axis=0)
+        eyes = start.centers.double().cpu().numpy()
     extent = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     return Viewpoint(start, center, extent, np.array([0.0, 0.0, 1.0]) if up is None else up[0])

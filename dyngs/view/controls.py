@@ -1,4 +1,5 @@
-"""The controls of the page: what is shown, the time, the truth, screenshots. Each browser has its own."""
+"""The controls of the page: what is shown, the time, the truth, screenshots. Each browser has its
+own."""
 
 from __future__ import annotations
 
@@ -48,8 +49,12 @@ class Controls:
         self.edits: EditControls | None = None
         gui = browsing.client.gui
         if len(source.names) > 1:
-            chosen = next((name for name in source.names if name == browsing.loaded.name), source.names[0])
-            runs = gui.add_dropdown("Run" if source.network is None else "Person", source.names, initial_value=chosen)
+            chosen = next(
+                (name for name in source.names if name == browsing.loaded.name), source.names[0]
+            )
+            runs = gui.add_dropdown(
+                "Run" if source.network is None else "Person", source.names, initial_value=chosen
+            )
             runs.on_update(lambda _: self._choose(str(runs.value)))
         browsing.status = gui.add_markdown("")
         self.show(browsing.loaded)
@@ -62,9 +67,11 @@ class Controls:
         if self.edits is not None:
             self.edits.remove()
             self.edits = None
-        gui, browsing = self._browsing.client.gui, self._browsing
+        gui = self._browsing.client.gui
+        browsing = self._browsing
         browsing.time_slider = None
-        network, parts = self._source.network, dict[str, Callable[[], None]]()
+        network = self._source.network
+        parts = dict[str, Callable[[], None]]()
         parts["Show"] = lambda: self._add_display(gui, opened)
         if has_timeline(opened):
             parts["Time"] = lambda: self._add_time(gui)
@@ -76,10 +83,15 @@ class Controls:
             parts["Predict from"] = lambda: add_image_controls(browsing, network)
         if can_be_edited(opened):
             parts["Edit"] = lambda: self._add_edits(opened)
-        parts |= {"Camera path": lambda: add_path_controls(browsing), "Help": lambda: _add_help(gui, opened)}
+        parts |= {
+            "Camera path": lambda: add_path_controls(browsing),
+            "Help": lambda: _add_help(gui, opened),
+        }
         self._of_scene = []
         for name, add in parts.items():
-            self._of_scene.append(gui.add_folder(name, expand_by_default=name not in ("Edit", "Camera path", "Help")))
+            self._of_scene.append(
+                gui.add_folder(name, expand_by_default=name not in ("Edit", "Camera path", "Help"))
+            )
             with self._of_scene[-1]:
                 add()
 
@@ -89,7 +101,11 @@ class Controls:
     def _add_display(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
         layers = [name for name in LAYERS if len(views_of(opened)) or name != "error"]
-        layers = [name for name in layers if isinstance(opened.renderable, GaussianScene) or name != "motion"]
+        layers = [
+            name
+            for name in layers
+            if isinstance(opened.renderable, GaussianScene) or name != "motion"
+        ]
         layers = [name for name in layers if shows_filled(opened) or name != "filled"]
         if session.look.layer not in layers:
             session.change(layer="colour")
@@ -113,7 +129,9 @@ class Controls:
     def _add_time(self, gui: viser.GuiApi) -> None:
         session = self._browsing.session
         slider = gui.add_slider("Time", 0.0, 1.0, 0.001, round(session.time, 3))
-        slider.on_update(lambda event: None if event.client_id is None else session.set_time(float(slider.value)))
+        slider.on_update(
+            lambda event: None if event.client_id is None else session.set_time(float(slider.value))
+        )
         play = gui.add_button("Pause" if session.timeline.playing else "Play")
         play.on_click(lambda _: session.change_timeline(playing=not session.timeline.playing))
         session.on_play = lambda playing: setattr(play, "label", "Pause" if playing else "Play")
@@ -126,9 +144,15 @@ class Controls:
 
     def _add_capture(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
-        cameras = gui.add_checkbox("Cameras", False, hint="frusta with their images; click one to go there")
-        cameras.on_update(lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove())
-        compare = gui.add_checkbox("Compare", session.look.comparing, hint="with the truth, on the right of the line")
+        cameras = gui.add_checkbox(
+            "Cameras", False, hint="frusta with their images; click one to go there"
+        )
+        cameras.on_update(
+            lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove()
+        )
+        compare = gui.add_checkbox(
+            "Compare", session.look.comparing, hint="with the truth, on the right of the line"
+        )
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
         view = gui.add_dropdown("Image", (NEAREST, *views_of(opened).names))
         session.change(view=None)
@@ -170,7 +194,8 @@ class Controls:
         """Send what is shown as a .png, in the thread that draws."""
         from PIL import Image
 
-        session, stream = self._browsing.session, io.BytesIO()
+        session = self._browsing.session
+        stream = io.BytesIO()
         if session.eye is None:
             return
         Image.fromarray(draw(session.opened, session.shot())).save(stream, "png")
@@ -186,19 +211,34 @@ def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
 
 def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None:
     """Add the motion picker, for files by name, and the sliders of the pose."""
-    gui, session = browsing.client.gui, browsing.session
+    gui = browsing.client.gui
+    session = browsing.session
     angles: dict[str, tuple[float, float, float]] = {}
     motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *motions))
-    feet = gui.add_checkbox("Keep feet", False, hint="in motions of files, feet on the floor do not slide")
+    feet = gui.add_checkbox(
+        "Keep feet", False, hint="in motions of files, feet on the floor do not slide"
+    )
     joint = gui.add_dropdown("Joint", MAIN_JOINTS, initial_value="left_shoulder")
-    sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0, hint=f"degrees about {axis}") for axis in _AXES]
+    sliders = [
+        gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0, hint=f"degrees about {axis}")
+        for axis in _AXES
+    ]
 
     def play(_: Any = None) -> None:
-        choice, chosen, keep = str(motion.value), dict(angles), bool(feet.value)
-        session.ask(lambda: session.show(in_motion(browsing.loaded, choice, motions, chosen, keep_feet=keep)), "pose")
+        choice = str(motion.value)
+        chosen = dict(angles)
+        keep = bool(feet.value)
+        session.ask(
+            lambda: session.show(
+                in_motion(browsing.loaded, choice, motions, chosen, keep_feet=keep)
+            ),
+            "pose",
+        )
 
     def pick(_: Any) -> None:
-        for slider, value in zip(sliders, angles.get(str(joint.value), (0.0, 0.0, 0.0)), strict=True):
+        for slider, value in zip(
+            sliders, angles.get(str(joint.value), (0.0, 0.0, 0.0)), strict=True
+        ):
             slider.value = value
 
     def turn(event: Any) -> None:
@@ -227,7 +267,9 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
 
 def add_image_controls(browsing: Browsing, network: PeopleNetwork) -> None:
     """Add the choice of the images that a network predicts the person from."""
-    gui, session, person = browsing.client.gui, browsing.session, browsing.loaded.name
+    gui = browsing.client.gui
+    session = browsing.session
+    person = browsing.loaded.name
     names = (_NONE, *network.images_of(person))
     hint = f"none: {network.num_images} that see much of the person"
     chosen = [gui.add_dropdown(f"Image {i + 1}", names, hint=hint) for i in range(MOST_IMAGES)]
@@ -251,15 +293,21 @@ def add_image_controls(browsing: Browsing, network: PeopleNetwork) -> None:
 
 
 def add_path_controls(browsing: Browsing) -> None:
-    gui, session = browsing.client.gui, browsing.session
+    gui = browsing.client.gui
+    session = browsing.session
     recorded = [Recording()]
     status = gui.add_markdown("no keyframes yet")
-    seconds = gui.add_slider("Seconds", 0.1, 20.0, 0.1, 2.0, hint="from the keyframe that is added to the next one")
+    seconds = gui.add_slider(
+        "Seconds", 0.1, 20.0, 0.1, 2.0, hint="from the keyframe that is added to the next one"
+    )
 
     def record(recording: Recording) -> None:
         recorded[0] = recording
-        count, duration = len(recording), recording.duration if len(recording) else 0.0
-        status.content = f"{counted(count, 'keyframe')}, {duration:.1f} s" if count else "no keyframes yet"
+        count = len(recording)
+        duration = recording.duration if len(recording) else 0.0
+        status.content = (
+            f"{counted(count, 'keyframe')}, {duration:.1f} s" if count else "no keyframes yet"
+        )
 
     def add(_: Any) -> None:
         if session.eye is not None:
@@ -269,16 +317,24 @@ def add_path_controls(browsing: Browsing) -> None:
 
     def save(_: Any) -> None:
         if not len(recorded[0]):
-            browsing.client.add_notification("No path", "Add a keyframe first.", auto_close_seconds=5.0)
+            browsing.client.add_notification(
+                "No path", "Add a keyframe first.", auto_close_seconds=5.0
+            )
             return
-        opened, first = session.opened, recorded[0].keyframes[0].camera
-        width, height = (2 * (side // 2) for side in (first.width, first.height))  # as videos need it
+        opened = session.opened
+        first = recorded[0].keyframes[0].camera
+        # as videos need it
+        width, height = (2 * (side // 2) for side in (first.width, first.height))
         text = recorded[0].moved(opened.frame).document((width, height), FPS, opened.world_offset)
         browsing.client.send_file_download(FILE_NAME, text.encode(), save_immediately=True)
 
     gui.add_button("Add keyframe", hint="this camera, at this time").on_click(add)
-    gui.add_button("Remove last").on_click(lambda _: record(replace(recorded[0], keyframes=recorded[0].keyframes[:-1])))
+    gui.add_button("Remove last").on_click(
+        lambda _: record(replace(recorded[0], keyframes=recorded[0].keyframes[:-1]))
+    )
     loop = gui.add_checkbox("Back to the first", False)
     loop.on_update(lambda _: record(replace(recorded[0], loops=bool(loop.value))))
     gui.add_button("Preview").on_click(lambda _: session.preview(recorded[0]))
-    gui.add_button("Save path", hint=f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}").on_click(save)
+    gui.add_button(
+        "Save path", hint=f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}"
+    ).on_click(save)

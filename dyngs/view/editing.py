@@ -1,4 +1,5 @@
-"""What a browser picks, measures and deletes in a scene; files and runs on disk never change. Knows no viser."""
+"""What a browser picks, measures and deletes in a scene; files and runs on disk never change. Knows
+no viser."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ _SOLID = 0.5  # opacity below which a ray meets nothing
 
 
 def looking_along(direction: np.ndarray) -> np.ndarray:
-    """Return the quaternion wxyz, world from camera, of a camera that looks along ``direction`` (3,)."""
+    """Return the quaternion wxyz, world from camera, of a camera that looks along ``direction``
+    (3,)."""
     from scipy.spatial.transform import Rotation
 
     forward = direction / np.linalg.norm(direction)
@@ -36,24 +38,32 @@ def looking_along(direction: np.ndarray) -> np.ndarray:
 
 
 def world_of(opened: Opened) -> Similarity:
-    """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of the file itself."""
+    """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of
+    the file itself."""
     return UNMOVED if opened.captured is None else opened.world
 
 
 def picked(
-    opened: Opened, origin: np.ndarray, direction: np.ndarray, pixel: float, shot: Shot | None = None
+    opened: Opened,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    pixel: float,
+    shot: Shot | None = None,
 ) -> np.ndarray | None:
-    """Return the point (3,) of the scene that a ray meets, at the depth that is drawn there; None: it meets nothing.
+    """Return the point (3,) of the scene that a ray meets, at the depth that is drawn there; None:
+    it meets nothing.
 
     Depths are those of centres: the point is exact to about the size of the Gaussians there.
 
-    ``origin``, ``direction``: (3,) of the ray. ``pixel``: rad that a pixel of the image sees. ``shot``: time and part
-    that are shown.
+    ``origin``, ``direction``: (3,) of the ray. ``pixel``: rad that a pixel of the image sees.
+    ``shot``: time and part that are shown.
     """
     numbers = np.array([*origin, *direction], np.float64)
     if not (np.isfinite(numbers).all() and np.linalg.norm(numbers[3:]) > 0 and pixel > 0):
         return None  # browsers may send anything
-    camera = camera_at(looking_along(numbers[3:]), numbers[:3], 2 * math.atan(0.5 * _SIZE * pixel), (_SIZE, _SIZE))
+    camera = camera_at(
+        looking_along(numbers[3:]), numbers[:3], 2 * math.atan(0.5 * _SIZE * pixel), (_SIZE, _SIZE)
+    )
     time, part = (None, "all") if shot is None else (shot.time, shot.part)
     depth, alpha = (x[_SIZE // 2, _SIZE // 2] for x in depth_of(opened, part, camera, time))
     if not alpha >= _SOLID:
@@ -90,18 +100,26 @@ class Editing:
     def left(self) -> Opened:
         """The scene that is left."""
         scene: GaussianScene = self.whole.scene
-        return self.whole.showing(scene.select(self.rows.to(scene.device))) if self.steps else self.whole
+        return (
+            self.whole.showing(scene.select(self.rows.to(scene.device)))
+            if self.steps
+            else self.whole
+        )
 
     def pick(self, point: np.ndarray) -> None:
         """Add a picked point (3,); a third one is the first of a new pair."""
         self.points = [point] if len(self.points) == 2 else [*self.points, point]
 
     def delete(self, *, inside: bool) -> int:
-        """Delete what the box holds, or all else; return how many Gaussians go. Raises DyngsError: all would."""
+        """Delete what the box holds, or all else; return how many Gaussians go. Raises DyngsError:
+        all would."""
         scene: GaussianScene = self.left.scene
         kept = held_by(self.box, scene, world_of(self.whole)) ^ inside
         if not bool(kept.any()):
-            raise DyngsError("nothing would be left: the box holds " + ("all of the scene" if inside else "nothing"))
+            raise DyngsError(
+                "nothing would be left: the box holds "
+                + ("all of the scene" if inside else "nothing")
+            )
         gone = len(kept) - int(kept.sum())
         if gone:
             self.steps.append(self.rows[kept])
@@ -115,12 +133,16 @@ class Editing:
         """Return what is left as a .ply, at ``time`` if it moves."""
         with tempfile.TemporaryDirectory(prefix="dyngs_view_") as folder:
             moment = None if self.whole.scene.is_static else time
-            return write_part(self.whole, self.rows, Path(folder) / "edited.ply", moment).path.read_bytes()
+            return write_part(
+                self.whole, self.rows, Path(folder) / "edited.ply", moment
+            ).path.read_bytes()
 
     @property
     def said(self) -> str:
-        """Lines of markdown about the picks, the box and what is left; options of `dyngs edit` that say the same."""
-        world, lines = world_of(self.whole), list[str]()
+        """Lines of markdown about the picks, the box and what is left; options of `dyngs edit` that
+        say the same."""
+        world = world_of(self.whole)
+        lines = list[str]()
         points = [world.points(point) for point in self.points]
         size = float(self.size.max())
         for name, point in zip("AB", points, strict=False):
@@ -136,6 +158,7 @@ class Editing:
 
 
 def _told(point: np.ndarray, size: float) -> str:
-    """Return "x,y,z" with four digits, and as many more as a scene of ``size`` is far away from the origin."""
+    """Return "x,y,z" with four digits, and as many more as a scene of ``size`` is far away from the
+    origin."""
     digits = 4 + math.ceil(math.log10(max(float(np.abs(point).max()) / size, 1)))
     return ",".join(f"{x:.{digits}g}" for x in point)

@@ -20,8 +20,8 @@ _COVERS = 1.5
 MOST = 120
 """Frusta that are shown at most, spread evenly over the cameras."""
 _SIZE, _OF_SPREAD = 0.05, 0.15
-"""Depth of a frustum at most, relative to the distance of the cameras from what they see, and from their middle: those
-of a video stand close together."""
+"""Depth of a frustum at most, relative to the distance of the cameras from what they see, and from
+their middle: those of a video stand close together."""
 
 
 class Frusta:
@@ -43,14 +43,17 @@ class Frusta:
 
     def remove(self) -> None:
         self._generation += 1
-        handles, self._handles = self._handles, []
+        handles = self._handles
+        self._handles = []
         for handle, _, _ in handles:
             handle.remove()
 
     def hide_what_covers(self) -> None:
-        """Hide the frusta that the browser's camera stands in, and all where the image is of another camera."""
+        """Hide the frusta that the browser's camera stands in, and all where the image is of
+        another camera."""
         session = self._browsing.session
-        eye, is_elsewhere = session.eye, session.shown_view is not None
+        eye = session.eye
+        is_elsewhere = session.shown_view is not None
         if eye is None:
             return
         for handle, position, size in list(self._handles):
@@ -62,7 +65,8 @@ class Frusta:
         if generation != self._generation:
             return
         shown = views_of(opened)
-        camera, size = shown.cameras[index], frustum_size(shown.poses, viewpoint_of(opened).extent)
+        camera = shown.cameras[index]
+        size = frustum_size(shown.poses, viewpoint_of(opened).extent)
         wxyz, position = pose_of(camera)
         handle = self._browsing.client.scene.add_camera_frustum(
             f"/cameras/{index}",
@@ -92,7 +96,8 @@ class Frusta:
 
 
 def distinct(poses: np.ndarray) -> list[int]:
-    """Return the indices of the first view from each pose of (V, 4, 4), ascending: a fixed camera is shown once."""
+    """Return the indices of the first view from each pose of (V, 4, 4), ascending: a fixed camera
+    is shown once."""
     relative = poses.copy()
     relative[:, :3, 3] /= np.abs(poses[:, :3, 3]).max(initial=0.0) or 1.0
     _, first = np.unique(relative.round(6).reshape(len(poses), -1), axis=0, return_index=True)
@@ -100,13 +105,22 @@ def distinct(poses: np.ndarray) -> list[int]:
 
 
 def frustum_size(poses: np.ndarray, extent: float) -> float:
-    """Return the depth of the frusta of poses (V, 4, 4), world units; ``extent`` is the distance of what they see."""
+    """Return the depth of the frusta of poses (V, 4, 4), world units; ``extent`` is the distance of
+    what they see."""
     centers = centers_of(poses)
     spread_out = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
-    return min(_SIZE * extent, _OF_SPREAD * spread_out) if spread_out > 1e-4 * extent else _SIZE * extent
+    return (
+        min(_SIZE * extent, _OF_SPREAD * spread_out)
+        if spread_out > 1e-4 * extent
+        else _SIZE * extent
+    )
 
 
 def _thumbnail(opened: Opened, index: int) -> np.ndarray | None:
     """Return the small image (h, w, 3) uint8 of a view, None where there is none."""
     loader = views_of(opened).thumbnails
-    return None if loader is None else to_uint8(loader[index].composite(opened.background).clamp(0, 1).numpy())
+    return (
+        None
+        if loader is None
+        else to_uint8(loader[index].composite(opened.background).clamp(0, 1).numpy())
+    )

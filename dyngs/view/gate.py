@@ -23,11 +23,13 @@ COOKIE = "dyngs_view"
 
 @dataclass(frozen=True)
 class Gate:
-    """Decision on requests, of HTTP or of a websocket, by their paths with the query and their headers.
+    """Decision on requests, of HTTP or of a websocket, by their paths with the query and their
+    headers.
 
     Attributes:
-        token: that a request has to bring, in the link or as the cookie that the link gives; None: requests must be
-            addressed to this machine, so that pages of others cannot reach the viewer through a browser that runs here.
+        token: that a request has to bring, in the link or as the cookie that the link gives; None:
+            requests must be addressed to this machine, so that pages of others cannot reach the
+            viewer through a browser that runs here.
     """
 
     token: str | None = None
@@ -46,14 +48,16 @@ class Gate:
         return "the token is missing or wrong; open the link that `dyngs view` printed"
 
     def cookie(self, path: str) -> str | None:
-        """Return the header ``Set-Cookie`` for a request that brings the token in the link; None: it needs none."""
+        """Return the header ``Set-Cookie`` for a request that brings the token in the link; None:
+        it needs none."""
         if self.token is None or "token" not in parse_qs(urlsplit(path).query):
             return None
         return f"{COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
 
 def gate_for(host: str) -> Gate:
-    """Return the gate of a server on ``host``: with a new token unless that is this machine alone."""
+    """Return the gate of a server on ``host``: with a new token unless that is this machine
+    alone."""
     return Gate() if is_loopback(host) else Gate(secrets.token_urlsafe(24))
 
 
@@ -73,11 +77,14 @@ def link_to(host: str, port: int, token: str | None = None) -> str:
         host = socket.gethostname() or "localhost"
     elif host == "127.0.0.1":
         host = "localhost"
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}/{f'?token={token}' if token else ''}"
+    return (
+        f"http://{f'[{host}]' if ':' in host else host}:{port}/{f'?token={token}' if token else ''}"
+    )
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return the port to listen on: ``port``; None: 8080, or the next that is free. Raises DyngsError."""
+    """Return the port to listen on: ``port``; None: 8080, or the next that is free. Raises
+    DyngsError."""
     for candidate in [port] if port is not None else [*range(DEFAULT_PORT, DEFAULT_PORT + 50), 0]:
         try:
             return _bound(host, candidate)
@@ -87,8 +94,12 @@ def free_port(host: str, port: int | None) -> int:
                     continue
                 raise port_taken(port) from error
             if error.errno == errno.EACCES:
-                raise DyngsError(f"--port {port}: not allowed for this user; choose one above 1023") from error
-            raise DyngsError(f"--host {host}: cannot listen there ({error.strerror or error})") from error
+                raise DyngsError(
+                    f"--port {port}: not allowed for this user; choose one above 1023"
+                ) from error
+            raise DyngsError(
+                f"--host {host}: cannot listen there ({error.strerror or error})"
+            ) from error
     raise AssertionError("the last candidate is never taken")
 
 
@@ -99,7 +110,8 @@ def port_taken(port: int) -> DyngsError:
 
 @contextmanager
 def guarded(gate: Gate) -> Iterator[None]:
-    """Let the servers that viser starts meanwhile ask ``gate`` first: about pages and websockets alike.
+    """Let the servers that viser starts meanwhile ask ``gate`` first: about pages and websockets
+    alike.
 
     viser has no setting for this; it starts its server by ``websockets.asyncio.server.serve``.
     """
@@ -129,7 +141,9 @@ def guarded(gate: Gate) -> Iterator[None]:
 
 def _bound(host: str, port: int) -> int:
     """Return the port of a socket that could be bound. Raises OSError where it could not."""
-    family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    family, _, _, _, address = socket.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    )[0]
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind(address)

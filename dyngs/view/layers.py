@@ -1,4 +1,5 @@
-"""Images of a scene for the viewer: colours, depth, opacity, motion, and the error against the truth."""
+"""Images of a scene for the viewer: colours, depth, opacity, motion, and the error against the
+truth."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ class Shot:
     Attributes:
         camera: one camera, of the size of the image.
         layer: what is shown; "error" needs ``view``.
-        view: the view of the capture whose camera, time and truth are shown instead; None: no truth.
+        view: the view of the capture whose camera, time and truth are shown instead; None: no
+            truth.
         divide: fraction of the width that shows the render; the truth is on the right of it.
         is_moving: it is one of many, and drawn in levels of detail where ``coarser`` has made them.
     """
@@ -58,7 +60,8 @@ class Shot:
 
 def draw(opened: Opened, shot: Shot) -> np.ndarray:
     """Return the image (H, W, 3) uint8 of a shot."""
-    camera, time = shot.camera, shot.time
+    camera = shot.camera
+    time = shot.time
     if shot.view is not None:
         camera = resize_cameras(views_of(opened).cameras[shot.view], camera.width, camera.height)
         time = views_of(opened).times[shot.view]
@@ -73,11 +76,14 @@ def draw(opened: Opened, shot: Shot) -> np.ndarray:
         return _error(rgb, truth)
     beside = np.isnan(truth)
     rgb = np.where(beside, rgb // 2, rgb)  # there is no truth: darker
-    return _divided(rgb, np.where(beside, rgb, to_uint8(np.nan_to_num(truth))).astype(np.uint8), shot.divide)
+    return _divided(
+        rgb, np.where(beside, rgb, to_uint8(np.nan_to_num(truth))).astype(np.uint8), shot.divide
+    )
 
 
 def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 3), NaN next to it."""
+    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 3),
+    NaN next to it."""
     images = views_of(opened).images
     if images is None:
         return None
@@ -90,13 +96,15 @@ def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndar
         image.permute(2, 0, 1)[None], own, mode="bilinear", align_corners=False, antialias=scale < 1
     )
     window = np.full((height, width, 3), np.nan, np.float32)
-    top, left = (height - own[0]) // 2, (width - own[1]) // 2
+    top = (height - own[0]) // 2
+    left = (width - own[1]) // 2
     window[top : top + own[0], left : left + own[1]] = shown[0].permute(1, 2, 0).clamp(0, 1).numpy()
     return window
 
 
 def motion_colours(opened: Opened) -> Tensor:
-    """Return (N, 3) colours of how far each Gaussian moves over all times: dark blue is not at all, red is far.
+    """Return (N, 3) colours of how far each Gaussian moves over all times: dark blue is not at all,
+    red is far.
 
     Red begins where 99% of those that move are left behind. On the CPU.
     """
@@ -107,9 +115,13 @@ def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> n
     """Return one layer (H, W, 3) uint8; for the error it is the colours."""
     match shot.layer:
         case "colour" | "error":
-            return to_uint8(_coarser_or_whole(opened, shot, camera, time).rgb[0].clamp(0, 1).numpy())
+            return to_uint8(
+                _coarser_or_whole(opened, shot, camera, time).rgb[0].clamp(0, 1).numpy()
+            )
         case "alpha":
-            alpha = to_uint8(_coarser_or_whole(opened, shot, camera, time).alpha[0].clamp(0, 1).numpy())
+            alpha = to_uint8(
+                _coarser_or_whole(opened, shot, camera, time).alpha[0].clamp(0, 1).numpy()
+            )
             return np.repeat(alpha[..., None], 3, axis=2)
         case "depth":
             return depth_to_rgb(*depth_of(opened, shot.part, camera, time))
@@ -120,7 +132,8 @@ def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> n
 
 
 def coarser(opened: Opened, most: int) -> Opened:
-    """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves. Raises DyngsError."""
+    """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
+    Raises DyngsError."""
     opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
     opened.once(_LEVELS, lambda: [LevelScene.of(opened.renderable, most)])
     return opened
@@ -129,12 +142,20 @@ def coarser(opened: Opened, most: int) -> Opened:
 def _coarser_or_whole(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> Rendering:
     may_be_coarser = shot.is_moving and shot.part == "all" and shot.layer != "error"
     levels: list[LevelScene] = opened.once(_LEVELS, list) if may_be_coarser else []
-    return levels[0].render(camera).to(device="cpu") if levels else _rendering(opened, shot.part, camera, time)
+    return (
+        levels[0].render(camera).to(device="cpu")
+        if levels
+        else _rendering(opened, shot.part, camera, time)
+    )
 
 
-def _rendering(opened: Opened, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:
+def _rendering(
+    opened: Opened, part: Part, camera: Cameras, time: float | None, with_depth: bool = False
+) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
-    scene = opened.renderable if part == "all" else opened.once(part, lambda: opened.scene.part(part))
+    scene = (
+        opened.renderable if part == "all" else opened.once(part, lambda: opened.scene.part(part))
+    )
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)
     if part not in kept or kept[part][0] != time:
         kept[part] = time, scene.time_step(time)
@@ -142,8 +163,11 @@ def _rendering(opened: Opened, part: Part, camera: Cameras, time: float | None, 
     return scene.render(camera, kept[part][1], options=options).to(device="cpu")
 
 
-def depth_of(opened: Opened, part: Part, camera: Cameras, time: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the expected depth (H, W), world units along the axis of the camera, and the opacity (H, W) there."""
+def depth_of(
+    opened: Opened, part: Part, camera: Cameras, time: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the expected depth (H, W), world units along the axis of the camera, and the opacity
+    (H, W) there."""
     with torch.no_grad():
         made = _rendering(opened, part, camera, time, with_depth=True)
     return np.zeros(0) if made.depth is None else made.depth[0].numpy(), made.alpha[0].numpy()
@@ -151,7 +175,8 @@ def depth_of(opened: Opened, part: Part, camera: Cameras, time: float | None) ->
 
 def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> np.ndarray:
     """Return the image of the motion (H, W, 3) uint8, on black."""
-    scene, colours = opened.scene.unmasked(), motion_colours(opened)
+    scene = opened.scene.unmasked()
+    colours = motion_colours(opened)
     gaussians = scene.at(time)
     coloured = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None].to(gaussians.means))
     if part != "all":
@@ -160,18 +185,26 @@ def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> 
             moves[scene.rows] = True
         coloured = coloured.select(moves if part == "moving" else ~moves)
     plain = replace(scene, colour=None, background=None)
-    made = plain.render(camera, GaussianTimeStep(coloured, time), options=replace(opened.scene.options, sh_degree=0))
+    made = plain.render(
+        camera, GaussianTimeStep(coloured, time), options=replace(opened.scene.options, sh_degree=0)
+    )
     return to_uint8(made.rgb[0].clamp(0, 1).cpu().numpy())
 
 
 def shows_filled(opened: Opened) -> bool:
     """Return whether it is known which surface of a person no training view shows."""
-    return opened.person is not None and opened.person.seen is not None and opened.person.colour is None
+    return (
+        opened.person is not None
+        and opened.person.seen is not None
+        and opened.person.colour is None
+    )
 
 
 def _filled(opened: Opened, camera: Cameras, time: float | None) -> np.ndarray:
-    """Return the image (H, W, 3) uint8 with marked what is filled in; the plain one where that is not known."""
-    scene, person = opened.scene, opened.person
+    """Return the image (H, W, 3) uint8 with marked what is filled in; the plain one where that is
+    not known."""
+    scene = opened.scene
+    person = opened.person
     if person is None or person.seen is None or not shows_filled(opened):
         return to_uint8(_rendering(opened, "all", camera, time).rgb[0].clamp(0, 1).numpy())
     now = scene.time_step(time)
@@ -190,7 +223,8 @@ def _motion_colours(scene: GaussianScene) -> Tensor:
         low = high = whole.at(times[0]).means
         for time in times[1:]:
             means = whole.at(time).means
-            low, high = torch.minimum(low, means), torch.maximum(high, means)
+            low = torch.minimum(low, means)
+            high = torch.maximum(high, means)
         far = (high - low).norm(dim=1)
         moves = far[scene.rows]
         far = far / (torch.quantile(moves[:: max(1, len(moves) // 100_000)], 0.99).clamp_min(1e-12))

@@ -1,4 +1,5 @@
-"""How large images are drawn: small while something moves, so that they come often; full when all is still."""
+"""How large images are drawn: small while something moves, so that they come often; full when all
+is still."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ STILL_AFTER = 0.2
 _REFINES_BY = 6.0
 """Factor of the number of pixels from one refinement to the next."""
 _PIXELS_FRACTION = 0.5
-"""Seconds for pixels relative to those for the Gaussians, where the latter alone exceed the target: a smaller image
-would hardly come sooner."""
+"""Seconds for pixels relative to those for the Gaussians, where the latter alone exceed the target:
+a smaller image would hardly come sooner."""
 _MEMORY = 0.7
 _TELLING = 3.0
 """Ratio of the pixels of two images from which their times tell how much a pixel takes."""
@@ -37,10 +38,11 @@ class _Mean:
 
 
 class Pace:
-    """Number of pixels that can be drawn within ``target`` seconds, by how long the last images took.
+    """Number of pixels that can be drawn within ``target`` seconds, by how long the last images
+    took.
 
-    Seconds are taken to be a + b * pixels: a is for the Gaussians, whatever the size of the image. Refined images may
-    take ``longest`` seconds. ``area``: pixels of an image while something moves.
+    Seconds are taken to be a + b * pixels: a is for the Gaussians, whatever the size of the image.
+    Refined images may take ``longest`` seconds. ``area``: pixels of an image while something moves.
     """
 
     def __init__(self, target: float, longest: float = math.inf) -> None:
@@ -70,7 +72,8 @@ class Pace:
         return max(seconds - fixed, _PIXELS_FRACTION * fixed) / per_pixel
 
     def _seconds_per_pixel(self) -> float:
-        small, large = self._moving, self._refined
+        small = self._moving
+        large = self._refined
         slope, least = 0.0, _LEAST_FRACTION
         if large.pixels > _TELLING * small.pixels:  # times of images of like sizes differ by chance
             slope = (large.seconds - small.seconds) / (large.pixels - small.pixels)
@@ -78,12 +81,14 @@ class Pace:
         return max(slope, least * small.seconds / small.pixels, 1e-12)
 
     def next_area(self, full: int, drawn: float | None) -> float:
-        """Return the pixels to draw next, of ``full``; ``drawn``: of what is shown, None where something moves."""
+        """Return the pixels to draw next, of ``full``; ``drawn``: of what is shown, None where
+        something moves."""
         return min(float(full), self.area if drawn is None else max(_REFINES_BY * drawn, self.area))
 
 
 def size_within(size: tuple[int, int], area: float) -> tuple[int, int]:
-    """Return width and height with the aspect of ``size`` and at most about ``area`` pixels, at least 16 each."""
+    """Return width and height with the aspect of ``size`` and at most about ``area`` pixels, at
+    least 16 each."""
     width, height = size
     scale = min(1.0, math.sqrt(area / max(width * height, 1)))
     if scale >= 1:

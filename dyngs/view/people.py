@@ -1,4 +1,5 @@
-"""A person in the viewer: played motions, the rest pose, and poses by the angles of the main joints."""
+"""A person in the viewer: played motions, the rest pose, and poses by the angles of the main
+joints."""
 
 from __future__ import annotations
 
@@ -15,35 +16,66 @@ from dyngs.runs.opened import Opened
 
 AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"
 MAIN_JOINTS = (
-    *("pelvis", "spine1", "spine3", "neck", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow"),
-    *("left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
+    *(
+        "pelvis",
+        "spine1",
+        "spine3",
+        "neck",
+        "head",
+        "left_shoulder",
+        "right_shoulder",
+        "left_elbow",
+        "right_elbow",
+    ),
+    *(
+        "left_wrist",
+        "right_wrist",
+        "left_hip",
+        "right_hip",
+        "left_knee",
+        "right_knee",
+        "left_ankle",
+        "right_ankle",
+    ),
 )
 """Joints with sliders."""
 MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf", ".vrma")
 _MOST_MOTIONS = 500
 
 Angles = Mapping[str, tuple[float, float, float]]
-"""Degrees about x, y and z, in this order, of joints by name; those that are missing are at rest."""
+"""Degrees about x, y and z, in this order, of joints by name; those that are missing are at
+rest."""
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:
-    """Return the motion files in a folder, or the file itself, by name; empty for None. Raises DyngsError."""
+    """Return the motion files in a folder, or the file itself, by name; empty for None. Raises
+    DyngsError."""
     if path is None:
         return {}
     if path.is_file():
         return {path.name: path}
     if not path.is_dir():
         raise DyngsError(f"--motion {path}: no such file or folder")
-    found = sorted(file for file in path.rglob("*") if file.suffix.lower() in MOTION_SUFFIXES and file.is_file())
+    found = sorted(
+        file
+        for file in path.rglob("*")
+        if file.suffix.lower() in MOTION_SUFFIXES and file.is_file()
+    )
     if not found:
         raise DyngsError(f"--motion {path}: no motion files there ({', '.join(MOTION_SUFFIXES)})")
     return {file.relative_to(path).as_posix(): file for file in found[:_MOST_MOTIONS]}
 
 
 def in_motion(
-    opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles, *, keep_feet: bool = False
+    opened: Opened,
+    choice: str,
+    files: Mapping[str, Path],
+    angles: Angles,
+    *,
+    keep_feet: bool = False,
 ) -> Opened:
-    """Return the person of ``opened`` in a motion: as captured, at rest, by the ``angles`` of sliders, or of a file.
+    """Return the person of ``opened`` in a motion: as captured, at rest, by the ``angles`` of
+    sliders, or of a file.
 
     With ``keep_feet`` feet on the floor do not slide in the motion of a file.
 
@@ -68,7 +100,9 @@ def posed(opened: Opened, angles: Angles) -> Opened:
     for name, turns in angles.items():
         row = joint_row(name, poses.shape[1])
         rest = Rotation.from_rotvec(poses[0, row].double().cpu().numpy())
-        poses[0, row] = torch.from_numpy((rest * Rotation.from_euler("xyz", turns, degrees=True)).as_rotvec()).to(poses)
+        poses[0, row] = torch.from_numpy(
+            (rest * Rotation.from_euler("xyz", turns, degrees=True)).as_rotvec()
+        ).to(poses)
     return replace(opened, renderable=person.playing(replace(clip, poses=poses)), as_captured=False)
 
 

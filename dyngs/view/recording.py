@@ -1,4 +1,5 @@
-"""Camera paths recorded in the viewer, in the format that ``dyngs render --path`` reads (docs/camera_paths.md)."""
+"""Camera paths recorded in the viewer, in the format that ``dyngs render --path`` reads
+(docs/camera_paths.md)."""
 
 from __future__ import annotations
 
@@ -45,7 +46,9 @@ class Recording:
 
     def starts(self) -> list[float]:
         """Return the second of each keyframe."""
-        return np.concatenate([[0.0], np.cumsum([key.seconds for key in self.keyframes[:-1]])]).tolist()
+        return np.concatenate(
+            [[0.0], np.cumsum([key.seconds for key in self.keyframes[:-1]])]
+        ).tolist()
 
     def document(self, size: tuple[int, int], fps: float, world_offset: np.ndarray) -> str:
         """Return the path as JSON, less ``world_offset``; focal lengths follow the height, px."""
@@ -56,23 +59,34 @@ class Recording:
             focal = float(key.camera.intrinsics[0, 1, 1]) * height / key.camera.height
             entry: dict[str, Any] = {"at": start, "cam_from_world": pose.tolist(), "fl_x": focal}
             keys.append(entry if key.time is None else entry | {"time": key.time})
-        document = {"width": width, "height": height, "fps": fps, "loop": self.loops, "keyframes": keys}
+        document = {
+            "width": width,
+            "height": height,
+            "fps": fps,
+            "loop": self.loops,
+            "keyframes": keys,
+        }
         if self.loops:
             document["seconds"] = self.duration
         return json.dumps(document, indent=1) + "\n"
 
     def at(self, seconds: float) -> tuple[Cameras, float | None]:
-        """Return the camera and the time of the scene after ``seconds`` of the path, of at least one keyframe."""
+        """Return the camera and the time of the scene after ``seconds`` of the path, of at least
+        one keyframe."""
         first = self.keyframes[0].camera
         has_times = all(key.time is not None for key in self.keyframes)
         keys = Keyframes(
-            np.stack([key.camera.cam_from_world[0].double().cpu().numpy() for key in self.keyframes]),
+            np.stack(
+                [key.camera.cam_from_world[0].double().cpu().numpy() for key in self.keyframes]
+            ),
             np.stack([key.camera.intrinsics[0].double().cpu().numpy() for key in self.keyframes]),
             np.array(self.starts()),
             np.array([key.time for key in self.keyframes], np.float64) if has_times else None,
             self.duration if self.loops and len(self) > 1 else None,
         )
         made = interpolate_keyframes(keys, np.array([seconds]))
-        pose, matrix = (first.cam_from_world.new_tensor(x) for x in (made.cam_from_world, made.intrinsics))
+        pose, matrix = (
+            first.cam_from_world.new_tensor(x) for x in (made.cam_from_world, made.intrinsics)
+        )
         camera = replace(first, cam_from_world=pose, intrinsics=matrix)
         return camera, None if made.times is None else float(made.times[0])

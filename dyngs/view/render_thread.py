@@ -1,4 +1,5 @@
-"""The one thread that draws for all browsers: whoever waits longest is next, and gets the newest state."""
+"""The one thread that draws for all browsers: whoever waits longest is next, and gets the newest
+state."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from dyngs.view.session import Session
 
 
 class Drawer:
-    """Sessions, and the turn of each; ``on_error`` is told what went wrong for one, the others go on."""
+    """Sessions, and the turn of each; ``on_error`` is told what went wrong for one, the others go
+    on."""
 
     def __init__(self, on_error: Callable[[Session, str], None]) -> None:
         self._on_error = on_error
@@ -51,7 +53,9 @@ class Drawer:
 
     def start(self) -> None:
         """Draw in a thread of its own."""
-        self._thread = threading.Thread(target=copy_context().run, args=(self._run,), name="dyngs-view", daemon=True)
+        self._thread = threading.Thread(
+            target=copy_context().run, args=(self._run,), name="dyngs-view", daemon=True
+        )
         self._thread.start()
 
     def stop(self) -> None:
@@ -73,7 +77,8 @@ class Drawer:
                     self._changed.wait(wait)
 
     def _next(self) -> tuple[Session | None, float]:
-        """Return the session that is due first, among equals that served longest ago, and when: within 0.5 s."""
+        """Return the session that is due first, among equals that served longest ago, and when:
+        within 0.5 s."""
         best: tuple[Session | None, float] = (None, 0.5)
         for session in self.sessions:
             wait = session.due()
@@ -97,7 +102,8 @@ class Drawer:
             self._failures.pop(session, None)
 
     def _fail(self, session: Session, message: str) -> bool:
-        """Say what went wrong, once in a row: what is played fails many times a second. Return whether it is new."""
+        """Say what went wrong, once in a row: what is played fails many times a second. Return
+        whether it is new."""
         if session.closed or self._failures.get(session) == message:
             return False
         self._failures[session] = message

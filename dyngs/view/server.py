@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 MOVING_QUALITY, STILL_QUALITY = 75, 95
 """JPEG qualities."""
 _STATUS_EVERY = 0.5
-"""Seconds between two changes of the line about the images, and of the time slider while it plays."""
+"""Seconds between two changes of the line about the images, and of the time slider while it
+plays."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class Serving:
         port: None: 8080 or the next that is free.
         motions: motion files for people, by name.
         target, longest: seconds that an image may take while something moves, and at all.
-        in_thread: images are drawn in a thread of the server; else by whoever calls ``drawer.draw_one``.
+        in_thread: images are drawn in a thread of the server; else by whoever calls
+            ``drawer.draw_one``.
     """
 
     host: str = "127.0.0.1"
@@ -51,7 +53,8 @@ class Serving:
 
 
 class Browsing:
-    """One browser: its connection, its session, and the images that went to it; ``opened`` is what it sees first."""
+    """One browser: its connection, its session, and the images that went to it; ``opened`` is what
+    it sees first."""
 
     def __init__(self, client: viser.ClientHandle, opened: Opened, pace: Pace) -> None:
         self.client = client
@@ -79,16 +82,23 @@ class Browsing:
         """Take over the camera of the browser."""
         camera = self.client.camera
         size = _window(camera)
-        eye = Eye(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size)
+        eye = Eye(
+            tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size
+        )
         if self.session.move(eye):
             self.on_move()
         elif not self._has_refused:
             self._has_refused = True
-            notify(self.client, "Camera ignored", "The browser sent a camera that cannot exist; the last one stays.")
+            notify(
+                self.client,
+                "Camera ignored",
+                "The browser sent a camera that cannot exist; the last one stays.",
+            )
 
     def go_to(self, index: int | None) -> None:
         """Move the browser's camera to a view of the capture; None: to where it began."""
-        opened, handle = self.session.opened, self.client.camera
+        opened = self.session.opened
+        handle = self.client.camera
         begin = viewpoint_of(opened)
         camera = begin.start if index is None else views_of(opened).cameras[index]
         wxyz, position = pose_of(camera)
@@ -105,18 +115,24 @@ class Browsing:
         rate = self._since_told / max(now - self._told_at, 1e-6)
         shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
         view = self.session.shown_view
-        truth = "" if view is None else f", truth: {as_text(views_of(self.session.opened).names[view])}"
+        truth = (
+            "" if view is None else f", truth: {as_text(views_of(self.session.opened).names[view])}"
+        )
         if self.status is not None:
-            self.status.content = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}{truth}"
+            self.status.content = (
+                f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}{truth}"
+            )
         if self.time_slider is not None and self.session.timeline.playing:
             self.time_slider.value = round(self.session.time, 3)
         self._told_at, self._since_told = now, 0
 
 
 class Viewer:
-    """A page that shows scenes to any number of browsers, each with its own camera, time and settings.
+    """A page that shows scenes to any number of browsers, each with its own camera, time and
+    settings.
 
-    A context manager: the page is there from ``__enter__`` on. A new browser sees the scene ``first``.
+    A context manager: the page is there from ``__enter__`` on. A new browser sees the scene
+    ``first``.
 
     Raises:
         DyngsError: viser is not installed, or the port cannot be had.
@@ -170,18 +186,27 @@ class Viewer:
         """Set what all browsers share: the theme, the first camera, the up direction."""
         from viser import _messages
 
-        server, first = self.server, self.first
+        server = self.server
+        first = self.first
         for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
-            server._websock_server.unregister_handler(kind)  # it would pass the page through a host of others
+            # it would pass the page through a host of others
+            server._websock_server.unregister_handler(kind)
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         server.gui.main_panel.dock_right()  # next to the image, not over it
         begin = viewpoint_of(first)
         _, position = pose_of(begin.start)
         server.scene.set_up_direction(tuple(begin.up))
         camera = server.initial_camera
-        camera.position, camera.look_at = position, look_point(begin.start, begin.center, begin.extent)
-        camera.up, camera.fov = begin.up, fitting_fov(begin.start, begin.start.width / begin.start.height)
-        camera.near, camera.far = 1e-3 * begin.extent, 1e3 * begin.extent
+        camera.position, camera.look_at = (
+            position,
+            look_point(begin.start, begin.center, begin.extent),
+        )
+        camera.up, camera.fov = (
+            begin.up,
+            fitting_fov(begin.start, begin.start.width / begin.start.height),
+        )
+        camera.near = 1e-3 * begin.extent
+        camera.far = 1e3 * begin.extent
 
     def _connected(self, client: viser.ClientHandle) -> None:
         from dyngs.view.controls import Controls
@@ -213,7 +238,8 @@ class Viewer:
 
 
 def _window(camera: viser.CameraHandle) -> tuple[int, int]:
-    """Return width and height of the window of a browser, px: at least 16, also of one that has none yet."""
+    """Return width and height of the window of a browser, px: at least 16, also of one that has
+    none yet."""
     return max(16, int(camera.image_width)), max(16, int(camera.image_height))
 
 
@@ -227,7 +253,9 @@ def require_viser() -> None:
     try:
         import viser  # noqa: F401
     except ImportError as error:
-        raise DyngsError(f"the viewer needs viser ({error}); install it with: pip install 'dyngs[view]'") from error
+        raise DyngsError(
+            f"the viewer needs viser ({error}); install it with: pip install 'dyngs[view]'"
+        ) from error
 
 
 @contextmanager
@@ -236,7 +264,8 @@ def quiet() -> Iterator[None]:
     import rich
 
     console = rich.get_console()
-    before, console.quiet = console.quiet, True
+    before = console.quiet
+    console.quiet = True
     try:
         yield
     finally:

@@ -1,4 +1,5 @@
-"""What one browser looks at, and which image it gets next. Knows neither viser nor threads of its own."""
+"""What one browser looks at, and which image it gets next. Knows neither viser nor threads of its
+own."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ _SHORTEST = 1 / 30
 
 @dataclass(frozen=True)
 class Eye:
-    """The camera of a browser: wxyz and position as in ``camera_at``, vertical field of view in rad, window in px."""
+    """The camera of a browser: wxyz and position as in ``camera_at``, vertical field of view in
+    rad, window in px."""
 
     wxyz: tuple[float, ...]
     position: tuple[float, ...]
@@ -38,7 +40,10 @@ class Eye:
         """Whether there is such a camera: browsers may send anything."""
         numbers = (*self.wxyz, *self.position, self.fov)
         return (
-            all(map(math.isfinite, numbers)) and math.hypot(*self.wxyz) > 1e-6 and self.fov > 0 and min(self.size) > 0
+            all(map(math.isfinite, numbers))
+            and math.hypot(*self.wxyz) > 1e-6
+            and self.fov > 0
+            and min(self.size) > 0
         )
 
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
@@ -50,7 +55,8 @@ class Eye:
 class Timeline:
     """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
 
-    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or stops.
+    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or
+    stops.
     """
 
     time: float = 0.0
@@ -72,7 +78,8 @@ class Timeline:
         return self.playing and not self.loops and self.at(clock) >= 1.0
 
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
-        """Return the timeline with other attributes; the time does not jump, but who plays from the end begins at 0."""
+        """Return the timeline with other attributes; the time does not jump, but who plays from the
+        end begins at 0."""
         now = replace(self, time=self.at(clock), since=clock)
         if changes.get("playing") and now.time >= 1.0:
             now = replace(now, time=0.0)
@@ -100,7 +107,8 @@ class Display:
 
 @dataclass(frozen=True)
 class Sent:
-    """An image for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that it took."""
+    """An image for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that
+    it took."""
 
     image: np.ndarray
     is_refined: bool
@@ -110,8 +118,9 @@ class Sent:
 class Session:
     """One browser's view of a scene.
 
-    Several threads tell it what has changed; one thread calls ``draw_next``, and gets the newest state, for ``send``.
-    Images are as large as ``pace`` says: by default fourteen a second while something moves, full when all is still.
+    Several threads tell it what has changed; one thread calls ``draw_next``, and gets the newest
+    state, for ``send``. Images are as large as ``pace`` says: by default fourteen a second while
+    something moves, full when all is still.
     """
 
     def __init__(
@@ -138,7 +147,8 @@ class Session:
         self.closed = False
 
     def move(self, eye: Eye) -> bool:
-        """Look from ``eye`` from now on; return False, and go on as before, where there is no such camera."""
+        """Look from ``eye`` from now on; return False, and go on as before, where there is no such
+        camera."""
         if not eye.is_possible:
             return False
         with self._lock:
@@ -156,7 +166,9 @@ class Session:
 
     def set_time(self, time: float) -> None:
         with self._lock:
-            self.timeline = replace(self.timeline, time=min(max(time, 0.0), 1.0), since=self._clock())
+            self.timeline = replace(
+                self.timeline, time=min(max(time, 0.0), 1.0), since=self._clock()
+            )
         self._note_change()
 
     def change_timeline(self, **changes: bool | float) -> None:
@@ -181,13 +193,15 @@ class Session:
         self._note_change()
 
     def take(self, opened: Opened, *, refreshes: bool) -> None:
-        """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing else has changed."""
+        """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
+        else has changed."""
         with self._lock:
             self.opened = opened
             self._is_stale = self._is_stale or refreshes
 
     def ask(self, job: Callable[[], None], kind: str | None = None) -> None:
-        """Have ``job`` run by the thread that draws, before the next image, instead of waiting ones of its kind."""
+        """Have ``job`` run by the thread that draws, before the next image, instead of waiting ones
+        of its kind."""
         with self._lock:
             if kind is not None:
                 self._jobs = deque(entry for entry in self._jobs if entry[0] != kind)
@@ -209,16 +223,26 @@ class Session:
     def shown_view(self) -> int | None:
         """Index of the view whose truth is shown; None without any."""
         with self._lock:
-            look, eye, opened = self.look, self.eye, self.opened
-        if eye is None or not len(views_of(opened)) or not (look.comparing or look.layer == "error"):
+            look = self.look
+            eye = self.eye
+            opened = self.opened
+        if (
+            eye is None
+            or not len(views_of(opened))
+            or not (look.comparing or look.layer == "error")
+        ):
             return None
         if look.view is not None:
             return look.view
-        shown, time = views_of(opened), None if opened.renderable.is_static else self.time
-        return nearest_camera(eye.camera(), time, shown.poses, shown.times, viewpoint_of(opened).extent)
+        shown = views_of(opened)
+        time = None if opened.renderable.is_static else self.time
+        return nearest_camera(
+            eye.camera(), time, shown.poses, shown.times, viewpoint_of(opened).extent
+        )
 
     def due(self) -> float | None:
-        """Return in how many seconds something is to be drawn; 0: now, None: not before something changes."""
+        """Return in how many seconds something is to be drawn; 0: now, None: not before something
+        changes."""
         with self._lock:
             if self.closed or self.eye is None:
                 return None
@@ -228,7 +252,11 @@ class Session:
             soonest = max(0.0, self._drawn_at + _SHORTEST - now)
             if self._is_moving or self._is_stale:
                 return soonest
-            if self._drawn_area is None or not self._is_refined or self._drawn_area < 0.99 * self._refined_area:
+            if (
+                self._drawn_area is None
+                or not self._is_refined
+                or self._drawn_area < 0.99 * self._refined_area
+            ):
                 return max(soonest, self._changed_at + STILL_AFTER - now)
             return None
 
@@ -243,12 +271,16 @@ class Session:
             if self.closed or self.eye is None:
                 return
             is_moving = self._is_moving or self._clock() < self._changed_at + STILL_AFTER
-            area = self._pace.next_area(int(self._refined_area), None if is_moving else self._drawn_area or 1.0)
+            area = self._pace.next_area(
+                int(self._refined_area), None if is_moving else self._drawn_area or 1.0
+            )
             if self._is_stale and not is_moving:
                 area = max(area, self._drawn_area or 0.0)
-            opened, version = self.opened, self._changed_at
+            opened = self.opened
+            version = self._changed_at
             self._is_stale = False
-            self._drawn_area, self._is_refined = self._full_area, True  # if it fails, it is not tried again
+            self._drawn_area = self._full_area
+            self._is_refined = True  # if it fails, it is not tried again
             self._drawn_at = start = self._clock()
             shot = replace(self.shot(size_within(self._full_size, area)), is_moving=is_moving)
         image = draw(opened, shot)
@@ -268,15 +300,20 @@ class Session:
             if self.eye is None:
                 raise ValueError("there is no camera yet")
             size = size or self._full_size
-            camera, time, view = self.eye.camera(size), self.time, self.shown_view
+            camera = self.eye.camera(size)
+            time = self.time
+            view = self.shown_view
             if self._preview is not None:
                 recording, since = self._preview
                 camera, recorded = recording.at(self._clock() - since)
-                camera, view = in_window(camera, size), None
+                camera = in_window(camera, size)
+                view = None
                 time = time if recorded is None else recorded
-            look, opened = self.look, self.opened
+            look = self.look
+            opened = self.opened
         layer = "colour" if look.layer == "error" and view is None else look.layer
-        shown, divide = None if opened.renderable.is_static else time, look.divide if look.comparing else 1.0
+        shown = None if opened.renderable.is_static else time
+        divide = look.divide if look.comparing else 1.0
         return Shot(camera, shown, layer, look.part, view, divide)
 
     @property
@@ -312,5 +349,7 @@ class Session:
 
     def _note_change(self) -> None:
         with self._lock:
-            self._changed_at, self._is_stale, self._drawn_area = self._clock(), True, None
+            self._changed_at = self._clock()
+            self._is_stale = True
+            self._drawn_area = None
         self.on_change()

@@ -1,4 +1,5 @@
-"""What can be chosen to look at: one scene, the runs in a folder, or the people that a network may predict."""
+"""What can be chosen to look at: one scene, the runs in a folder, or the people that a network may
+predict."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ MOST_IMAGES = 5
 
 @dataclass(frozen=True)
 class PeopleNetwork:
-    """A trained network, captures of people by name, and the number of images that it was trained to predict from."""
+    """A trained network, captures of people by name, and the number of images that it was trained
+    to predict from."""
 
     run: Path
     people: dict[str, DataConfig]
@@ -39,7 +41,8 @@ class PeopleNetwork:
     _images: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def images_of(self, person: str) -> tuple[str, ...]:
-        """Return the names of the images of a person that can be predicted from. Raises DyngsError."""
+        """Return the names of the images of a person that can be predicted from. Raises
+        DyngsError."""
         if person not in self._images:
             views = read_capture(self.people[person]).splits["train"]
             self._images[person] = tuple(view.name for view in views)
@@ -49,7 +52,8 @@ class PeopleNetwork:
         """Return a person as the network predicts it.
 
         Args:
-            images: to predict from; without any, as many as in training, chosen to see much of the person.
+            images: to predict from; without any, as many as in training, chosen to see much of the
+                person.
             up: up axis; None: that of the capture.
 
         Raises:
@@ -64,15 +68,22 @@ class PeopleNetwork:
 
 
 def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
-    """Return a network with the people it was trained on, or those of ``capture``: one, or a folder of them.
+    """Return a network with the people it was trained on, or those of ``capture``: one, or a folder
+    of them.
 
     Raises DyngsError: not the run of a network, or no captures there.
     """
     config = network_config(run)
-    data = config.data if capture is None else config.data.model_copy(update={"root": capture.absolute()})
+    data = (
+        config.data
+        if capture is None
+        else config.data.model_copy(update={"root": capture.absolute()})
+    )
     if capture is not None and _is_capture(data):
         return PeopleNetwork(run, {capture.absolute().name: data}, config.model.source_views)
-    return PeopleNetwork(run, {one.root.name: one for one in captures_in(data)}, config.model.source_views)
+    return PeopleNetwork(
+        run, {one.root.name: one for one in captures_in(data)}, config.model.source_views
+    )
 
 
 def _is_capture(data: DataConfig) -> bool:
@@ -85,7 +96,8 @@ def _is_capture(data: DataConfig) -> bool:
 
 @dataclass(frozen=True)
 class Source:
-    """Names of scenes, at least one, what loads the scene of a name, and the network if that is what makes them."""
+    """Names of scenes, at least one, what loads the scene of a name, and the network if that is
+    what makes them."""
 
     names: tuple[str, ...]
     load: Callable[[str], Opened]
@@ -100,7 +112,8 @@ def open_source(
     data_root: Path | None = None,
     most: int | None = None,
 ) -> Source:
-    """Return what is to be seen of a run, a file, a folder of runs or a network; the first scene is not loaded yet.
+    """Return what is to be seen of a run, a file, a folder of runs or a network; the first scene is
+    not loaded yet.
 
     Args:
         up, data_root: as in ``open_to_view``.
@@ -112,14 +125,22 @@ def open_source(
         DyngsError: nothing is there, a folder without runs, or a ``capture`` without a network.
     """
     if not path.exists():
-        raise DyngsError(f"{path}: no such run, file or folder; give what `dyngs train` or `dyngs export` wrote")
+        raise DyngsError(
+            f"{path}: no such run, file or folder; give what `dyngs train` or `dyngs export` wrote"
+        )
     if is_network(path):
         network = open_network(path, capture)
         if most is not None:
-            raise DyngsError(f"{path} is a network of people; levels of detail are for still scenes")
-        return Source(tuple(network.people), lambda name: network.predict(name, up=up).to(device), network)
+            raise DyngsError(
+                f"{path} is a network of people; levels of detail are for still scenes"
+            )
+        return Source(
+            tuple(network.people), lambda name: network.predict(name, up=up).to(device), network
+        )
     if capture is not None:
-        raise DyngsError(f"--capture goes with the run of a network of people, {path} is none; leave it out")
+        raise DyngsError(
+            f"--capture goes with the run of a network of people, {path} is none; leave it out"
+        )
 
     def shown(opened: Opened) -> Opened:
         return opened.to(device) if most is None else coarser(opened.to(device), most)
@@ -137,12 +158,15 @@ def open_source(
     return Source(tuple(runs), lambda name: shown(open_to_view(runs[name], name, up)))
 
 
-def open_to_view(path: Path, name: str, up: str | None = None, data_root: Path | None = None) -> Opened:
+def open_to_view(
+    path: Path, name: str, up: str | None = None, data_root: Path | None = None
+) -> Opened:
     """Open a run or a file; where its capture is gone, a note says what lacks.
 
     Args:
         name: that it is shown by.
-        up: up axis such as "z" or "-y"; None: that of the capture, or as the file or its format has it.
+        up: up axis such as "z" or "-y"; None: that of the capture, or as the file or its format has
+            it.
         data_root: where the capture of a run lies by now, if it was moved.
 
     Raises:
@@ -179,7 +203,8 @@ def is_network(path: Path) -> bool:
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """Return the runs with a scene in a folder and the folders below it, by name; networks are left out."""
+    """Return the runs with a scene in a folder and the folders below it, by name; networks are left
+    out."""
     found: list[Path] = []
     level = [folder]
     for _ in range(_DEEPEST):
@@ -203,6 +228,8 @@ def _has_scene(run: Path) -> bool:
 
 def _folders(parent: Path) -> list[Path]:
     try:
-        return [child for child in parent.iterdir() if child.is_dir() and not child.name.startswith(".")]
+        return [
+            child for child in parent.iterdir() if child.is_dir() and not child.name.startswith(".")
+        ]
     except OSError:
         return []

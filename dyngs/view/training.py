@@ -1,4 +1,5 @@
-"""The page that shows a scene while it is trained: a listener of the events that the progress bar listens to."""
+"""The page that shows a scene while it is trained: a listener of the events that the progress bar
+listens to."""
 
 from __future__ import annotations
 
@@ -32,14 +33,19 @@ REFRESH_SECONDS = 1.0
 
 
 class DrawnBetweenSteps:
-    """Draws for browsers in the thread that trains, between two steps, since steps change the scene in place.
+    """Draws for browsers in the thread that trains, between two steps, since steps change the scene
+    in place.
 
-    Without browsers a step costs one look at an empty list. Images change nothing of the training: they are drawn
-    from a copy of the scene's shell, with caches of its own, and without gradients or random numbers.
+    Without browsers a step costs one look at an empty list. Images change nothing of the training:
+    they are drawn from a copy of the scene's shell, with caches of its own, and without gradients
+    or random numbers.
     """
 
     def __init__(
-        self, drawer: Drawer, fraction: float = FRACTION, clock: Callable[[], float] = time.perf_counter
+        self,
+        drawer: Drawer,
+        fraction: float = FRACTION,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._drawer, self._fraction, self._clock = drawer, fraction, clock
         self._not_before = 0.0
@@ -58,7 +64,10 @@ class DrawnBetweenSteps:
             self._refreshed_at = start
         with torch.no_grad():
             for session in sessions:
-                session.take(session.opened.showing(_shell(scene, session.opened.background)), refreshes=refreshes)
+                session.take(
+                    session.opened.showing(_shell(scene, session.opened.background)),
+                    refreshes=refreshes,
+                )
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
@@ -68,14 +77,18 @@ class DrawnBetweenSteps:
 
 
 class TrainingView:
-    """Listener that serves a page with the scene of a training; a context manager. ``say`` is told the link.
+    """Listener that serves a page with the scene of a training; a context manager. ``say`` is told
+    the link.
 
-    Raises DyngsError: a network is trained, which has no scene, viser is missing, or the port cannot be had.
+    Raises DyngsError: a network is trained, which has no scene, viser is missing, or the port
+    cannot be had.
     """
 
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
         if config.model.is_network:
-            raise DyngsError("--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts")
+            raise DyngsError(
+                "--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts"
+            )
         require_viser()
         free_port(serving.host, serving.port)  # now, not after reading the capture
         self._say = say
@@ -92,7 +105,8 @@ class TrainingView:
     def __call__(self, event: Event) -> None:
         """Draw what browsers ask for, after a step."""
         if isinstance(event, StepDone) and isinstance(event.loop.trainer, Trainer):
-            trainer, start = event.loop.trainer, time.perf_counter()
+            trainer = event.loop.trainer
+            start = time.perf_counter()
             if self._drawn is None:
                 self._drawn = self._begin(opened_training(trainer))
                 took = time.perf_counter() - start
@@ -103,22 +117,35 @@ class TrainingView:
 
     def _begin(self, first: Opened) -> DrawnBetweenSteps:
         """Serve the page, now that there is a scene."""
-        viewer = self._stack.enter_context(Viewer(Source((first.name,), lambda _: first), first, self._serving))
+        viewer = self._stack.enter_context(
+            Viewer(Source((first.name,), lambda _: first), first, self._serving)
+        )
         self._say(f"viewing: {viewer.link} (until the training ends)")
         return DrawnBetweenSteps(viewer.drawer)
 
 
 def opened_training(trainer: Trainer[Any]) -> Opened:
     """Return the scene of a trainer with the views that it is trained on."""
-    config, views = trainer.config, trainer.images.views
-    shown, cameras = captured_views(views, config.data, trainer.images), cameras_for_paths(views, config.data)
+    config = trainer.config
+    views = trainer.images.views
+    shown = captured_views(views, config.data, trainer.images)
+    cameras = cameras_for_paths(views, config.data)
     captured = Captured(config.data, trainer.info, trainer.capture)
     captured.once("views", lambda: shown)
     captured.once("cameras", lambda: cameras)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))
     name = config.run.name
-    return Opened(config, scene, trainer.done, 0.0, trainer.info, name=name, captured=captured, in_training=True)
+    return Opened(
+        config,
+        scene,
+        trainer.done,
+        0.0,
+        trainer.info,
+        name=name,
+        captured=captured,
+        in_training=True,
+    )
 
 
 def _shell(scene: Renderable, background: Tensor) -> Renderable:

@@ -26,7 +26,9 @@ from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, load_checkpoint
 from dyngs.training.processes import Processes
 
-BUSY = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150)
+BUSY = DefaultStrategy(
+    start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150
+)
 
 
 def _still(capture: Path, run: Path, **options: object) -> Config:
@@ -35,7 +37,9 @@ def _still(capture: Path, run: Path, **options: object) -> Config:
         model=StaticModel(sh_degree=1),
         init=RandomInit(num_random=60),
         strategy=BUSY,
-        train=TrainConfig.model_validate({"steps": 12, "log_every": 1, "remove_floaters": False, **options}),
+        train=TrainConfig.model_validate(
+            {"steps": 12, "log_every": 1, "remove_floaters": False, **options}
+        ),
         run=RunConfig(dir=run, threads=1),
     )
 
@@ -68,7 +72,9 @@ def small_person(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_human_capture(tmp_path_factory.mktemp("person"), options)
 
 
-def test_two_processes_end_with_the_bytes_of_one(moving: Path, still: Path, small_person: Path, tmp_path: Path) -> None:
+def test_two_processes_end_with_the_bytes_of_one(
+    moving: Path, still: Path, small_person: Path, tmp_path: Path
+) -> None:
     def configs(folder: str) -> list[Config]:
         return [
             _still(still, tmp_path / folder / "still", batch_size=2),
@@ -83,7 +89,11 @@ def test_two_processes_end_with_the_bytes_of_one(moving: Path, still: Path, smal
         train(config)
         assert config.run.dir is not None
         _require_same_bytes(config.run.dir, tmp_path / "two" / config.run.dir.name)
-    counts = {line.split(" Gaussians")[0].split()[-1] for line in said[0].splitlines() if line.startswith("step ")}
+    counts = {
+        line.split(" Gaussians")[0].split()[-1]
+        for line in said[0].splitlines()
+        if line.startswith("step ")
+    }
     assert len(counts) > 3, "the set of Gaussians changes"
 
 
@@ -100,7 +110,8 @@ def test_four_do_so_too_and_write_one_run(still: Path, tmp_path: Path) -> None:
     codes, said = run_in(4, do.trained, tmp_path, [_still(still, tmp_path / "four")])
     assert codes == [0] * 4, said
     assert said[1:] == ["", "", ""]
-    train(_still(still, tmp_path / "one", batch_size=4))  # one view for each process is what four take
+    # one view for each process is what four take
+    train(_still(still, tmp_path / "one", batch_size=4))
     _require_same_bytes(tmp_path / "one", tmp_path / "four")
     assert sorted(path.name for path in (tmp_path / "four").iterdir()) == sorted(
         path.name for path in (tmp_path / "one").iterdir()
@@ -108,7 +119,8 @@ def test_four_do_so_too_and_write_one_run(still: Path, tmp_path: Path) -> None:
 
 
 def test_two_views_for_each_process_differ_by_rounding(still: Path, tmp_path: Path) -> None:
-    """Rotations aside: of Gaussians that are round, their gradient is rounding, of which Adam makes full steps."""
+    """Rotations aside: of Gaussians that are round, their gradient is rounding, of which Adam makes
+    full steps."""
     few = {"batch_size": 4, "steps": 3}
     codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "two", **few)])
     assert codes == [0, 0], said
@@ -119,7 +131,9 @@ def test_two_views_for_each_process_differ_by_rounding(still: Path, tmp_path: Pa
 
 
 def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Path) -> None:
-    whole, parted = (_still(still, tmp_path / name, batch_size=2, save_every=5) for name in ("whole", "parted"))
+    whole, parted = (
+        _still(still, tmp_path / name, batch_size=2, save_every=5) for name in ("whole", "parted")
+    )
     train(whole)
     train(parted)
     for path in checkpoint_paths(tmp_path / "parted")[-1:]:
@@ -138,10 +152,14 @@ def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Pat
         ("death", "has lost the others: one has ended without a word"),
     ],
 )
-def test_where_one_fails_all_end_with_one_line(fails: str, line: str, still: Path, tmp_path: Path) -> None:
+def test_where_one_fails_all_end_with_one_line(
+    fails: str, line: str, still: Path, tmp_path: Path
+) -> None:
     codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "run")], fails)
     assert codes == [2, 9 if fails == "death" else 2]
-    errors = [x for text in said for x in text.splitlines() if not x.startswith(("memory:", "step "))]
+    errors = [
+        x for text in said for x in text.splitlines() if not x.startswith(("memory:", "step "))
+    ]
     assert len(errors) == 1
     assert line in errors[0]
 
@@ -154,14 +172,21 @@ def test_a_signal_to_any_process_ends_the_run_which_can_go_on(still: Path, tmp_p
     assert said[1] == ""
     step = latest_checkpoint(run).info.step
     assert 4 <= step < 400
-    assert f"dyngs: interrupted: stopped after step {step}; go on with: dyngs train --resume" in said[0]
+    assert (
+        f"dyngs: interrupted: stopped after step {step}; go on with: dyngs train --resume"
+        in said[0]
+    )
 
 
 def test_what_needs_one_process_says_so(still: Path, tmp_path: Path) -> None:
     two = Processes(0, 2)
-    with pytest.raises(DyngsError, match="minutes=1: is measured with one process; leave it out, or start without"):
+    with pytest.raises(
+        DyngsError, match="minutes=1: is measured with one process; leave it out, or start without"
+    ):
         train(_still(still, tmp_path / "run", minutes=1), processes=two)
-    with pytest.raises(DyngsError, match=r"batch_size=2: train[.]robust=always follows one image per step"):
+    with pytest.raises(
+        DyngsError, match=r"batch_size=2: train[.]robust=always follows one image per step"
+    ):
         train(_still(still, tmp_path / "run", robust="always"), processes=two)
     with pytest.raises(DyngsError, match="batch_size=5 views cannot be shared evenly among 2"):
         train(_still(still, tmp_path / "run", batch_size=5), processes=two)

@@ -39,11 +39,26 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "first"
-    return train(config_of(capture, folder, "init.kind=random", "init.num_random=60", "strategy.kind=fixed", steps=8))
+    return train(
+        config_of(
+            capture,
+            folder,
+            "init.kind=random",
+            "init.num_random=60",
+            "strategy.kind=fixed",
+            steps=8,
+        )
+    )
 
 
 def config_of(capture: Path, folder: Path, *more: str, steps: int = 8) -> Config:
-    words = (f"data.root={capture}", f"run.dir={folder}", f"train.steps={steps}", "run.threads=1", *more)
+    words = (
+        f"data.root={capture}",
+        f"run.dir={folder}",
+        f"train.steps={steps}",
+        "run.threads=1",
+        *more,
+    )
     return load_config(Path("static"), list(words))
 
 
@@ -53,7 +68,9 @@ def going_on(capture: Path, run: Path, folder: Path, *more: str, steps: int = 8)
 
 def rows_of(gaussians: Gaussians) -> set[bytes]:
     """All that a Gaussian is, as bytes, without an order."""
-    values = torch.cat([x.detach().reshape(len(x), -1) for x in gaussians.tensors().values()], dim=1)
+    values = torch.cat(
+        [x.detach().reshape(len(x), -1) for x in gaussians.tensors().values()], dim=1
+    )
     return {row.numpy().tobytes() for row in values}
 
 
@@ -70,8 +87,19 @@ def test_it_begins_where_the_scene_was(kind: str, capture: Path, run: Path, tmp_
     assert first.frozen is None
     old = open_run(run).scene.gaussians
     if kind == "run":
-        assert all(torch.equal(x, old.tensors()[name]) for name, x in first.gaussians.tensors().items())
-    new = train(going_on(capture, source, tmp_path / "new", "optim.rate_factor=1e-9", "strategy.kind=fixed", steps=1))
+        assert all(
+            torch.equal(x, old.tensors()[name]) for name, x in first.gaussians.tensors().items()
+        )
+    new = train(
+        going_on(
+            capture,
+            source,
+            tmp_path / "new",
+            "optim.rate_factor=1e-9",
+            "strategy.kind=fixed",
+            steps=1,
+        )
+    )
     assert psnr_of(new) == pytest.approx(psnr_of(run), abs=0.01)
 
 
@@ -84,7 +112,9 @@ class Wild(Densifier):
         source = torch.arange(len(parameters)).repeat(2)
         edit = TopologyEdit(source, torch.arange(len(source)) >= len(parameters))
         faint = parameters.logit_opacities.detach()[source] - 0.1
-        return EditResult(edit, {"means": parameters.means.detach()[source] + 0.01, "logit_opacities": faint})
+        return EditResult(
+            edit, {"means": parameters.means.detach()[source] + 0.01, "logit_opacities": faint}
+        )
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
         parameters.means.detach().add_(0.001)
@@ -92,7 +122,9 @@ class Wild(Densifier):
 
 def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_path: Path) -> None:
     """While the set grows, is shaken and ordered anew around it; also from a checkpoint."""
-    config = settled(going_on(capture, run, tmp_path / "new", f"init.box={list(BOX)}", "strategy.kind=fixed"))
+    config = settled(
+        going_on(capture, run, tmp_path / "new", f"init.box={list(BOX)}", "strategy.kind=fixed")
+    )
     first = first_of(config, read_capture(config.data))
     assert first is not None
     assert first.frozen is not None
@@ -114,17 +146,23 @@ def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_p
 
 def test_colour_only(capture: Path, run: Path, tmp_path: Path) -> None:
     new = train(going_on(capture, run, tmp_path / "new", "init.trains=colour"))
-    before, after = open_run(run).scene.gaussians.tensors(), open_run(new).scene.gaussians.tensors()
+    before = open_run(run).scene.gaussians.tensors()
+    after = open_run(new).scene.gaussians.tensors()
     assert not torch.equal(before["sh"], after["sh"])
     assert all(torch.equal(before[name], x) for name, x in after.items() if name != "sh")
     assert isinstance(load_resolved(new).strategy, FixedStrategy)
     assert psnr_of(new) > psnr_of(run) - 0.5
 
 
-def test_an_edited_run_goes_on_with_its_own_cameras(capture: Path, run: Path, tmp_path: Path) -> None:
+def test_an_edited_run_goes_on_with_its_own_cameras(
+    capture: Path, run: Path, tmp_path: Path
+) -> None:
     frame = Frame(scale=2.0, origin=(0.25, 0.0, 0.0))
     edited = edit_scene(run, tmp_path / "edited", Edits(frame=frame), tell=lambda _: None).path
-    assert main(["export", str(edited), "--format", "cameras", "--out", str(tmp_path / "cameras")]) == 0
+    assert (
+        main(["export", str(edited), "--format", "cameras", "--out", str(tmp_path / "cameras")])
+        == 0
+    )
     config = going_on(tmp_path / "cameras", edited, tmp_path / "new", "data.follow_links=true")
     first = first_of(config, read_capture(config.data))
     assert first is not None
@@ -135,9 +173,11 @@ def test_an_edited_run_goes_on_with_its_own_cameras(capture: Path, run: Path, tm
 
 
 def test_what_stays_is_not_part_of_a_change() -> None:
-    """A frozen Gaussian that would be split, relocated or made fainter is there as it was, and has no copies."""
+    """A frozen Gaussian that would be split, relocated or made fainter is there as it was, and has
+    no copies."""
     n = 4
-    means, sh = torch.arange(12.0).reshape(n, 3), torch.ones(n, 1, 3)
+    means = torch.arange(12.0).reshape(n, 3)
+    sh = torch.ones(n, 1, 3)
     old = Gaussians(means, torch.ones(n, 4), torch.zeros(n, 3), torch.arange(4.0), sh)
     still = Still(torch.tensor([False, True, False, True]))
     source = torch.tensor([0, 1, 1, 2, 2])
@@ -165,4 +205,7 @@ def test_what_cannot_be_gone_on_from(capture: Path, run: Path, tmp_path: Path) -
             train(going_on(capture, source, tmp_path / "new", *more, steps=2))
         assert "\n" not in str(caught.value)
         assert not (tmp_path / "new" / "checkpoints").exists()
-    assert main(["train", "static", f"data.root={capture}", "--from", str(run), "--resume", str(run)]) == 2
+    assert (
+        main(["train", "static", f"data.root={capture}", "--from", str(run), "--resume", str(run)])
+        == 2
+    )

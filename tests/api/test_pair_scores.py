@@ -9,7 +9,8 @@ from dyngs.api.pair_scores import explained_pixels
 
 def test_half_is_explained_and_neither_image_is_favoured() -> None:
     truth = torch.zeros(10, 10, 3)
-    one, other = truth.clone(), truth.clone()
+    one = truth.clone()
+    other = truth.clone()
     one[:5], other[5:] = 1.0, 1.0
     one[0], other[0] = 1.0, 1.0
     counts = explained_pixels(one, other, truth, None)

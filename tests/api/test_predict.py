@@ -32,7 +32,12 @@ class Made:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("predicted")
     people(folder / "people", (1,))
-    values = {"data": {"root": folder / "people"}, "model": NET, "train": {"steps": 2}, "run": {"dir": folder / "net"}}
+    values = {
+        "data": {"root": folder / "people"},
+        "model": NET,
+        "train": {"steps": 2},
+        "run": {"dir": folder / "net"},
+    }
     network = train(Config.model_validate(values))
     capture = people(folder / "others", (5,)) / "p5"
     return Made(network, capture, predict(network, capture, folder / "run", 3, steps=1))
@@ -53,9 +58,13 @@ def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
 
 
 def test_the_same_images_give_the_same_bytes(made: Made, tmp_path: Path) -> None:
-    again = predict(made.network, made.capture, tmp_path / "again", tuple(made.prediction.views), steps=1)
+    again = predict(
+        made.network, made.capture, tmp_path / "again", tuple(made.prediction.views), steps=1
+    )
     assert again.views == made.prediction.views
-    first, second = (load_run(run.run_dir).scene.gaussians.tensors().values() for run in (made.prediction, again))
+    first, second = (
+        load_run(run.run_dir).scene.gaussians.tensors().values() for run in (made.prediction, again)
+    )
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
@@ -74,7 +83,9 @@ def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
     run = made.prediction.run_dir
     with pytest.raises(DyngsError, match="exists already"):
         predict(made.network, made.capture, run, 3)
-    with pytest.raises(DyngsError, match="kind=human; a prediction needs one of human_predictor or gps or "):
+    with pytest.raises(
+        DyngsError, match="kind=human; a prediction needs one of human_predictor or gps or "
+    ):
         network_config(run)
     with pytest.raises(DyngsError, match="not a run folder"):
         predict(tmp_path, made.capture, tmp_path / "out", 3)
@@ -92,11 +103,15 @@ def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
         load_run(made.network)
 
 
-def test_a_body_is_fitted_where_none_is_given(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_is_fitted_where_none_is_given(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By what `dyngs train human` does, too; without one nothing is written."""
     asked: list[tuple[Path, bool]] = []
 
-    def fit(data: DataConfig, model: HumanModel, *, only_if_needed: bool, say: object, report: object) -> DataConfig:
+    def fit(
+        data: DataConfig, model: HumanModel, *, only_if_needed: bool, say: object, report: object
+    ) -> DataConfig:
         assert model.body is None, "the template of the network"
         asked.append((data.root, only_if_needed))
         return data

@@ -1,4 +1,5 @@
-"""From run to smaller run: the same bytes as with the stage in the configuration, and a promise that is kept."""
+"""From run to smaller run: the same bytes as with the stage in the configuration, and a promise
+that is kept."""
 
 from __future__ import annotations
 
@@ -33,13 +34,20 @@ def silent(text: str) -> None:
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes"))
+    return train(
+        busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes")
+    )
 
 
 @pytest.fixture
 def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search tries one value of each kind of limit."""
-    few = {"LEFT_GAUSSIANS": (0.5,), "CUT_OFFS": (0.02,), "FIELD_LOSSES": (0.1,), "HARMONIC_LOSSES": (0.03,)}
+    few = {
+        "LEFT_GAUSSIANS": (0.5,),
+        "CUT_OFFS": (0.02,),
+        "FIELD_LOSSES": (0.1,),
+        "HARMONIC_LOSSES": (0.03,),
+    }
     for name, candidates in few.items():
         monkeypatch.setattr(f"dyngs.prune.search.{name}", candidates)
 
@@ -68,7 +76,9 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_candidates")
-def test_on_a_gpu_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_gpu_it_is_the_same(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The search, of few candidates, its file, and the comparison with the run before."""
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
@@ -87,7 +97,9 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     """On views that fine-tuning has not seen; and it is the same each time."""
     told: list[str] = []
     folder = tmp_path / "a"
-    first, again = (prune_within(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b"))
+    first, again = (
+        prune_within(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b")
+    )
     assert first == again
     assert told[: len(told) // 2] == told[len(told) // 2 :]
     for path in (checkpoint_paths(folder)[-1], file_of(folder) / SCENE_FILE):
@@ -97,7 +109,9 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     trainer = assemble(config, restored=True)
     trainer.restore(latest_checkpoint(folder))
     shown = [trainer.images[i] for i in evenly_held_out(len(trainer.images))]
-    assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(first.after, abs=1e-4)
+    assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(
+        first.after, abs=1e-4
+    )
     before, after = compared([run_dir, file_of(folder)], 1)
     assert after.num_gaussians < before.num_gaussians
     assert after.stored is not None
@@ -112,9 +126,14 @@ def test_where_nothing_can_go_the_run_stays_as_it_is(
     """Every candidate is worse by 5 dB than what was there."""
     monkeypatch.setattr("dyngs.prune.search.apply_cut", _spoil)
     promise = prune_within(run_dir, tmp_path / "same", 0.2, BRIEFLY, silent)
-    assert checkpoint_paths(tmp_path / "same")[-1].read_bytes() == checkpoint_paths(run_dir)[-1].read_bytes()
+    assert (
+        checkpoint_paths(tmp_path / "same")[-1].read_bytes()
+        == checkpoint_paths(run_dir)[-1].read_bytes()
+    )
     assert str(promise).startswith("nothing can be taken away for 0.2 dB: the run is as it was")
-    assert all(limit.refused is not None and limit.refused[1] > 0.2 for limit in promise.limits[:-1])
+    assert all(
+        limit.refused is not None and limit.refused[1] > 0.2 for limit in promise.limits[:-1]
+    )
     assert promise.before - promise.after <= 0.2
 
 
@@ -126,7 +145,9 @@ def _spoil(trainer: object, cut: object, scores: object) -> None:
         trainer.model.scene.gaussians.sh.data[:, 0] += 0.8  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_an_interruption_leaves_nothing(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_leaves_nothing(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -154,7 +175,11 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
         (tmp_path / "new", ["prune.fraction=-0.1"], "prune.fraction"),
         (tmp_path / "new", ["prune.fraction=0"], "nothing to do"),
         (tmp_path / "new", ["prune.score=beauty"], "prune.score"),
-        (tmp_path / "new", ["prune.fraction=0.5", "prune.max_loss=1"], "unknown key 'prune.max_loss'"),
+        (
+            tmp_path / "new",
+            ["prune.fraction=0.5", "prune.max_loss=1"],
+            "unknown key 'prune.max_loss'",
+        ),
     ):
         with pytest.raises(DyngsError, match=message):
             prune_run(run_dir, out, overrides)

@@ -1,4 +1,5 @@
-"""Whole runs on a tiny capture: they learn, they repeat to the byte, they stop and go on as if nothing had happened."""
+"""Whole runs on a tiny capture: they learn, they repeat to the byte, they stop and go on as if
+nothing had happened."""
 
 from __future__ import annotations
 
@@ -34,7 +35,14 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, packaged_presets, save_config
+from dyngs.config.io import (
+    RESOLVED_NAME,
+    load_config,
+    load_resolved,
+    packaged_preset,
+    packaged_presets,
+    save_config,
+)
 from dyngs.data import read
 from dyngs.data.capture import Capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
@@ -49,7 +57,9 @@ from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import StepReport, Trainer
 
 # Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.
-BUSY = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150)
+BUSY = DefaultStrategy(
+    start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150
+)
 BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90, min_opacity=0.45)
 
 IN_TERMINAL = """
@@ -70,7 +80,12 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _config(
-    capture: Path, run_dir: Path, *, steps: int = 14, strategy: DefaultStrategy | McmcStrategy = BUSY, **changes: object
+    capture: Path,
+    run_dir: Path,
+    *,
+    steps: int = 14,
+    strategy: DefaultStrategy | McmcStrategy = BUSY,
+    **changes: object,
 ) -> Config:
     config = Config(
         data=DataConfig(root=capture),
@@ -102,7 +117,9 @@ def _stopped_and_resumed(config: Config, stop_at: int, monkeypatch: pytest.Monke
     return train(load_resolved(config.run.dir), resume_from=config.run.dir)
 
 
-def _interrupt_after(step: int, monkeypatch: pytest.MonkeyPatch, which: signal.Signals = signal.SIGINT) -> None:
+def _interrupt_after(
+    step: int, monkeypatch: pytest.MonkeyPatch, which: signal.Signals = signal.SIGINT
+) -> None:
     """Send ``which`` to this process during ``step``, once."""
     real = Trainer.step
 
@@ -116,7 +133,8 @@ def _interrupt_after(step: int, monkeypatch: pytest.MonkeyPatch, which: signal.S
 
 def test_a_run_learns_and_leaves_its_folder(capture: Path, tmp_path: Path) -> None:
     config = _config(capture, tmp_path / "run", steps=60, strategy=DefaultStrategy())
-    of_images = config.train.model_copy(update={"alpha_weight": 0.0})  # a loss whose weights do not change
+    # a loss whose weights do not change
+    of_images = config.train.model_copy(update={"alpha_weight": 0.0})
     config = config.model_copy(update={"train": of_images})
     folder = train(config)
     assert folder == tmp_path / "run"
@@ -144,7 +162,12 @@ def test_the_seed_decides_every_byte_and_threads_none(
     capture: Path, tmp_path: Path, strategy: DefaultStrategy | McmcStrategy
 ) -> None:
     results = {}
-    for name, seed, threads in (("a", 1, 1), ("again", 1, 1), ("two threads", 1, 2), ("other seed", 2, 1)):
+    for name, seed, threads in (
+        ("a", 1, 1),
+        ("again", 1, 1),
+        ("two threads", 1, 2),
+        ("other seed", 2, 1),
+    ):
         run = RunConfig(dir=tmp_path / name, seed=seed, threads=threads)
         results[name] = _final_bytes(train(_config(capture, tmp_path, strategy=strategy, run=run)))
     assert results["a"] == results["again"] == results["two threads"]
@@ -154,7 +177,8 @@ def test_the_seed_decides_every_byte_and_threads_none(
 
 
 def test_threads_decide_nothing_above_the_grain_of_torch(capture: Path, tmp_path: Path) -> None:
-    """torch shares work among threads from 32,768 elements on; some of its functions then round otherwise."""
+    """torch shares work among threads from 32,768 elements on; some of its functions then round
+    otherwise."""
     results = []
     for threads in (1, 2):
         config = _config(
@@ -175,7 +199,9 @@ def test_threads_decide_nothing_above_the_grain_of_torch(capture: Path, tmp_path
 def test_resumed_equals_uninterrupted(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, stop_at: int
 ) -> None:
-    strategy = {"mcmc": BUSY_MCMC, "absgrad": BUSY.model_copy(update={"absgrad": True})}.get(kind, BUSY)
+    strategy = {"mcmc": BUSY_MCMC, "absgrad": BUSY.model_copy(update={"absgrad": True})}.get(
+        kind, BUSY
+    )
     changes = {
         "model": StaticModel(sh_degree=2, filter_3d=kind == "filtered"),
         "data": DataConfig(root=capture, background="random"),
@@ -185,7 +211,9 @@ def test_resumed_equals_uninterrupted(
     resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
     assert _final_bytes(resumed) == _final_bytes(whole)
     same = ("step", "loss", "psnr", "num_gaussians")
-    assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole)]
+    assert [[r[k] for k in same] for r in _log(resumed)] == [
+        [r[k] for k in same] for r in _log(whole)
+    ]
 
 
 @pytest.mark.parametrize("stop_at", [2, 8])
@@ -258,8 +286,10 @@ def test_a_resumed_run_names_images_that_were_replaced(
 def test_a_resumed_run_refuses_another_capture(
     interrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also where it is said to be the same one at another place; that of a copy goes on to the same bytes."""
-    other, copied = tmp_path / "other", tmp_path / "copied"
+    """Also where it is said to be the same one at another place; that of a copy goes on to the same
+    bytes."""
+    other = tmp_path / "other"
+    copied = tmp_path / "copied"
     write_still_capture(other, StillOptions(size=24, num_train=4, num_test=1, samples=1))
     before = (interrupted / RESOLVED_NAME).read_text()
     assert main(["train", "--resume", str(interrupted), f"data.root={other}"]) == 2
@@ -268,7 +298,9 @@ def test_a_resumed_run_refuses_another_capture(
     (tmp_path / "capture").rename(copied)
     assert main(["train", "--resume", str(interrupted), f"data.root={copied}"]) == 0
     assert "warning" not in capsys.readouterr().err
-    assert _final_bytes(interrupted) == _final_bytes(train(_config(copied, tmp_path / "whole", steps=6)))
+    assert _final_bytes(interrupted) == _final_bytes(
+        train(_config(copied, tmp_path / "whole", steps=6))
+    )
     shutil.copytree(other, copied, dirs_exist_ok=True)
     assert main(["train", "--resume", str(interrupted), "train.steps=8"]) == 2
     assert "not the capture that the run was trained on" in capsys.readouterr().err
@@ -277,9 +309,21 @@ def test_a_resumed_run_refuses_another_capture(
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ("  kind: static\n", "  kind: dynamic\n", "model.kind=static, but config.yaml has model.kind=dynamic"),
-        ("  sh_degree: 2\n", "  sh_degree: 1\n", "model.sh_degree=2, but config.yaml has model.sh_degree=1"),
-        ("  refine: never\n", "  refine: always\n", "camera.refine=never, but config.yaml has camera.refine=always"),
+        (
+            "  kind: static\n",
+            "  kind: dynamic\n",
+            "model.kind=static, but config.yaml has model.kind=dynamic",
+        ),
+        (
+            "  sh_degree: 2\n",
+            "  sh_degree: 1\n",
+            "model.sh_degree=2, but config.yaml has model.sh_degree=1",
+        ),
+        (
+            "  refine: never\n",
+            "  refine: always\n",
+            "camera.refine=never, but config.yaml has camera.refine=always",
+        ),
         ("  exposure: never\n", "  exposure: always\n", "train.exposure=never, but config.yaml"),
     ],
 )
@@ -295,7 +339,9 @@ def test_an_edited_configuration_that_contradicts_the_checkpoint_is_refused(
         assert said in capsys.readouterr().err
 
 
-def test_time_adds_up_over_resumes(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_adds_up_over_resumes(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run_dir = tmp_path / "run"
     with monkeypatch.context() as patch:
         _interrupt_after(3, patch)
@@ -308,14 +354,19 @@ def test_time_adds_up_over_resumes(capture: Path, tmp_path: Path, monkeypatch: p
 
 
 def test_a_run_is_never_overwritten(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     config = _config(capture, tmp_path / "run", steps=4)
     with monkeypatch.context() as patch:
         _interrupt_after(2, patch)
         with pytest.raises(KeyboardInterrupt):
             train(config)
-    with pytest.raises(DyngsError, match=r"already holds a run, this very one, stopped after step 2 of 4.*--resume"):
+    with pytest.raises(
+        DyngsError, match=r"already holds a run, this very one, stopped after step 2 of 4.*--resume"
+    ):
         train(config)
     train(config, resume_from=tmp_path / "run")
     before = _final_bytes(tmp_path / "run")
@@ -325,18 +376,25 @@ def test_a_run_is_never_overwritten(
     assert re.search(r"holds just this run, finished.*dyngs eval.*--resume.*run.dir", line)
     assert line.count("\n") == 1
     with pytest.raises(
-        DyngsError, match=r"another one \(train.steps is 4 there and 9 here\).*--resume .*train.steps=9"
+        DyngsError,
+        match=r"another one \(train.steps is 4 there and 9 here\).*--resume .*train.steps=9",
     ):
         train(_config(capture, tmp_path / "run", steps=9))
-    with pytest.raises(DyngsError, match=r"another one \(run.seed is 42 there and 7 here\); give another run.dir"):
+    with pytest.raises(
+        DyngsError, match=r"another one \(run.seed is 42 there and 7 here\); give another run.dir"
+    ):
         train(config.model_copy(update={"run": config.run.model_copy(update={"seed": 7})}))
-    assert train(config, resume_from=tmp_path / "run") == tmp_path / "run"  # finished: nothing to do
+    # finished: nothing to do
+    assert train(config, resume_from=tmp_path / "run") == tmp_path / "run"
     assert _final_bytes(tmp_path / "run") == before
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is")
+@pytest.mark.skipif(
+    not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is"
+)
 def test_a_folder_that_is_renamed_gets_its_run(capture: Path, tmp_path: Path) -> None:
-    still, moved = tmp_path / "still", tmp_path / "moved"
+    still = tmp_path / "still"
+    moved = tmp_path / "moved"
     train(_config(capture, still, steps=12))
 
     def rename(event: Event) -> None:
@@ -350,8 +408,11 @@ def test_a_folder_that_is_renamed_gets_its_run(capture: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("is_replaced", [False, True])
-def test_a_folder_that_is_removed_loses_nothing_but_its_log(capture: Path, tmp_path: Path, is_replaced: bool) -> None:
-    run, still = tmp_path / "run", tmp_path / "still"
+def test_a_folder_that_is_removed_loses_nothing_but_its_log(
+    capture: Path, tmp_path: Path, is_replaced: bool
+) -> None:
+    run = tmp_path / "run"
+    still = tmp_path / "still"
     train(_config(capture, still, steps=12))
 
     def remove(event: Event) -> None:
@@ -360,7 +421,9 @@ def test_a_folder_that_is_removed_loses_nothing_but_its_log(capture: Path, tmp_p
             if is_replaced:
                 run.write_text("mine")
 
-    with pytest.raises(DyngsError, match=r"step 12 is in .*; go on with `dyngs train --resume") as caught:
+    with pytest.raises(
+        DyngsError, match=r"step 12 is in .*; go on with `dyngs train --resume"
+    ) as caught:
         train(_config(capture, run, steps=12), listeners=[remove])
     found = tmp_path / ("run_2" if is_replaced else "run")
     assert f"--resume {found}`" in str(caught.value)
@@ -394,7 +457,8 @@ def test_bad_input_leaves_no_folder(tmp_path: Path) -> None:
 def test_a_loss_that_is_not_finite_stops_the_run(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, calls = losses.l1_ssim_loss, []
+    real = losses.l1_ssim_loss
+    calls = []
 
     def failing(rendered: Tensor, target: Tensor, weight: float, mask: Tensor | None) -> Tensor:
         calls.append(0)
@@ -411,14 +475,19 @@ def test_checkpoints_and_scores_come_when_asked(capture: Path, tmp_path: Path) -
     options = TrainConfig(steps=9, save_every=3, eval_every=6, log_every=100)
     folder = train(_config(capture, tmp_path / "run", train=options))
     assert [path.stem for path in checkpoint_paths(folder)] == ["step_0000006", "step_0000009"]
-    assert [(record["step"], "split" in record) for record in _log(folder)] == [(6, True), (9, False)]
+    assert [(record["step"], "split" in record) for record in _log(folder)] == [
+        (6, True),
+        (9, False),
+    ]
     assert json.loads((folder / "metrics.json").read_text())["num_views"] == 1
 
 
 @pytest.fixture
 def saves_each_step(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The time between checkpoints is over after each step; returns the steps of all that are written."""
-    saved, real = list[int](), train_module.save_checkpoint
+    """The time between checkpoints is over after each step; returns the steps of all that are
+    written."""
+    saved = list[int]()
+    real = train_module.save_checkpoint
 
     def noted(folder: Path, checkpoint: Checkpoint, seconds: float) -> Path:
         saved.append(checkpoint.info.step)
@@ -430,7 +499,9 @@ def saves_each_step(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def _saved_often(config: Config, minutes: float = 5.0) -> Config:
-    return config.model_copy(update={"train": config.train.model_copy(update={"save_minutes": minutes})})
+    return config.model_copy(
+        update={"train": config.train.model_copy(update={"save_minutes": minutes})}
+    )
 
 
 def test_checkpoints_come_by_time_in_every_preset() -> None:
@@ -440,7 +511,10 @@ def test_checkpoints_come_by_time_in_every_preset() -> None:
 
 @pytest.mark.parametrize("strategy", [BUSY, BUSY_MCMC], ids=["default", "mcmc"])
 def test_saving_changes_no_byte(
-    capture: Path, tmp_path: Path, strategy: DefaultStrategy | McmcStrategy, saves_each_step: list[int]
+    capture: Path,
+    tmp_path: Path,
+    strategy: DefaultStrategy | McmcStrategy,
+    saves_each_step: list[int],
 ) -> None:
     plain = train(_saved_often(_config(capture, tmp_path / "plain", strategy=strategy), 0))
     assert saves_each_step == [14]
@@ -463,20 +537,31 @@ def test_saving_changes_no_byte_of_a_network(tmp_path: Path, saves_each_step: li
 
 def test_the_capture_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Deciding, training and evaluating hand it on."""
-    root, reads, real = write_tiny_capture(tmp_path / "capture"), list[Path](), read._finished
+    root = write_tiny_capture(tmp_path / "capture")
+    reads = list[Path]()
+    real = read._finished
 
     def counted(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
         reads.append(capture.root)
         return real(capture, options, decode_videos)
 
     monkeypatch.setattr(read, "_finished", counted)
-    words = ["train.steps=4", "train.eval_every=2", "init.num_random=40", "model.num_random_moving=20", "run.threads=1"]
-    config = load_config(packaged_preset("dynamic"), [f"data.root={root}", f"run.dir={tmp_path / 'run'}", *words])
+    words = [
+        "train.steps=4",
+        "train.eval_every=2",
+        "init.num_random=40",
+        "model.num_random_moving=20",
+        "run.threads=1",
+    ]
+    config = load_config(
+        packaged_preset("dynamic"), [f"data.root={root}", f"run.dir={tmp_path / 'run'}", *words]
+    )
     assert (tmp_path / "run" / "metrics.json") in train(config).iterdir()
     assert len(reads) == 1
 
 
-# --- scenes that move -------------------------------------------------------------------------------------------------
+# --- scenes that move
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -485,9 +570,13 @@ def moving_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module", params=ALL_KINDS)
-def whole_run(request: pytest.FixtureRequest, moving_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole_run(
+    request: pytest.FixtureRequest, moving_capture: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """An uninterrupted run of each kind of field."""
-    return train(busy_config(moving_capture, tmp_path_factory.mktemp(request.param) / "run", request.param))
+    return train(
+        busy_config(moving_capture, tmp_path_factory.mktemp(request.param) / "run", request.param)
+    )
 
 
 def _kind_of(run_dir: Path) -> str:
@@ -498,7 +587,9 @@ def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
     log = _log(whole_run)
     moving = [record["num_moving"] / record["num_gaussians"] for record in log]
     assert moving[:7] == [0.0] * 7
-    assert all(0 < fraction < 1 for fraction in moving[7:]), "a part of them must move, or the tests below show little"
+    assert all(0 < fraction < 1 for fraction in moving[7:]), (
+        "a part of them must move, or the tests below show little"
+    )
     assert log[7]["num_moving"] > 12, "not only the random Gaussians"
     assert log[-1]["num_moving"] != log[13]["num_moving"], "some must have been frozen since"
     assert len({record["num_gaussians"] for record in log}) > 3
@@ -512,18 +603,27 @@ def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
 
 @pytest.mark.parametrize(
     ("whole_run", "stop_at"),
-    [*((kind, 11) for kind in ALL_KINDS), *((kind, stop) for kind in ("control_nodes", "mlp") for stop in (2, 8, 18))],
+    [
+        *((kind, 11) for kind in ALL_KINDS),
+        *((kind, stop) for kind in ("control_nodes", "mlp") for stop in (2, 8, 18)),
+    ],
     indirect=["whole_run"],
     scope="module",
 )
 def test_a_resumed_moving_run_equals_an_uninterrupted_one(
-    whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
+    whole_run: Path,
+    moving_capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    stop_at: int,
 ) -> None:
     config = busy_config(moving_capture, tmp_path / "parts", _kind_of(whole_run))
     resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
     assert _final_bytes(resumed) == _final_bytes(whole_run)
     same = ("step", "loss", "psnr", "num_gaussians", "num_moving")
-    assert [[r[k] for k in same] for r in _log(resumed)] == [[r[k] for k in same] for r in _log(whole_run)]
+    assert [[r[k] for k in same] for r in _log(resumed)] == [
+        [r[k] for k in same] for r in _log(whole_run)
+    ]
 
 
 def test_saving_changes_no_byte_of_a_moving_run(
@@ -536,7 +636,9 @@ def test_saving_changes_no_byte_of_a_moving_run(
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("steps", [2, 8, 11, 20], ids=["coarse", "begin", "fine", "split"])
-def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path: Path, kind: str, steps: int) -> None:
+def test_what_is_loaded_is_what_the_trainer_draws(
+    moving_capture: Path, tmp_path: Path, kind: str, steps: int
+) -> None:
     """At any time, with the 3D filter."""
     config = busy_config(moving_capture, tmp_path, kind, filter_3d=True, freeze_below_px=0.1)
     trainer = assemble(config)
@@ -555,10 +657,13 @@ def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_where_nothing_moves_no_field_is_kept(tmp_path: Path, kind: str) -> None:
-    """A capture with times of a scene that stands still: after the split it is static, in the run and on disk."""
+    """A capture with times of a scene that stands still: after the split it is static, in the run
+    and on disk."""
     capture = write_timed_capture(tmp_path / "capture")
     run = train(busy_config(capture, tmp_path / "run", kind, freeze_below_px=1e6))
-    assert [record["num_moving"] > 0 for record in _log(run)] == [8 <= step <= 14 for step in range(1, 25)]
+    assert [record["num_moving"] > 0 for record in _log(run)] == [
+        8 <= step <= 14 for step in range(1, 25)
+    ]
     assert load_run(run).scene.is_static
     tensors = load_checkpoint(checkpoint_paths(run)[-1]).part("model")
     assert tensors.keys() == {"times"}
@@ -582,7 +687,9 @@ def test_where_a_still_model_explains_all_the_run_stays_static(
     assert _final_bytes(resumed) == _final_bytes(whole)
     changed = {"model": StaticModel(sh_degree=1), "optim": OptimConfig(rate_factor=1)}
     still = config.model_copy(update=changed | {"run": RunConfig(dir=tmp_path / "s", threads=1)})
-    assert [record["loss"] for record in _log(train(still))] == [record["loss"] for record in _log(whole)]
+    assert [record["loss"] for record in _log(train(still))] == [
+        record["loss"] for record in _log(whole)
+    ]
 
 
 def test_a_field_that_is_no_number_stops_the_run(
@@ -598,7 +705,8 @@ def test_a_field_that_is_no_number_stops_the_run(
         message = str(caught.value)
         assert "\n" not in message
         pattern = (
-            r"step 11, view 'train/r_0\d\d': the field makes means, .* at [0-9.]+ not finite; lower .*model\.deform"
+            r"step 11, view 'train/r_0\d\d': the field makes means, "
+            r".* at [0-9.]+ not finite; lower .*model\.deform"
         )
         assert re.match(pattern, message)
         assert message.endswith("step_0000008.safetensors")
@@ -612,7 +720,10 @@ def test_a_field_that_is_huge_stops_the_run(
     """By what overflows first, a term of the loss or what the field makes of the Gaussians."""
     _spoil_in_step(11, monkeypatch, 1e30)
     config = busy_config(moving_capture, tmp_path / "run", _kind_of(whole_run))
-    with pytest.raises(DyngsError, match=r"^step 11, view 'train/r_0\d\d': the (field makes|loss term) .*step_0000008"):
+    with pytest.raises(
+        DyngsError,
+        match=r"^step 11, view 'train/r_0\d\d': the (field makes|loss term) .*step_0000008",
+    ):
         train(config.model_copy(update={"train": TrainConfig(steps=24, save_every=4)}))
     assert load_run(tmp_path / "run").step == 8
 

@@ -1,4 +1,5 @@
-"""The cost of a whole run, by a part of it: right where steps cost what they are taken to, on a clock of its own."""
+"""The cost of a whole run, by a part of it: right where steps cost what they are taken to, on a
+clock of its own."""
 
 from __future__ import annotations
 
@@ -11,7 +12,15 @@ from limited import limited
 from dyngs.api.train import train
 from dyngs.budget import cost
 from dyngs.budget.cost import CostMeter, Range
-from dyngs.config import Config, DataConfig, DefaultStrategy, FixedStrategy, McmcStrategy, RandomInit, TrainConfig
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    FixedStrategy,
+    McmcStrategy,
+    RandomInit,
+    TrainConfig,
+)
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.kinds import assemble
@@ -27,7 +36,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _config(capture: Path, **changes: object) -> Config:
-    config = Config(data=DataConfig(root=capture), init=RandomInit(num_random=60), train=TrainConfig(steps=12))
+    config = Config(
+        data=DataConfig(root=capture), init=RandomInit(num_random=60), train=TrainConfig(steps=12)
+    )
     return config.model_copy(update=changes)
 
 
@@ -42,32 +53,42 @@ class _Clock:
 
 def _metered(config: Config, steps: int, monkeypatch: pytest.MonkeyPatch) -> CostMeter:
     """A meter that has seen all steps of ``config``."""
-    clock, run = _Clock(), limited(assemble(config))
+    clock = _Clock()
+    run = limited(assemble(config))
     monkeypatch.setattr(cost, "time", clock)
     meter = CostMeter(run, steps)
 
     def tick(event: object) -> None:
         match event:
             case StepDone():
-                clock.now += 1e-3 * step_cost(run.trainer.config, event.step, 256, event.num_gaussians)
+                clock.now += 1e-3 * step_cost(
+                    run.trainer.config, event.step, 256, event.num_gaussians
+                )
 
     run.loop.subscribe(tick, meter)
     run.loop.run()
     return meter
 
 
-def test_the_time_is_that_of_the_steps_to_come(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_is_that_of_the_steps_to_come(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = _config(capture, strategy=FixedStrategy())
     found = _metered(config, 1000, monkeypatch).found()
     assert found is not None
     true = sum(1e-3 * step_cost(with_steps(config, 1000), step, 256, 60) for step in range(1, 1001))
-    assert found.seconds.middle == pytest.approx(true, rel=0.03, abs=2)  # and the real seconds beside the steps
+    # and the real seconds beside the steps
+    assert found.seconds.middle == pytest.approx(true, rel=0.03, abs=2)
     assert found.seconds.low < found.seconds.middle < found.seconds.high
     assert found.gaussians == Range(60, 60, 60)
 
 
-def test_gaussians_are_added_as_before_up_to_the_limit(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    busy = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=None, max_gaussians=4000)
+def test_gaussians_are_added_as_before_up_to_the_limit(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    busy = DefaultStrategy(
+        start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=None, max_gaussians=4000
+    )
     meter = _metered(_config(capture, strategy=busy), 48, monkeypatch)
     now = meter.run.trainer.num_gaussians
     assert now > 60
@@ -90,7 +111,10 @@ def test_ranges_are_told_in_two_digits() -> None:
 
 
 def test_a_preview_says_what_all_steps_would_cost(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("dyngs.budget.time.FEWEST_STEPS", 1)  # a slow machine may do no more
     monkeypatch.setattr(cost, "FIRST", 0)
@@ -99,7 +123,11 @@ def test_a_preview_says_what_all_steps_would_cost(
     run = train(load_config("static", [*words, *asked]))
     told = capsys.readouterr().out
     assert re.search(r"^memory: about .* GB", told)
-    line = next(line for line in told.splitlines() if line.startswith("all 100,000 steps would take about"))
-    assert re.search(r"min \(.*MB \(.*of memory.*MB.* of disk.*Gaussians.*--resume .*train.steps=100000", line), line
+    line = next(
+        line for line in told.splitlines() if line.startswith("all 100,000 steps would take about")
+    )
+    assert re.search(
+        r"min \(.*MB \(.*of memory.*MB.* of disk.*Gaussians.*--resume .*train.steps=100000", line
+    ), line
     assert train(load_config("static", [*words, *asked])) == run
     assert "holds just this run" in capsys.readouterr().out

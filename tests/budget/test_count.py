@@ -1,4 +1,5 @@
-"""The number of Gaussians at the end: never exceeded, wherever a run begins, and known to a resumed run."""
+"""The number of Gaussians at the end: never exceeded, wherever a run begins, and known to a resumed
+run."""
 
 from __future__ import annotations
 
@@ -76,20 +77,30 @@ def test_no_run_ends_with_more_and_a_resumed_one_knows(
     assert len(load_run(folder).scene) <= 100
     train(load_resolved(folder), resume_from=folder)
     assert end.read_bytes() == wanted
-    assert out.splitlines()[-1] == capsys.readouterr().out.splitlines()[-1], "it is said again as it was"
+    assert out.splitlines()[-1] == capsys.readouterr().out.splitlines()[-1], (
+        "it is said again as it was"
+    )
 
 
 def test_room_in_a_file_is_a_limit(
-    captures: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    captures: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """And a stage that removes more is left alone."""
     monkeypatch.setattr("dyngs.training.limits.FEWEST", 1)
     config = config_of("default", captures, tmp_path / "run", BudgetConfig(max_mb=0.001))
     folder = train(config)
     assert len(load_run(folder).scene) == 1000 // (16 + 0.35 * 9)
-    assert "budget.max_mb: asked for at most 52 Gaussians, got 52; 150 before" in capsys.readouterr().out
+    assert (
+        "budget.max_mb: asked for at most 52 Gaussians, got 52; 150 before"
+        in capsys.readouterr().out
+    )
     compact = PruneConfig(fraction=0.7, steps=3)
-    other = config.model_copy(update={"prune": compact, "run": RunConfig(dir=tmp_path / "other", threads=1)})
+    other = config.model_copy(
+        update={"prune": compact, "run": RunConfig(dir=tmp_path / "other", threads=1)}
+    )
     assert len(load_run(train(other)).scene) <= 45
     assert "removed" not in capsys.readouterr().out.split("asked for at most 52")[1]
 
@@ -97,10 +108,15 @@ def test_room_in_a_file_is_a_limit(
 def test_the_line_says_whether_it_mattered(captures: dict[str, Path], tmp_path: Path) -> None:
     trainer = assemble(config_of("default", captures, tmp_path, BudgetConfig(max_gaussians=160)))
     assert (
-        "asked for at most 160 Gaussians, got 150; it held growth back" in CountLimit(limited(trainer), 160).reached()
+        "asked for at most 160 Gaussians, got 150; it held growth back"
+        in CountLimit(limited(trainer), 160).reached()
     )
     assert "150; it cost nothing" in CountLimit(limited(trainer), 300).reached()
     person = assemble(config_of("human", captures, tmp_path, BudgetConfig()))
     count = person.num_gaussians
-    person.config = person.config.model_copy(update={"strategy": DefaultStrategy(max_gaussians=count + 2)})
-    assert "it cost nothing" in CountLimit(limited(person), count + 1).reached(), "growth was not held back by it"
+    person.config = person.config.model_copy(
+        update={"strategy": DefaultStrategy(max_gaussians=count + 2)}
+    )
+    assert "it cost nothing" in CountLimit(limited(person), count + 1).reached(), (
+        "growth was not held back by it"
+    )

@@ -24,7 +24,12 @@ def test_stages_only_come_and_the_last_is_the_end(steps: int, tuning: int, fract
     compact = PruneConfig(fraction=0.5, steps=tuning) if tuning else PruneConfig()
     config = PLAIN.model_copy(update={"train": TrainConfig(steps=steps), "prune": compact})
     total = config.total_steps
-    around = sorted({min(max(x, 0), total) for x in (0, steps // 2, steps - 1, steps, steps + 1, total - 1, total)})
+    around = sorted(
+        {
+            min(max(x, 0), total)
+            for x in (0, steps // 2, steps - 1, steps, steps + 1, total - 1, total)
+        }
+    )
     found = [stage(config, step) for step in around]
     assert found == sorted(found)
     assert found[0] == 0 < found[-1]
@@ -35,7 +40,9 @@ def test_stages_only_come_and_the_last_is_the_end(steps: int, tuning: int, fract
 
 
 def test_the_stage_of_a_run_follows_its_steps_and_its_time(still: Path) -> None:
-    config = Config(data=DataConfig(root=still), init=RandomInit(num_random=9), train=TrainConfig(steps=10))
+    config = Config(
+        data=DataConfig(root=still), init=RandomInit(num_random=9), train=TrainConfig(steps=10)
+    )
     run = limited(assemble(config), given=100.0, used=0.0)
     found = []
     for run.trainer.done in range(11):
@@ -49,7 +56,9 @@ def test_the_stage_of_a_run_follows_its_steps_and_its_time(still: Path) -> None:
 
 @pytest.mark.usefixtures("one_thread")
 def test_a_removal_is_told_with_what_it_costs(still: Path) -> None:
-    config = Config(data=DataConfig(root=still), model=StaticModel(sh_degree=0), init=RandomInit(num_random=40))
+    config = Config(
+        data=DataConfig(root=still), model=StaticModel(sh_degree=0), init=RandomInit(num_random=40)
+    )
     run = limited(assemble(config))
     told: list[Event] = []
     run.loop.subscribe(told.append)
@@ -67,6 +76,7 @@ def test_a_removal_is_told_with_what_it_costs(still: Path) -> None:
 
 def test_another_trainer_is_that_of_the_loop(still: Path) -> None:
     config = Config(data=DataConfig(root=still), init=RandomInit(num_random=9))
-    run, other = limited(assemble(config)), assemble(config)
+    run = limited(assemble(config))
+    other = assemble(config)
     run.exchange(other)
     assert run.trainer is run.loop.trainer is other

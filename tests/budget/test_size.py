@@ -10,13 +10,28 @@ import torch
 
 from dyngs.api.train import train
 from dyngs.budget.size import write_within
-from dyngs.config import BudgetConfig, Config, DataConfig, OptimConfig, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.config import (
+    BudgetConfig,
+    Config,
+    DataConfig,
+    OptimConfig,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.config.io import load_resolved
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.kinds import assemble
 from dyngs.prune.stage import quality_of
-from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, has_only_scene_file, latest_checkpoint, load_run
+from dyngs.runs.checkpoint import (
+    SCENE_FILE,
+    checkpoint_paths,
+    has_only_scene_file,
+    latest_checkpoint,
+    load_run,
+)
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.training.trainer import Trainer
 
@@ -83,11 +98,14 @@ def test_a_run_writes_it_and_a_finished_one_makes_it_again(
 ) -> None:
     folder = train(config_of(still, tmp_path / "run", BudgetConfig(max_mb=0.02)))
     assert "budget.max_mb: asked 0.02, got" in capsys.readouterr().out
-    file, end = folder / EXPORT_FOLDER / SCENE_FILE, checkpoint_paths(folder)[-1].read_bytes()
+    file = folder / EXPORT_FOLDER / SCENE_FILE
+    end = checkpoint_paths(folder)[-1].read_bytes()
     wanted = file.read_bytes()
     assert len(wanted) <= 20_000
     assert has_only_scene_file(folder / EXPORT_FOLDER)
-    assert len(load_run(folder / EXPORT_FOLDER).scene) == len(latest_checkpoint(folder).tensors["gaussians.means"])
+    assert len(load_run(folder / EXPORT_FOLDER).scene) == len(
+        latest_checkpoint(folder).tensors["gaussians.means"]
+    )
     shutil.rmtree(folder / EXPORT_FOLDER)
     train(load_resolved(folder), resume_from=folder)
     assert file.read_bytes() == wanted

@@ -1,4 +1,5 @@
-"""How many steps fit, on clocks of known pace; and that a run ends in time, whatever the machine."""
+"""How many steps fit, on clocks of known pace; and that a run ends in time, whatever the
+machine."""
 
 from __future__ import annotations
 
@@ -78,7 +79,9 @@ def test_what_fits_fits_and_one_more_does_not(done: int, pace: float, seconds: f
     found = fitting_steps(forecast, PLAIN, done, seconds, 7000)
     assert done <= found <= 7000
     assert found == done or forecast.seconds(with_steps(PLAIN, found), found, done) <= seconds
-    assert found == 7000 or forecast.seconds(with_steps(PLAIN, found + 1), found + 1, done) > seconds
+    assert (
+        found == 7000 or forecast.seconds(with_steps(PLAIN, found + 1), found + 1, done) > seconds
+    )
 
 
 def test_a_settled_run_goes_on_as_it_was() -> None:
@@ -104,7 +107,9 @@ def simulated(seconds: float, most_steps: int, *, fits: bool) -> Deadline:
 @pytest.mark.parametrize("factor", [0.3, 1.0, 4.0])
 def test_a_run_whose_steps_change_pace_fills_its_time(factor: float) -> None:
     """A simulated machine: steps that take ``factor`` times as long from a third of the run on."""
-    deadline, config, now = simulated(100.0, 100_000, fits=True), with_steps(PLAIN, 5000), 0.0
+    deadline = simulated(100.0, 100_000, fits=True)
+    config = with_steps(PLAIN, 5000)
+    now = 0.0
     for done in itertools.count():
         deadline._forecast.observe(config, done, now, 1000, 10_000)
         found = deadline.steps(config, done, now)
@@ -118,7 +123,9 @@ def test_a_run_whose_steps_change_pace_fills_its_time(factor: float) -> None:
 def test_a_step_unlike_the_others_is_not_taken_for_the_pace() -> None:
     """The step in which motion begins searches the images: 30 seconds of 100."""
     moving = PLAIN.model_copy(update={"model": DynamicModel(motion_from=0.05)})
-    deadline, config, now = simulated(100.0, 100_000, fits=True), with_steps(moving, 5000), 0.0
+    deadline = simulated(100.0, 100_000, fits=True)
+    config = with_steps(moving, 5000)
+    now = 0.0
     planned = list[int]()
     for done in itertools.count(1):
         now += 30.0 if done == motion_begins_after(config, config.train.steps) else 0.02
@@ -133,7 +140,8 @@ def test_a_step_unlike_the_others_is_not_taken_for_the_pace() -> None:
 
 
 def test_a_settled_number_of_steps_ends_only_with_the_time() -> None:
-    deadline, now = simulated(10.0, 1000, fits=False), 0.0
+    deadline = simulated(10.0, 1000, fits=False)
+    now = 0.0
     config = with_steps(PLAIN, 1000)
     for done in range(1000):
         found = deadline.steps(config, done, now)
@@ -148,7 +156,8 @@ def test_a_settled_number_of_steps_ends_only_with_the_time() -> None:
 
 def test_what_happens_once_is_neither_missed_nor_redone() -> None:
     dynamic = PLAIN.model_copy(update={"model": DynamicModel(motion_from=0.1)})
-    longer, shorter = with_steps(dynamic, 20_000), with_steps(dynamic, 16_000)
+    longer = with_steps(dynamic, 20_000)
+    shorter = with_steps(dynamic, 16_000)
     assert [same_phase(longer, shorter, done) for done in (1500, 1800, 2100)] == [True, False, True]
     thrifty = PLAIN.model_copy(update={"colour": AutoColour()})
     assert not same_phase(with_steps(thrifty, 1000), with_steps(thrifty, 1200), 650)
@@ -160,10 +169,21 @@ def alone(config: Config, folder: Path, resumed: Checkpoint | None = None) -> _R
     capture = read_capture(config.data) if resumed else prepared(config)
     folder.mkdir(exist_ok=True)
     held = Held(folder, alone=True)
-    return _Run(config, folder, resumed, config, capture=capture, held=held, processes=Processes(), watch=Stopwatch())
+    return _Run(
+        config,
+        folder,
+        resumed,
+        config,
+        capture=capture,
+        held=held,
+        processes=Processes(),
+        watch=Stopwatch(),
+    )
 
 
-def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_limit_no_deadline(
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The number of steps that were asked for is kept in mind; that of a resumed run is settled."""
     _slowed(monkeypatch, 0.1)
     config = busy_config(moving, tmp_path / "run", "control_nodes")
@@ -181,7 +201,9 @@ def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("kind", ["control_nodes", "hexplane"])
-def test_refitted_is_where_it_was_on_other_schedules(kind: str, moving: Path, tmp_path: Path) -> None:
+def test_refitted_is_where_it_was_on_other_schedules(
+    kind: str, moving: Path, tmp_path: Path
+) -> None:
     config = busy_config(moving, tmp_path, kind)
     trainer = assemble(config)
     for _ in range(10):
@@ -190,15 +212,21 @@ def test_refitted_is_where_it_was_on_other_schedules(kind: str, moving: Path, tm
     same = refitted(trainer, config)
     assert longer.done == same.done == trainer.done == 10
     assert longer.config.train.steps == config.train.steps + 6
-    before, after = trainer.checkpoint().tensors, same.checkpoint().tensors
+    before = trainer.checkpoint().tensors
+    after = same.checkpoint().tensors
     assert before.keys() == after.keys()
-    assert all(torch.equal(x, after[name]) for name, x in before.items() if "rng" in name or "gaussians" in name)
+    assert all(
+        torch.equal(x, after[name])
+        for name, x in before.items()
+        if "rng" in name or "gaussians" in name
+    )
     assert trainer.step().loss == same.step().loss
 
 
 def _slowed(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[float]:
     """A clock that only steps advance, by ``seconds`` each; its time."""
-    clock, real = [0.0], Trainer.step
+    clock = [0.0]
+    real = Trainer.step
 
     def stepping(trainer: Trainer) -> StepReport:
         clock[0] += seconds
@@ -209,7 +237,9 @@ def _slowed(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[float]:
     return clock
 
 
-def test_a_first_fit_keeps_or_lowers_the_steps(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_first_fit_keeps_or_lowers_the_steps(
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = busy_config(moving, tmp_path, "control_nodes")
     wanted = config.train.steps
     _slowed(monkeypatch, 1.0)
@@ -225,7 +255,8 @@ def test_a_first_fit_keeps_or_lowers_the_steps(moving: Path, tmp_path: Path, mon
 
 def _slowed_by_pixels(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     """A clock that only steps advance, by ``seconds`` for each pixel of their image."""
-    clock, real = _slowed(monkeypatch, 0.0), Trainer.step
+    clock = _slowed(monkeypatch, 0.0)
+    real = Trainer.step
 
     def stepping(trainer: Trainer) -> StepReport:
         report = real(trainer)
@@ -236,9 +267,13 @@ def _slowed_by_pixels(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     monkeypatch.setattr("dyngs.budget.time.SMALLEST_SIDE", 5)
 
 
-def test_decoding_counts_once_for_each_image(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps of a second on 16 images that take ten seconds each: with them in every step 50 would fit."""
-    clock, real = _slowed(monkeypatch, 1.0), ImageLoader._decode
+def test_decoding_counts_once_for_each_image(
+    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps of a second on 16 images that take ten seconds each: with them in every step 50 would
+    fit."""
+    clock = _slowed(monkeypatch, 1.0)
+    real = ImageLoader._decode
 
     def decoded(loader: ImageLoader, view: View) -> Decoded:
         clock[0] += 10.0
@@ -294,13 +329,17 @@ def test_images_are_halved_until_enough_steps_fit(
 def test_a_run_that_gets_slow_ends_in_time_and_stays_ended(
     moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a clock that only steps advance: fitted at first to all steps, then they take ten times as long."""
+    """On a clock that only steps advance: fitted at first to all steps, then they take ten times as
+    long."""
     config = timed(busy_config(moving, tmp_path / "run", "control_nodes"), 2.0)
     wanted = config.train.steps
-    clock, real = _slowed(monkeypatch, 0.1), Trainer.step
+    clock = _slowed(monkeypatch, 0.1)
+    real = Trainer.step
 
     def slower(trainer: Trainer) -> StepReport:
-        clock[0] += 10.0 if trainer.done >= wanted // 2 and clock[0] > 0.1 * (22 + wanted // 2) else 0.0
+        clock[0] += (
+            10.0 if trainer.done >= wanted // 2 and clock[0] > 0.1 * (22 + wanted // 2) else 0.0
+        )
         return real(trainer)
 
     monkeypatch.setattr(Trainer, "step", slower)

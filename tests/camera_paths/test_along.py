@@ -15,7 +15,9 @@ def _walk(count: int, shake: float = 0.0) -> np.ndarray:
     rng = np.random.default_rng(1)
     eyes = np.stack([np.linspace(0, 10, count), np.zeros(count), np.ones(count)], axis=-1)
     eyes += shake * rng.normal(size=eyes.shape)
-    return np.stack([look_at(eye, eye + [0, 5, 0] + shake * rng.normal(size=3), UP) for eye in eyes])
+    return np.stack(
+        [look_at(eye, eye + [0, 5, 0] + shake * rng.normal(size=3), UP) for eye in eyes]
+    )
 
 
 def test_a_shaken_walk_becomes_smooth() -> None:
@@ -41,7 +43,9 @@ def test_a_path_is_the_same_in_any_unit(factor: float) -> None:
     scaled = poses.copy()
     scaled[:, :3, 3] *= factor
     wanted, found = (path_along(cameras_at(x), 30).cameras for x in (poses, scaled))
-    np.testing.assert_allclose(found.centers.numpy() / factor, wanted.centers.numpy(), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        found.centers.numpy() / factor, wanted.centers.numpy(), rtol=0, atol=1e-4
+    )
 
 
 def test_photos_in_any_order_become_a_walk() -> None:
@@ -73,12 +77,15 @@ def test_few_cameras_give_a_path(count: int) -> None:
 
 
 def test_fixed_cameras_are_visited_once_each() -> None:
-    """Five cameras that stand, at four times each, in the order of time: the path is that of five cameras."""
+    """Five cameras that stand, at four times each, in the order of time: the path is that of five
+    cameras."""
     poses = np.linalg.inv(ring_of(5, np.zeros(3)).cam_from_world.numpy())
     times = np.repeat([0.0, 0.3, 0.6, 1.0], 5).tolist()
     many = path_along(cameras_at(np.tile(poses, (4, 1, 1))), 9, times)
     once = path_along(cameras_at(poses), 9)
-    np.testing.assert_allclose(many.cameras.centers.numpy(), once.cameras.centers.numpy(), atol=1e-9)
+    np.testing.assert_allclose(
+        many.cameras.centers.numpy(), once.cameras.centers.numpy(), atol=1e-9
+    )
     assert many.times is None
 
 

@@ -17,7 +17,10 @@ from dyngs.errors import DyngsError
 from dyngs.files.limits import VARIABLE
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
-EYES = [look_at(np.array([3 * math.cos(a), 3 * math.sin(a), 1 + 0.2 * a]), np.zeros(3), UP) for a in (0.1, 0.9, 2.0)]
+EYES = [
+    look_at(np.array([3 * math.cos(a), 3 * math.sin(a), 1 + 0.2 * a]), np.zeros(3), UP)
+    for a in (0.1, 0.9, 2.0)
+]
 """Camera to world, OpenCV's axes."""
 FOV = math.degrees(2 * math.atan(HEIGHT / 2 / FOCAL))
 
@@ -28,12 +31,26 @@ def opengl() -> list[np.ndarray]:
 
 def nerfstudio(**more: Any) -> dict[str, Any]:
     views = [
-        {"camera_to_world": pose.ravel().tolist(), "fov": FOV, "aspect": WIDTH / HEIGHT, "render_time": 0.25 * i}
+        {
+            "camera_to_world": pose.ravel().tolist(),
+            "fov": FOV,
+            "aspect": WIDTH / HEIGHT,
+            "render_time": 0.25 * i,
+        }
         for i, pose in enumerate(opengl())
     ]
     keyframes = [{"matrix": pose.ravel().tolist(), "fov": FOV, "aspect": 1.0} for pose in opengl()]
-    document = {"camera_type": "perspective", "render_width": WIDTH, "render_height": HEIGHT, "fps": 12}
-    return document | {"seconds": 0.25, "default_fov": 50, "keyframes": keyframes, "camera_path": views} | more
+    document = {
+        "camera_type": "perspective",
+        "render_width": WIDTH,
+        "render_height": HEIGHT,
+        "fps": 12,
+    }
+    return (
+        document
+        | {"seconds": 0.25, "default_fov": 50, "keyframes": keyframes, "camera_path": views}
+        | more
+    )
 
 
 def of_3dgs() -> list[dict[str, Any]]:
@@ -54,7 +71,14 @@ def of_3dgs() -> list[dict[str, Any]]:
 
 def transforms(poses: list[Any], **more: Any) -> dict[str, Any]:
     frames = [{"file_path": f"{i}.png", "transform_matrix": pose} for i, pose in enumerate(poses)]
-    return {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "frames": frames} | more
+    return {
+        "w": WIDTH,
+        "h": HEIGHT,
+        "fl_x": FOCAL,
+        "cx": WIDTH / 2,
+        "cy": HEIGHT / 2,
+        "frames": frames,
+    } | more
 
 
 def written(folder: Path, document: object) -> Path:
@@ -69,7 +93,10 @@ def written(folder: Path, document: object) -> Path:
         pytest.param(
             nerfstudio(
                 camera_path=[
-                    {**view, "camera_to_world": np.reshape(view["camera_to_world"], (4, 4)).tolist()}
+                    {
+                        **view,
+                        "camera_to_world": np.reshape(view["camera_to_world"], (4, 4)).tolist(),
+                    }
                     for view in nerfstudio()["camera_path"]
                 ]
             ),
@@ -78,7 +105,9 @@ def written(folder: Path, document: object) -> Path:
         pytest.param(of_3dgs(), id="cameras.json"),
         pytest.param(transforms([pose.tolist() for pose in opengl()]), id="transforms.json"),
         pytest.param(transforms([pose.ravel().tolist() for pose in opengl()]), id="16 numbers"),
-        pytest.param(transforms([pose.T.ravel().tolist() for pose in opengl()]), id="16 numbers by column"),
+        pytest.param(
+            transforms([pose.T.ravel().tolist() for pose in opengl()]), id="16 numbers by column"
+        ),
         pytest.param(transforms([pose[:3].tolist() for pose in opengl()]), id="3x4"),
         pytest.param(transforms([pose[:3].ravel().tolist() for pose in opengl()]), id="12 numbers"),
     ],
@@ -87,7 +116,9 @@ def test_cameras_are_those_that_were_meant(document: Any, tmp_path: Path) -> Non
     path = read_path(written(tmp_path, document))
     cameras = path.cameras
     assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
-    np.testing.assert_allclose(cameras.cam_from_world.numpy(), np.linalg.inv(np.stack(EYES)), atol=1e-5)
+    np.testing.assert_allclose(
+        cameras.cam_from_world.numpy(), np.linalg.inv(np.stack(EYES)), atol=1e-5
+    )
     wanted = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
     np.testing.assert_allclose(cameras.intrinsics.numpy(), [wanted] * 3, atol=1e-4)
     if isinstance(document, dict) and "camera_path" in document:
@@ -102,10 +133,15 @@ def test_what_a_file_leaves_open(tmp_path: Path) -> None:
     path = read_path(written(tmp_path, nerfstudio(camera_path=views, default_fov=90)))
     assert path.times is None
     assert float(path.cameras.intrinsics[0, 0, 0]) == pytest.approx(HEIGHT / 2)
-    blender = {"camera_angle_x": math.pi / 2, "frames": transforms([pose.tolist() for pose in opengl()])["frames"]}
+    blender = {
+        "camera_angle_x": math.pi / 2,
+        "frames": transforms([pose.tolist() for pose in opengl()])["frames"],
+    }
     with pytest.raises(DyngsError, match="'width' is missing"):
         read_path(written(tmp_path, blender))
-    assert float(read_path(written(tmp_path, blender), size=(40, 30)).cameras.intrinsics[0, 0, 0]) == pytest.approx(20)
+    assert float(
+        read_path(written(tmp_path, blender), size=(40, 30)).cameras.intrinsics[0, 0, 0]
+    ) == pytest.approx(20)
 
 
 def test_sizes_and_lenses_of_frames(tmp_path: Path) -> None:
@@ -121,12 +157,18 @@ def test_sizes_and_lenses_of_frames(tmp_path: Path) -> None:
 
 
 BAD = [
-    ({"time": 1, "path": [{"R": [0, 0, 0, 1], "T": [0.5, 0.5, 0.5], "fov": 50}]}, "a path of instant-ngp"),
+    (
+        {"time": 1, "path": [{"R": [0, 0, 0, 1], "T": [0.5, 0.5, 0.5], "fov": 50}]},
+        "a path of instant-ngp",
+    ),
     (nerfstudio(camera_type="equirectangular"), "'camera_type' is equirectangular"),
     (nerfstudio(camera_path=[]), "needs a list of cameras"),
     (nerfstudio(camera_path=[{"camera_to_world": [1] * 16, "fov": "wide"}]), "'fov' is 'wide'"),
     (nerfstudio(camera_path=[{"fov": 50}]), "'transform_matrix': the pose must be"),
-    (nerfstudio(camera_path=[{"camera_to_world": [[1, 2], 3], "fov": 50}]), "'transform_matrix' must be"),
+    (
+        nerfstudio(camera_path=[{"camera_to_world": [[1, 2], 3], "fov": 50}]),
+        "'transform_matrix' must be",
+    ),
     (nerfstudio(render_height=None), "'render_height' must be a number"),
     (nerfstudio(render_height=10**400), "'render_height' must be a number"),
     (nerfstudio(render_width=1e9), "'width' is 1000000000"),

@@ -28,14 +28,18 @@ def test_orbit_of_a_ring_is_the_ring(target: tuple[float, float, float], count: 
 
 def test_orbit_moves_with_the_scene() -> None:
     """A rigid motion of all cameras moves the orbit alike: no axis of the world is special."""
-    motion = look_at(np.array([3.0, -2.0, 7.0]), np.array([1.0, 1.0, 1.0]), np.array([0.3, 1.0, 0.2]))
+    motion = look_at(
+        np.array([3.0, -2.0, 7.0]), np.array([1.0, 1.0, 1.0]), np.array([0.3, 1.0, 0.2])
+    )
     for path, cameras in ((orbit_path, ring_of(5, np.zeros(3))), (spiral_path, forward_facing(5))):
         moved = cameras_at(motion @ np.linalg.inv(cameras.cam_from_world.numpy()))
         expected = path(cameras, 7).cam_from_world @ torch.from_numpy(np.linalg.inv(motion))
         torch.testing.assert_close(path(moved, 7).cam_from_world, expected, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("cameras", [ring_of(1, np.zeros(3)), forward_facing(6), ring_of(2, np.ones(3))])
+@pytest.mark.parametrize(
+    "cameras", [ring_of(1, np.zeros(3)), forward_facing(6), ring_of(2, np.ones(3))]
+)
 @pytest.mark.parametrize("path", [orbit_path, spiral_path])
 def test_odd_camera_sets_give_finite_rigid_paths(cameras: Cameras, path: Any) -> None:
     made = path(cameras, 9)
@@ -51,7 +55,9 @@ def test_a_spiral_rises_first() -> None:
 
 
 def test_a_camera_straight_above_still_orbits() -> None:
-    made = orbit_path(cameras_at(look_at(np.array([0, 0, 5.0]), np.zeros(3), np.array([0, 1.0, 0]))[None]), 6)
+    made = orbit_path(
+        cameras_at(look_at(np.array([0, 0, 5.0]), np.zeros(3), np.array([0, 1.0, 0]))[None]), 6
+    )
     assert_rigid(made)
     assert torch.isfinite(made.cam_from_world).all()
 
@@ -65,15 +71,21 @@ def test_spiral_stays_near_the_cameras_and_closes() -> None:
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.sampled_from([(0, 0, 1), (0, -1, 0), (1, 2, 3)]), st.floats(0.01, 1000), st.integers(1, 5))
+@given(
+    st.sampled_from([(0, 0, 1), (0, -1, 0), (1, 2, 3)]), st.floats(0.01, 1000), st.integers(1, 5)
+)
 def test_points_fill_the_image(up: tuple[float, float, float], scale: float, frames: int) -> None:
     rng = np.random.default_rng(0)
     center = np.array([5.0, -3.0, 2.0]) * scale
     points = center + scale * rng.normal(size=(3000, 3)).clip(-2, 2)
     stray = np.full((5, 3), 1e6 * scale)
-    orbit = frame_orbit_for_points(np.concatenate([points, stray, [[np.nan] * 3]]), frames, (80, 60), up)
+    orbit = frame_orbit_for_points(
+        np.concatenate([points, stray, [[np.nan] * 3]]), frames, (80, 60), up
+    )
     assert_rigid(orbit)
-    for pose, k in zip(orbit.cam_from_world.double().numpy(), orbit.intrinsics.double().numpy(), strict=True):
+    for pose, k in zip(
+        orbit.cam_from_world.double().numpy(), orbit.intrinsics.double().numpy(), strict=True
+    ):
         local = points @ pose[:3, :3].T + pose[:3, 3]
         pixels = (local @ k.T)[:, :2] / local[:, 2:]
         inside = ((pixels > 0) & (pixels < [80, 60])).all(axis=1) & (local[:, 2] > 0)
@@ -91,7 +103,8 @@ def test_no_points_or_no_up_is_one_line() -> None:
 
 
 def _arc(degrees: float, count: int, tilt: float = 0.0) -> Cameras:
-    """Return cameras on an arc around the origin, at radius 4 and height 1.5, the first ``tilt`` degrees further."""
+    """Return cameras on an arc around the origin, at radius 4 and height 1.5, the first ``tilt``
+    degrees further."""
     angles = np.radians(np.linspace(-degrees / 2, degrees / 2, count) + tilt)
     eyes = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.full(count, 1.5)], axis=-1)
     return cameras_at(np.stack([look_at(eye, np.zeros(3), UP) for eye in eyes]))
@@ -107,11 +120,15 @@ def test_an_orbit_stays_on_the_filmed_arc(degrees: float, count: int, turned: fl
     spacing = 2 * 4 * np.sin(np.radians(degrees / (count - 1)) / 2)
     assert nearest.max() < 0.55 * spacing + 1e-6, "always between two cameras"
     covered = np.linalg.norm(centers[:, None] - centers, axis=-1).max()
-    assert covered > 0.98 * 2 * 4 * np.sin(np.radians(min(degrees, 180)) / 2) * (degrees < 180), "to both ends"
+    assert covered > 0.98 * 2 * 4 * np.sin(np.radians(min(degrees, 180)) / 2) * (degrees < 180), (
+        "to both ends"
+    )
     (note,) = orbit_of(cameras).notes
     assert f"arc of {degrees:.0f} degrees" in note
     steps = np.linalg.norm(centers - np.roll(centers, 1, axis=0), axis=1)
-    assert steps.max() < 0.5 * np.radians(degrees) * 4 * 2 * np.pi / 24 * 1.01, "the last frame leads to the first"
+    assert steps.max() < 0.5 * np.radians(degrees) * 4 * 2 * np.pi / 24 * 1.01, (
+        "the last frame leads to the first"
+    )
 
 
 def test_all_around_there_is_nothing_to_say() -> None:
@@ -123,7 +140,8 @@ def test_an_arc_orbit_keeps_the_height_of_the_cameras_near() -> None:
     poses = np.stack([look_at(np.array([4 * np.cos(a), 4 * np.sin(a), 2 + 2 * a]), np.zeros(3), UP)
                       for a in np.linspace(-0.8, 0.8, 15)])  # fmt: skip
     centers = orbit_path(cameras_at(poses), 40, UP).centers.numpy()
-    heights, azimuths = centers[:, 2], np.arctan2(centers[:, 1], centers[:, 0])
+    heights = centers[:, 2]
+    azimuths = np.arctan2(centers[:, 1], centers[:, 0])
     assert np.corrcoef(heights, azimuths)[0, 1] > 0.99
     assert np.ptp(heights) > 1.5
 
@@ -140,6 +158,8 @@ def test_another_up_tilts_the_circle() -> None:
         made = path(ring_of(8, np.zeros(3)), 8, leaning)
         assert_rigid(made)
         np.testing.assert_allclose(made.cam_from_world[:, 0, :3].numpy() @ leaning, 0, atol=1e-9)
-        assert (made.cam_from_world[:, 1, :3].numpy() @ leaning < 0).all(), "y points down, away from up"
+        assert (made.cam_from_world[:, 1, :3].numpy() @ leaning < 0).all(), (
+            "y points down, away from up"
+        )
     heights = orbit_path(ring_of(8, np.zeros(3)), 8, leaning).centers.numpy() @ leaning
     np.testing.assert_allclose(heights, heights[0], atol=1e-9)

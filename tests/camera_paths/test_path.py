@@ -36,7 +36,9 @@ def test_json_round_trip_with_offset(tmp_path: Path) -> None:
     write_path(file, CameraPath(ring, 24.0, (0.0, 0.25, 0.5, 1.0)), offset)
     back = read_path(file, offset)
     assert (back.fps, back.times, len(back)) == (24.0, (0.0, 0.25, 0.5, 1.0), 4)
-    torch.testing.assert_close(back.cameras.cam_from_world, ring.cam_from_world.float(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        back.cameras.cam_from_world, ring.cam_from_world.float(), atol=1e-6, rtol=0
+    )
     torch.testing.assert_close(back.cameras.intrinsics, ring.intrinsics.float())
     far = read_path(file).cameras.centers.double().numpy()
     np.testing.assert_allclose(far, ring.centers.numpy() + offset, atol=1.0)  # float32 at 1e6
@@ -47,11 +49,15 @@ def test_opengl_poses_and_field_of_view(tmp_path: Path) -> None:
     frame = {"transform_matrix": (eye @ np.diag([1, -1, -1, 1.0])).tolist()}
     frames = [frame, {**frame, "fl_x": 90, "cx": 30}]
     file = tmp_path / "p.json"
-    file.write_text(json.dumps({"width": 64, "height": 48, "camera_angle_x": np.pi / 2, "frames": frames}))
+    file.write_text(
+        json.dumps({"width": 64, "height": 48, "camera_angle_x": np.pi / 2, "frames": frames})
+    )
     path = read_path(file)
     assert path.times is None
     assert path.fps == 30.0
-    np.testing.assert_allclose(path.cameras.cam_from_world[0].numpy(), np.linalg.inv(eye), atol=1e-6)
+    np.testing.assert_allclose(
+        path.cameras.cam_from_world[0].numpy(), np.linalg.inv(eye), atol=1e-6
+    )
     expected = [[[32, 0, 32], [0, 32, 24], [0, 0, 1]], [[90, 0, 30], [0, 90, 24], [0, 0, 1]]]
     np.testing.assert_allclose(path.cameras.intrinsics.numpy(), expected, atol=1e-4)
 
@@ -90,7 +96,9 @@ def test_wrong_files_are_one_line(tmp_path: Path, change: dict[str, Any], names:
 
 
 def test_the_examples_of_the_documentation_are_read(tmp_path: Path) -> None:
-    text = (Path(__file__).resolve().parents[2] / "docs" / "camera_paths.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[2] / "docs" / "camera_paths.md").read_text(
+        encoding="utf-8"
+    )
     paths = []
     for i, example in enumerate(re.findall(r"```json\n(.*?)```", text, re.DOTALL)):
         (tmp_path / f"{i}.json").write_text(example)
@@ -135,7 +143,9 @@ def test_the_length_of_the_whole_spreads_the_keys(tmp_path: Path, length: dict[s
 
 def test_keys_at_given_seconds(tmp_path: Path) -> None:
     keys = [_key(0, at=0.1), _key(1, at=0.3)]
-    np.testing.assert_allclose(_x(read_path(_write_keys(tmp_path, keys))), [0, 0, 0.5, 1], atol=1e-6)
+    np.testing.assert_allclose(
+        _x(read_path(_write_keys(tmp_path, keys))), [0, 0, 0.5, 1], atol=1e-6
+    )
     longer = read_path(_write_keys(tmp_path, keys, num_frames=6))
     np.testing.assert_allclose(_x(longer), [0, 0, 0.5, 1, 1, 1], atol=1e-6)
 
@@ -167,7 +177,9 @@ def test_one_key_is_a_still(tmp_path: Path) -> None:
 
 
 def test_keys_far_from_the_origin_stay_exact(tmp_path: Path) -> None:
-    far = read_path(_write_keys(tmp_path, [_key(1e8), _key(1e8 + 1)], num_frames=3), np.array([1e8, 0, 0]))
+    far = read_path(
+        _write_keys(tmp_path, [_key(1e8), _key(1e8 + 1)], num_frames=3), np.array([1e8, 0, 0])
+    )
     np.testing.assert_allclose(_x(far), [0, 0.5, 1], atol=1e-6)
 
 
@@ -186,7 +198,10 @@ def test_keys_far_from_the_origin_stay_exact(tmp_path: Path) -> None:
         ({"num_frames": 3, "seconds": 2}, "give one of them"),
         ({"seconds": 1e6}, "at most 100000"),
         ({"keyframes": [_key(0, at=0), _key(1, at=9e5)]}, "at most 100000"),
-        ({"keyframes": [_key(0, at=0), _key(1, at=2)], "seconds": 2, "loop": True}, "make it longer"),
+        (
+            {"keyframes": [_key(0, at=0), _key(1, at=2)], "seconds": 2, "loop": True},
+            "make it longer",
+        ),
     ],
 )
 def test_wrong_keyframes_are_one_line(tmp_path: Path, change: dict[str, Any], names: str) -> None:
@@ -251,7 +266,20 @@ def test_times_in_words() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "0.5", "0:1", "0:1:2:3", "a:b:c", "0:1:2.5", "0:1:0", "0:1:-4", "0:inf:3", "nan:1:3", "0:1:99999999"]
+    "text",
+    [
+        "",
+        "0.5",
+        "0:1",
+        "0:1:2:3",
+        "a:b:c",
+        "0:1:2.5",
+        "0:1:0",
+        "0:1:-4",
+        "0:inf:3",
+        "nan:1:3",
+        "0:1:99999999",
+    ],
 )
 def test_other_words_are_no_times(text: str) -> None:
     with pytest.raises(DyngsError, match="START:STOP:COUNT") as caught:
@@ -261,14 +289,17 @@ def test_other_words_are_no_times(text: str) -> None:
 
 
 def test_far_cameras_come_back_to_where_they_were(tmp_path: Path) -> None:
-    cameras, offset = ring_of(6, np.array([0.5, 0.0, 1.0])), np.array([500_123.25, 4_600_321.5, 117.0])
+    cameras = ring_of(6, np.array([0.5, 0.0, 1.0]))
+    offset = np.array([500_123.25, 4_600_321.5, 117.0])
     ring = CameraPath(replace(cameras, cam_from_world=cameras.cam_from_world.float()))
     write_path(tmp_path / "p.json", ring, offset)
     back = read_path(tmp_path / "p.json", offset).cameras
     torch.testing.assert_close(back.centers, ring.cameras.centers, rtol=0, atol=2e-6)
     pose = np.array(json.loads((tmp_path / "p.json").read_text())["frames"][0]["cam_from_world"])
     centre = -np.linalg.inv(pose[:3, :3]) @ pose[:3, 3]
-    np.testing.assert_allclose(centre, offset + ring.cameras.centers[0].double().numpy(), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(
+        centre, offset + ring.cameras.centers[0].double().numpy(), rtol=0, atol=2e-6
+    )
 
 
 def test_no_file_and_no_json(tmp_path: Path) -> None:
@@ -284,7 +315,9 @@ sizes = st.integers(1, 400)
 
 @settings(max_examples=25, deadline=None)
 @given(old=st.tuples(sizes, sizes), new=st.tuples(sizes, sizes))
-def test_resizing_keeps_corners_inside_and_pixels_square(old: tuple[int, int], new: tuple[int, int]) -> None:
+def test_resizing_keeps_corners_inside_and_pixels_square(
+    old: tuple[int, int], new: tuple[int, int]
+) -> None:
     intrinsics = torch.tensor([[[300.0, 0, old[0] / 2 + 3], [0, 300.0, old[1] / 2 - 2], [0, 0, 1]]])
     cameras = resize_cameras(Cameras(torch.eye(4)[None], intrinsics, *old), *new)
     corners = torch.tensor([[0.0, 0.0, 1.0], [old[0], old[1], 1.0]])

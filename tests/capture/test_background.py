@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from dyngs.capture.background import background_of, outlined, person_mask, separation, with_background_masks
+from dyngs.capture.background import (
+    background_of,
+    outlined,
+    person_mask,
+    separation,
+    with_background_masks,
+)
 from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
@@ -21,18 +27,22 @@ HEIGHT, WIDTH, FRAMES, RADIUS = 120, 240, 12, 22
 
 
 def clip(speed: float, noise: float = 2.0, shade: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Images (F, H, W, 3) uint8 of a checkered disc that moves ``speed`` px per frame, and its masks."""
+    """Images (F, H, W, 3) uint8 of a checkered disc that moves ``speed`` px per frame, and its
+    masks."""
     rng = np.random.default_rng(1)
     ground = rng.uniform(90, 170, (HEIGHT // 8, WIDTH // 8, 3)).repeat(8, 0).repeat(8, 1)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    images, masks = [], []
+    images = []
+    masks = []
     for frame in range(FRAMES):
         middle = 30 + speed * frame
         mask = (rows - 56) ** 2 + (columns - middle) ** 2 < RADIUS**2
         inside = (abs(rows - 94) < 12) & (abs(columns - middle) < 28)
         shadow = ndimage.gaussian_filter(inside.astype(float), 4.0)
         colours = ground * (1 - (1 - shade) * shadow[..., None])
-        own = np.where((rows // 3 + (columns - round(middle)) // 3) % 2 == 0, 30.0, 230.0)[..., None] * [1, 0.8, 0.5]
+        own = np.where((rows // 3 + (columns - round(middle)) // 3) % 2 == 0, 30.0, 230.0)[
+            ..., None
+        ] * [1, 0.8, 0.5]
         colours = np.where(mask[..., None], own, colours) + rng.normal(0, noise, (HEIGHT, WIDTH, 3))
         images.append(np.clip(colours.round(), 0, 255).astype(np.uint8))
         masks.append(mask)
@@ -43,7 +53,9 @@ def worst_iou(found: np.ndarray, true: np.ndarray) -> float:
     return float(((found & true).sum((1, 2)) / (found | true).sum((1, 2))).min())
 
 
-@pytest.mark.parametrize(("noise", "shade", "least"), [(2.0, 1.0, 0.9), (5.0, 1.0, 0.85), (2.0, 0.7, 0.85)])
+@pytest.mark.parametrize(
+    ("noise", "shade", "least"), [(2.0, 1.0, 0.9), (5.0, 1.0, 0.85), (2.0, 0.7, 0.85)]
+)
 def test_who_walks_by_is_cut_out(noise: float, shade: float, least: float) -> None:
     images, true = clip(16.0, noise, shade)
     background = background_of(images)
@@ -54,7 +66,12 @@ def test_who_walks_by_is_cut_out(noise: float, shade: float, least: float) -> No
 
 def rough(masks: np.ndarray) -> np.ndarray:
     """Masks as a detector has them: too wide in odd images, too narrow in even ones."""
-    return np.stack([(ndimage.binary_dilation if i % 2 else ndimage.binary_erosion)(x) for i, x in enumerate(masks)])
+    return np.stack(
+        [
+            (ndimage.binary_dilation if i % 2 else ndimage.binary_erosion)(x)
+            for i, x in enumerate(masks)
+        ]
+    )
 
 
 @pytest.mark.parametrize("speed", [16.0, 6.0])
@@ -84,11 +101,13 @@ def test_a_moving_camera_has_no_outlines_and_nobody_no_mask() -> None:
 
 
 def test_gaps_between_legs_stay_open() -> None:
-    """A hole that the outline closes is filled where a detector sees the person, not where it does not."""
+    """A hole that the outline closes is filled where a detector sees the person, not where it does
+    not."""
     images, true = clip(16.0)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     background = background_of(images)
-    image, mask = images[3].copy(), true[3].copy()
+    image = images[3].copy()
+    mask = true[3].copy()
     hole = (abs(rows - 56) < 8) & (abs(columns - 78) < 8)
     image[hole] = np.clip(background.colours[hole].round(), 0, 255).astype(np.uint8)
     mask &= ~hole
@@ -110,15 +129,23 @@ def test_nobody_is_not_found() -> None:
     assert not person_mask(background_of(empty), empty[0]).any()
 
 
-SIZE, COUNT = (60, 90), 9
+SIZE = (60, 90)
+COUNT = 9
 
 
 def ground() -> np.ndarray:
-    return np.random.default_rng(0).uniform(80, 180, (6, 9, 3)).repeat(10, 0).repeat(10, 1).astype(np.uint8)
+    return (
+        np.random.default_rng(0)
+        .uniform(80, 180, (6, 9, 3))
+        .repeat(10, 0)
+        .repeat(10, 1)
+        .astype(np.uint8)
+    )
 
 
 def moving_block(folder: Path, step: int, turn: int = 0) -> Capture:
-    """A bright block that moves by ``step`` px per image, before a background that moves by ``turn``."""
+    """A bright block that moves by ``step`` px per image, before a background that moves by
+    ``turn``."""
     for i in range(COUNT):
         image = np.roll(ground(), turn * i, axis=1)
         image[20:50, 5 + step * i : 17 + step * i] = [250, 240, 20]
@@ -140,7 +167,9 @@ def iou_of(mask: np.ndarray, step: int, index: int) -> float:
 
 def test_who_walks_by_gets_masks(tmp_path: Path) -> None:
     said: list[str] = []
-    capture = with_background_masks(moving_block(tmp_path / "c", 8), tmp_path / "m", say=said.append)
+    capture = with_background_masks(
+        moving_block(tmp_path / "c", 8), tmp_path / "m", say=said.append
+    )
     assert capture.has_alpha
     assert all(iou_of(mask_of(capture, i), 8, i) > 0.9 for i in range(COUNT))
     assert len(said) == 1
@@ -152,7 +181,9 @@ def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="--background"):
         with_background_masks(capture, tmp_path / "m")
     write_image(tmp_path / "empty.png", ground())
-    found = with_background_masks(capture, tmp_path / "m", tmp_path / "empty.png", say=lambda _: None)
+    found = with_background_masks(
+        capture, tmp_path / "m", tmp_path / "empty.png", say=lambda _: None
+    )
     assert iou_of(mask_of(found, 4), 0, 4) > 0.9
     write_image(tmp_path / "plates" / "0.png", ground())
     again = with_background_masks(capture, tmp_path / "n", tmp_path / "plates", say=lambda _: None)

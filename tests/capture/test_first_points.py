@@ -42,7 +42,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def begin(capture: Capture, triangulate: int = 24) -> tuple[Capture, list[str]]:
-    return with_first_points(capture, DataConfig(root=capture.root), PointsInit(triangulate=triangulate))
+    return with_first_points(
+        capture, DataConfig(root=capture.root), PointsInit(triangulate=triangulate)
+    )
 
 
 def shifted(root: Path, out: Path) -> Path:
@@ -63,7 +65,12 @@ def shifted(root: Path, out: Path) -> Path:
 def write_noise(path: Path, count: int = 500) -> None:
     rng = np.random.default_rng(0)
     rows = np.column_stack([rng.uniform(-1.3, 1.3, (count, 3)), rng.integers(0, 256, (count, 3))])
-    header = ["ply", "format ascii 1.0", f"element vertex {count}", *[f"property float {x}" for x in "xyz"]]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {count}",
+        *[f"property float {x}" for x in "xyz"],
+    ]
     header += [*[f"property uchar {c}" for c in ("red", "green", "blue")], "end_header"]
     path.write_text("\n".join(header + [" ".join(f"{x:g}" for x in row) for row in rows]) + "\n")
 
@@ -74,10 +81,14 @@ def test_around_the_origin_random_points_stay(root: Path) -> None:
 
 
 def test_noise_is_not_used_and_the_scene_is_elsewhere(root: Path, tmp_path: Path) -> None:
-    """As 4DGaussians leaves it in a folder, here around the origin, where no camera looks; and around the scene."""
+    """As 4DGaussians leaves it in a folder, here around the origin, where no camera looks; and
+    around the scene."""
     write_noise(root / "points3d.ply")
     near, lines = begin(read_capture(root))
-    assert (near.points, lines) == (None, ["points3d.ply: 500 points, not used: no better than random ones"])
+    assert (near.points, lines) == (
+        None,
+        ["points3d.ply: 500 points, not used: no better than random ones"],
+    )
     (root / "points3d.ply").rename(tmp_path / "points3d.ply")
     elsewhere = shifted(root, tmp_path / "shifted")
     (tmp_path / "points3d.ply").rename(elsewhere / "points3d.ply")
@@ -107,7 +118,8 @@ RNG = np.random.default_rng(1)
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], PointCloud]:
-    """A corner that eight cameras see, and points on its surfaces: of random ones, those nearest to them."""
+    """A corner that eight cameras see, and points on its surfaces: of random ones, those nearest to
+    them."""
     options = DynamicOptions(size=96, num_times=1, num_cameras=8, num_val=0, num_test=0, samples=1)
     folder = tmp_path_factory.mktemp("room") / "capture"
     views = list(dyngs.read_capture(write_dynamic_capture("room", folder, options)).splits["train"])
@@ -139,7 +151,8 @@ def test_noise_does_not(room: tuple[list[View], PointCloud], timed: bool) -> Non
     """In the box of the real points, with random colours or theirs; and far off."""
     views = [view if timed else replace(view, time=None) for view in room[0]]
     points = room[1]
-    low, high = points.xyz.min(0), points.xyz.max(0)
+    low = points.xyz.min(0)
+    high = points.xyz.max(0)
     xyz = RNG.uniform(low, high, points.xyz.shape)
     for rgb in (points.rgb, RNG.integers(0, 256, points.rgb.shape).astype(np.uint8)):
         assert fault(views, xyz, rgb) == "no better than random ones"
@@ -150,7 +163,11 @@ def test_groups_are_of_a_moment_or_of_neighbours(room: tuple[list[View], PointCl
     views = [replace(room[0][0], time=i / 19) for i in range(20)]
     assert groups_of(views[::-1]) == [[19, 18, 17, 16, 15], [12, 11, 10, 9, 8], [4, 3, 2, 1, 0]]
     assert groups_of(views[:2]) == [[0, 1]]
-    assert [len(group) for group in groups_of([replace(view, time=None) for view in views])] == [5, 5, 5]
+    assert [len(group) for group in groups_of([replace(view, time=None) for view in views])] == [
+        5,
+        5,
+        5,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +190,8 @@ def test_points_lie_on_the_surfaces(furnished: DataConfig) -> None:
     assert found.rgb.shape == found.xyz.shape
     assert found.rgb.dtype == np.uint8
     distances = distances_to_surface(found.xyz, views, views[0].time or 0.0)
-    # A pixel covers 0.02, and far more in depth; tiles and wallpaper repeat, so some matches join different ones.
+    # A pixel covers 0.02, and far more in depth; tiles and wallpaper repeat, so some matches join
+    # different ones.
     assert np.median(distances) < 0.05
     assert np.mean(distances < 0.1) > 0.7
     shifted = found.xyz + np.array([0.3, -0.3, 0.3])
@@ -200,7 +218,9 @@ def test_images_without_features_have_no_points(blender_root: Path) -> None:
     assert triangulated_points(train_views(options), options) is None
 
 
-def test_a_handful_of_points_is_none(furnished: DataConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_handful_of_points_is_none(
+    furnished: DataConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A model that begins with them would have to grow all the rest."""
     views = views_of_a_time_step(train_views(furnished), 24)
     monkeypatch.setattr("dyngs.capture.first_points.MIN_POINTS", 100_000)
@@ -223,7 +243,10 @@ def test_the_moment_is_the_middle_one_of_those_with_most_views(furnished: DataCo
 
 
 def test_without_times_the_views_are_evenly_chosen(furnished: DataConfig) -> None:
-    views = [replace(view, time=None, name=str(i)) for i, view in enumerate((train_views(furnished) * 2)[:12])]
+    views = [
+        replace(view, time=None, name=str(i))
+        for i, view in enumerate((train_views(furnished) * 2)[:12])
+    ]
     assert [view.name for view in views_of_a_time_step(views, 4)] == ["0", "3", "6", "9"]
 
 
@@ -265,7 +288,11 @@ def test_pairs_of_a_clip_are_bounded(furnished: DataConfig) -> None:
     """Near in time, or of overlapping images; and none twice."""
     views = train_views(furnished)
     few = [replace(views[i % len(views)], time=i / 5) for i in range(6)]
-    assert {(0, 1), (0, 2), (0, 4), (1, 5)} <= set(clip_pairs(few)) <= {(i, j) for j in range(6) for i in range(j)}
+    assert (
+        {(0, 1), (0, 2), (0, 4), (1, 5)}
+        <= set(clip_pairs(few))
+        <= {(i, j) for j in range(6) for i in range(j)}
+    )
     many = [replace(views[i % len(views)], time=i / 39) for i in range(40)]
     pairs = clip_pairs(many)
     assert len(set(pairs)) == len(pairs) <= 40 * (len(TIME_STEPS) + OVERLAPPING)

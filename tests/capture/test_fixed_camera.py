@@ -39,7 +39,9 @@ def test_hdr_is_tone_mapped_in_the_cache_with_a_note(tmp_path: Path) -> None:
         assert "1 video: HLG is tone-mapped to SDR" in capture.warnings[1]
 
 
-def test_frames_are_chosen_by_number_or_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_chosen_by_number_or_evenly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = frames(tmp_path / "c" / "images", 9).parent
     chosen = read_fixed_camera(DataConfig(root=root, frames="1:8:3")).splits["train"]
     assert [view.name for view in chosen] == ["f1", "f4", "f7"]
@@ -51,7 +53,8 @@ def test_frames_are_chosen_by_number_or_evenly(tmp_path: Path, monkeypatch: pyte
 
 
 def test_masks_are_named_as_images(tmp_path: Path) -> None:
-    root, masks = frames(tmp_path / "c", 3), frames(tmp_path / "m", 2, channels=1)
+    root = frames(tmp_path / "c", 3)
+    masks = frames(tmp_path / "m", 2, channels=1)
     with pytest.raises(DyngsError, match=r"no mask for 1 of 3 images, first f2\.png"):
         read_fixed_camera(DataConfig(root=root), masks)
     capture = read_fixed_camera(DataConfig(root=root, frames=":2"), masks)
@@ -84,5 +87,6 @@ def test_a_zoomed_camera_stands_back(tmp_path: Path) -> None:
     view = read_fixed_camera(DataConfig(root=frames(tmp_path / "c", 1))).splits["train"][0]
     far = zoomed(view, 2.0, 3.0)
     point = view.cam_from_world @ np.array([0.4, 0.2, -3.0, 1.0])
-    before, after = view.intrinsics @ point[:3], far.intrinsics @ (far.cam_from_world @ [0.4, 0.2, -3.0, 1.0])[:3]
+    before = view.intrinsics @ point[:3]
+    after = far.intrinsics @ (far.cam_from_world @ [0.4, 0.2, -3.0, 1.0])[:3]
     assert (after / after[2]).tolist() == pytest.approx((before / before[2]).tolist())

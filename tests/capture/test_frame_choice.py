@@ -5,11 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyngs.capture.frame_choice import STILL, FrameMeasures, chosen_frames, measured, motion_between, shrunk
+from dyngs.capture.frame_choice import (
+    STILL,
+    FrameMeasures,
+    chosen_frames,
+    measured,
+    motion_between,
+    shrunk,
+)
 
 
 def _wave(shift: float, width: int = 192) -> np.ndarray:
-    columns, rows = np.arange(width) + shift, np.arange(width * 3 // 4)
+    columns = np.arange(width) + shift
+    rows = np.arange(width * 3 // 4)
     grey = 128 + 60 * np.sin(columns / 11)[None] + 50 * np.cos(rows / 9)[:, None]
     return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
 
@@ -51,7 +59,10 @@ def test_a_camera_that_stands_has_no_motion() -> None:
 
 def test_noise_of_a_long_clip_is_no_motion_of_the_camera() -> None:
     rng = np.random.default_rng(0)
-    noisy = (np.clip(_wave(0) + rng.normal(0, 4, (144, 192, 3)), 0, 255).astype(np.uint8) for _ in range(60))
+    noisy = (
+        np.clip(_wave(0) + rng.normal(0, 4, (144, 192, 3)), 0, 255).astype(np.uint8)
+        for _ in range(60)
+    )
     measures = measured(noisy)
     assert measures.motion.sum() > 3 * STILL
     assert chosen_frames(measures, 20).reach < STILL

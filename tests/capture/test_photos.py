@@ -17,7 +17,9 @@ from dyngs.capture.sfm import estimate_poses
 from dyngs.data.images.images import read_header, read_image
 from dyngs.errors import DyngsError
 
-COLOURS = np.kron(np.random.default_rng(0).integers(0, 256, (3, 4, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+COLOURS = np.kron(np.random.default_rng(0).integers(0, 256, (3, 4, 3)), np.ones((8, 8, 1))).astype(
+    np.uint8
+)
 
 
 def _save(path: Path, **options: object) -> Path:
@@ -49,10 +51,16 @@ def test_every_suffix_is_taken_or_said_to_be_left_out(tmp_path: Path) -> None:
     for name in ("h.dng", "i.dng", "notes.txt", ".hidden", "README"):
         (folder / name).write_text("no photo")
     names, notes = _gather(tmp_path)
-    assert names == {x: x for x in ("a.jpg", "b.JPEG", "c.png", "d.tif", "e.bmp", "f.webp")} | {"g.gif": "g.png"}
-    assert notes[0].startswith("left out, no photos: 2 .dng, 1 .txt, 1 without a suffix (photos are .bmp, ")
+    assert names == {x: x for x in ("a.jpg", "b.JPEG", "c.png", "d.tif", "e.bmp", "f.webp")} | {
+        "g.gif": "g.png"
+    }
+    assert notes[0].startswith(
+        "left out, no photos: 2 .dng, 1 .txt, 1 without a suffix (photos are .bmp, "
+    )
     assert notes[1] == "1 .gif: the first frame of each is taken"
-    assert read_image(tmp_path / "images" / "g.png").shape == (24, 32, 3), "an opaque GIF has no alpha"
+    assert read_image(tmp_path / "images" / "g.png").shape == (24, 32, 3), (
+        "an opaque GIF has no alpha"
+    )
 
 
 def test_colmap_gets_formats_that_it_reads(tmp_path: Path) -> None:
@@ -65,7 +73,8 @@ def test_colmap_gets_formats_that_it_reads(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])
 def test_heic_becomes_png_with_its_tags(tmp_path: Path, orientation: int) -> None:
-    """libheif rotates by what the file itself says; the EXIF tag repeats it and must not be applied again."""
+    """libheif rotates by what the file itself says; the EXIF tag repeats it and must not be applied
+    again."""
     _save_heic(tmp_path / "photos" / "a.HEIC", orientation)
     names, notes = _gather(tmp_path)
     assert (names, notes) == ({"a.HEIC": "a.png"}, ())
@@ -93,15 +102,20 @@ def test_hdr_heic_is_tone_mapped_with_a_note(tmp_path: Path) -> None:
         full_range_flag=1,
     )
     names, notes = _gather(tmp_path)
-    assert notes == ("HEIC photos: PQ is tone-mapped to SDR (white: 203 cd/m2; brighter is clipped)",)
+    assert notes == (
+        "HEIC photos: PQ is tone-mapped to SDR (white: 203 cd/m2; brighter is clipped)",
+    )
     stored = read_image(tmp_path / "images" / names["a.HIF"]).numpy()
     assert np.sqrt(np.mean((stored - 255 * patches()) ** 2)) < 4
 
 
 @pytest.mark.parametrize(
-    ("content", "name"), [("jpeg", "a.png"), ("png", "a.jpg"), ("webp", "a.jpg"), ("webp", "a.png"), ("jpeg", "a.heic")]
+    ("content", "name"),
+    [("jpeg", "a.png"), ("png", "a.jpg"), ("webp", "a.jpg"), ("webp", "a.png"), ("jpeg", "a.heic")],
 )
-def test_photos_are_read_by_content_whatever_their_name(tmp_path: Path, content: str, name: str) -> None:
+def test_photos_are_read_by_content_whatever_their_name(
+    tmp_path: Path, content: str, name: str
+) -> None:
     options = {"jpeg": {"quality": 98, "subsampling": 0}, "webp": {"lossless": True}}
     _save(tmp_path / "photos" / name, format=content, **options.get(content, {}))
     photos, _ = gather_photos(tmp_path / "photos", tmp_path / "images", tmp_path / "out")
@@ -123,7 +137,9 @@ def test_heic_that_is_named_as_jpeg(tmp_path: Path) -> None:
     _save_heic(tmp_path / "photos" / "a.heic").rename(tmp_path / "photos" / "a.jpg")
     names, _ = _gather(tmp_path)
     assert names == {"a.jpg": "a.png"}
-    assert np.abs(read_image(tmp_path / "images" / "a.png").numpy().astype(int) - COLOURS).mean() < 10
+    assert (
+        np.abs(read_image(tmp_path / "images" / "a.png").numpy().astype(int) - COLOURS).mean() < 10
+    )
 
 
 def test_heic_without_its_package_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,8 +158,8 @@ def test_a_damaged_heic_is_one_line(tmp_path: Path) -> None:
 
 
 def test_photos_that_differ_in_the_suffix_get_names_that_do_not(tmp_path: Path) -> None:
-    """Views are named without the suffix, and a capture with one name for two images is refused; names that differ in
-    upper and lower case are one name to Windows and macOS."""
+    """Views are named without the suffix, and a capture with one name for two images is refused;
+    names that differ in upper and lower case are one name to Windows and macOS."""
     for name in ("a.TIF", "a.png", "a.jpg", "a.gif", "sub/a.png", "a.png.bmp", "B.gif", "b.png"):
         _save(tmp_path / "photos" / name)
     names, _ = _gather(tmp_path)
@@ -158,9 +174,9 @@ def test_photos_that_differ_in_the_suffix_get_names_that_do_not(tmp_path: Path) 
         "sub/a.png": "sub/a.png",
     }
     assert len({Path(name).with_suffix("") for name in names.values()}) == len(names)
-    assert sorted(p.relative_to(tmp_path / "images").as_posix() for p in (tmp_path / "images").rglob("*.*")) == sorted(
-        names.values()
-    )
+    assert sorted(
+        p.relative_to(tmp_path / "images").as_posix() for p in (tmp_path / "images").rglob("*.*")
+    ) == sorted(names.values())
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".bmp", ".webp", ".gif"])
@@ -185,9 +201,12 @@ def test_an_edit_of_the_capture_leaves_the_photo_as_it_is(tmp_path: Path) -> Non
     assert photo.read_bytes() == before
 
 
-def test_a_copy_is_whole_without_the_help_of_the_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_copy_is_whole_without_the_help_of_the_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     photo = _save(tmp_path / "a.jpg")
-    monkeypatch.setattr(os, "copy_file_range", lambda *_: 0, raising=False)  # as some file systems do
+    # as some file systems do
+    monkeypatch.setattr(os, "copy_file_range", lambda *_: 0, raising=False)
     copied(photo, tmp_path / "b.jpg")
     assert (tmp_path / "b.jpg").read_bytes() == photo.read_bytes()
 

@@ -11,7 +11,13 @@ import torch
 
 from dyngs.capture import first_points, plane_sweep
 from dyngs.capture.first_points import with_first_points
-from dyngs.capture.plane_sweep import MIN_NEIGHBOURS, NEIGHBOURS, dense_points, neighbours, points_of_depth_maps
+from dyngs.capture.plane_sweep import (
+    MIN_NEIGHBOURS,
+    NEIGHBOURS,
+    dense_points,
+    neighbours,
+    points_of_depth_maps,
+)
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import projected
@@ -20,12 +26,16 @@ from dyngs.files.write import write_image
 WIDTH, HEIGHT, FOCAL, SLOPE, DISTANCE = 64, 48, 66.0, 0.3, 4.0
 INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 _ACROSS = np.linspace(-1, 1, 60)
-SPARSE = np.stack([_ACROSS, 0.6 * np.sin(9 * _ACROSS), SLOPE * _ACROSS], axis=1)  # on the plane z = SLOPE x
+# on the plane z = SLOPE x
+SPARSE = np.stack([_ACROSS, 0.6 * np.sin(9 * _ACROSS), SLOPE * _ACROSS], axis=1)
 
 
 def _colour(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """A texture without repetition, (..., 3) in [0, 1]."""
-    waves = [np.sin(a * x + b * y + c) for a, b, c in ((9, 4, 0), (-5, 13, 1), (17, 8, 2), (7, -19, 3), (2, 3, 4))]
+    waves = [
+        np.sin(a * x + b * y + c)
+        for a, b, c in ((9, 4, 0), (-5, 13, 1), (17, 8, 2), (7, -19, 3), (2, 3, 4))
+    ]
     grey = 0.5 + 0.09 * np.sum(waves, axis=0)
     return np.stack([grey, 0.8 * grey, 0.5 * grey + 0.2], axis=-1)
 
@@ -38,26 +48,44 @@ def _views(folder: Path, count: int = 7, contrast: float = 1.0, unit: float = 1.
     for i in range(count):
         angle = np.radians(8 * (i - count // 2))
         pose = np.eye(4)
-        pose[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+        pose[:3, :3] = [
+            [np.cos(angle), 0, -np.sin(angle)],
+            [0, 1, 0],
+            [np.sin(angle), 0, np.cos(angle)],
+        ]
         pose[2, 3] = DISTANCE
-        center, lines = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
+        center = -pose[:3, :3].T @ pose[:3, 3]
+        lines = rays @ pose[:3, :3]
         depth = (SLOPE * center[0] - center[2]) / (lines[..., 2] - SLOPE * lines[..., 0])
         x, y = (center[k] + depth * lines[..., k] for k in (0, 1))
         path = folder / f"{i}.png"
         write_image(path, (0.5 + contrast * (_colour(x, y) - 0.5)).astype(np.float32))
         np.save(path.with_suffix(".npy"), depth / unit)
-        views.append(View(path.stem, path, pose, INTRINSICS, WIDTH, HEIGHT, depth_path=path.with_suffix(".npy")))
+        views.append(
+            View(
+                path.stem,
+                path,
+                pose,
+                INTRINSICS,
+                WIDTH,
+                HEIGHT,
+                depth_path=path.with_suffix(".npy"),
+            )
+        )
     return views
 
 
 def test_points_lie_on_the_plane_in_its_colours(tmp_path: Path) -> None:
-    views, options = _views(tmp_path), DataConfig(root=tmp_path)
+    views = _views(tmp_path)
+    options = DataConfig(root=tmp_path)
     found = dense_points(views, options, SPARSE, 100_000)
     assert found is not None
     assert len(found.xyz) > 0.5 * len(views) * WIDTH * HEIGHT
     x, y, z = found.xyz.T
     error = np.abs(z - SLOPE * x)
-    assert np.median(error) < 0.002 * DISTANCE, "depths between those that are tried are interpolated"
+    assert np.median(error) < 0.002 * DISTANCE, (
+        "depths between those that are tried are interpolated"
+    )
     assert np.quantile(error, 0.95) < 0.02 * DISTANCE
     assert np.abs(found.rgb / 255 - _colour(x, y)).mean() < 0.02
     few = dense_points(views, options, SPARSE, 50)
@@ -66,7 +94,8 @@ def test_points_lie_on_the_plane_in_its_colours(tmp_path: Path) -> None:
 
 
 def test_given_depth_maps_have_points_where_they_agree(tmp_path: Path) -> None:
-    views, options = _views(tmp_path), DataConfig(root=tmp_path)
+    views = _views(tmp_path)
+    options = DataConfig(root=tmp_path)
     wrong = np.load(tmp_path / "3.npy")
     wrong[:, : WIDTH // 2] *= 1.2
     np.save(tmp_path / "3.npy", wrong)
@@ -90,14 +119,19 @@ def test_depth_maps_in_another_unit_have_none(tmp_path: Path) -> None:
 
 def test_a_still_capture_without_points_begins_with_those_of_its_depth_maps(tmp_path: Path) -> None:
     capture = Capture(tmp_path, "polycam", {"train": tuple(_views(tmp_path))})
-    begun, lines = with_first_points(capture, DataConfig(root=tmp_path), PointsInit(num_random=2000, dense=0))
+    begun, lines = with_first_points(
+        capture, DataConfig(root=tmp_path), PointsInit(num_random=2000, dense=0)
+    )
     assert lines == ["2,000 first points are from the depth maps"]
     assert begun.points is not None
     assert np.abs(begun.points.xyz[:, 2] - SLOPE * begun.points.xyz[:, 0]).max() < 1e-4
 
 
-def test_a_still_capture_without_any_points_is_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Random candidates say how deep to look; pixels without texture take the depth of their neighbours."""
+def test_a_still_capture_without_any_points_is_swept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Random candidates say how deep to look; pixels without texture take the depth of their
+    neighbours."""
     monkeypatch.setattr(first_points, "triangulated_points", lambda *_: None)
     views = [replace(view, depth_path=None) for view in _views(tmp_path)]
     capture = Capture(tmp_path, "nerfstudio", {"train": tuple(views)})
@@ -109,22 +143,35 @@ def test_a_still_capture_without_any_points_is_swept(tmp_path: Path, monkeypatch
     error = np.abs(z - SLOPE * x)
     assert np.median(error) < 0.01 * DISTANCE
     assert np.quantile(error, 0.9) < 0.05 * DISTANCE
-    assert with_first_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points is None
-    timed = capture.replace(splits={"train": tuple(replace(view, time=0.1 * i) for i, view in enumerate(views))})
-    assert with_first_points(timed, DataConfig(root=tmp_path), PointsInit(dense=2000))[0].points is None
+    assert (
+        with_first_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points is None
+    )
+    timed = capture.replace(
+        splits={"train": tuple(replace(view, time=0.1 * i) for i, view in enumerate(views))}
+    )
+    assert (
+        with_first_points(timed, DataConfig(root=tmp_path), PointsInit(dense=2000))[0].points
+        is None
+    )
 
 
 def test_points_beside_the_images_do_not_say_how_deep_to_look(tmp_path: Path) -> None:
-    views, options = _views(tmp_path), DataConfig(root=tmp_path)
-    beside = np.stack([np.full(60, 50.0), _ACROSS, np.linspace(-1, 1, 60) - DISTANCE], axis=1)  # as near as cameras
-    expected, found = (dense_points(views, options, x, 1000) for x in (SPARSE, np.concatenate([SPARSE, beside])))
+    views = _views(tmp_path)
+    options = DataConfig(root=tmp_path)
+    # as near as cameras
+    beside = np.stack([np.full(60, 50.0), _ACROSS, np.linspace(-1, 1, 60) - DISTANCE], axis=1)
+    expected, found = (
+        dense_points(views, options, x, 1000) for x in (SPARSE, np.concatenate([SPARSE, beside]))
+    )
     assert expected is not None
     assert found is not None
     assert np.array_equal(found.xyz, expected.xyz)
 
 
 def test_any_number_of_threads_finds_the_same_points(tmp_path: Path) -> None:
-    views, options, before = _views(tmp_path, 4), DataConfig(root=tmp_path), torch.get_num_threads()
+    views = _views(tmp_path, 4)
+    options = DataConfig(root=tmp_path)
+    before = torch.get_num_threads()
     found = []
     try:
         for threads in (1, 2):
@@ -134,30 +181,48 @@ def test_any_number_of_threads_finds_the_same_points(tmp_path: Path) -> None:
         torch.set_num_threads(before)
     first = found[0]
     assert first is not None
-    assert all(x is not None and np.array_equal(x.xyz, first.xyz) and np.array_equal(x.rgb, first.rgb) for x in found)
+    assert all(
+        x is not None and np.array_equal(x.xyz, first.xyz) and np.array_equal(x.rgb, first.rgb)
+        for x in found
+    )
 
 
 def test_pixels_that_do_not_count_give_no_points(tmp_path: Path) -> None:
-    views, mask = _views(tmp_path), np.ones((HEIGHT, WIDTH, 1), np.float32)
+    views = _views(tmp_path)
+    mask = np.ones((HEIGHT, WIDTH, 1), np.float32)
     mask[:, : WIDTH // 2] = 0
     write_image(tmp_path / "mask.png", mask)
     masked = [replace(view, mask_path=tmp_path / "mask.png") for view in views]
     found = dense_points(masked, DataConfig(root=tmp_path), SPARSE, 100_000)
     assert found is not None
     right_half = np.stack(
-        [(at[:, 0] >= 0.5 - 1 / WIDTH) & inside for at, inside in (projected(found.xyz, v) for v in views)]
+        [
+            (at[:, 0] >= 0.5 - 1 / WIDTH) & inside
+            for at, inside in (projected(found.xyz, v) for v in views)
+        ]
     )
     assert right_half.any(axis=0).all()
 
 
-@pytest.mark.parametrize("fault", ["no texture", "wrong poses", "one view", "the same view", "no points seen"])
+@pytest.mark.parametrize(
+    "fault", ["no texture", "wrong poses", "one view", "the same view", "no points seen"]
+)
 def test_without_evidence_there_are_no_points(tmp_path: Path, fault: str) -> None:
-    views, sparse = _views(tmp_path, contrast=0.0 if fault == "no texture" else 1.0), SPARSE
+    views = _views(tmp_path, contrast=0.0 if fault == "no texture" else 1.0)
+    sparse = SPARSE
     if fault == "wrong poses":
         tilts = np.radians([9, -7, 4, -11, 8, -5, 10])  # about the axis across the image
-        turns = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in tilts]
-        wrong = [np.block([[turn, np.zeros((3, 1))], [np.zeros((1, 3)), np.eye(1)]]) for turn in turns]
-        views = [replace(v, cam_from_world=turn @ v.cam_from_world) for v, turn in zip(views, wrong, strict=True)]
+        turns = [
+            np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+            for a in tilts
+        ]
+        wrong = [
+            np.block([[turn, np.zeros((3, 1))], [np.zeros((1, 3)), np.eye(1)]]) for turn in turns
+        ]
+        views = [
+            replace(v, cam_from_world=turn @ v.cam_from_world)
+            for v, turn in zip(views, wrong, strict=True)
+        ]
     elif fault == "one view":
         views = views[:1]
     elif fault == "the same view":
@@ -173,7 +238,8 @@ def test_neighbours_see_the_same_from_a_useful_angle(tmp_path: Path) -> None:
     assert len(groups) == 9
     for first, *others in groups:
         assert MIN_NEIGHBOURS <= len(others) <= NEIGHBOURS
-        # 8 and 16 degrees away are better than 24; the angle is to the points seen, not to the middle.
+        # 8 and 16 degrees away are better than 24; the angle is to the points seen, not to the
+        # middle.
         assert all(1 <= abs(first - i) <= 3 for i in others)
         assert abs(first - others[0]) == 1 or abs(first - others[0]) == 2
 
@@ -181,7 +247,8 @@ def test_neighbours_see_the_same_from_a_useful_angle(tmp_path: Path) -> None:
 def test_dense_points_join_few_sparse_ones_of_still_captures_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    views, options = _views(tmp_path, 4), DataConfig(root=tmp_path)
+    views = _views(tmp_path, 4)
+    options = DataConfig(root=tmp_path)
     points = PointCloud(SPARSE, np.full(SPARSE.shape, 128, np.uint8))
     capture = Capture(root=tmp_path, format="colmap", splits={"train": tuple(views)}, points=points)
     joined, lines = with_first_points(capture, options, PointsInit(dense=1000))

@@ -30,13 +30,17 @@ def _still_arc(count: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """OpenGL poses on an arc of 7 degrees per step, and their images on grey."""
     poses = orbit_cameras(360 // 7, 4.0, elevation_deg=40.0, start_deg=200.0)[:count]
     rgba = [render_scene(still_life(), pose, 320, samples=2) / 255.0 for pose in poses]
-    return poses, [((x[..., :3] * x[..., 3:] + 0.5 * (1 - x[..., 3:])) * 255).astype(np.uint8) for x in rgba]
+    return poses, [
+        ((x[..., :3] * x[..., 3:] + 0.5 * (1 - x[..., 3:])) * 255).astype(np.uint8) for x in rgba
+    ]
 
 
 def _rotation_errors_deg(result: SfmResult, truth: dict[str, np.ndarray]) -> np.ndarray:
     """Angles between estimated and true rotations relative to the first image."""
     model = pycolmap.Reconstruction(str(result.root / "sparse" / "0"))
-    found = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
+    found = {
+        image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()
+    }
     names = sorted(found)
     errors = []
     for name in names[1:]:
@@ -58,7 +62,10 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     options = SfmOptions(num_threads=1, num_frames=8)
     told: dict[str, tuple[int, int]] = {}
     result = estimate_poses(
-        tmp_path / "arc.mp4", out, options, lambda what, done, total: told.update({what: (done, total)})
+        tmp_path / "arc.mp4",
+        out,
+        options,
+        lambda what, done, total: told.update({what: (done, total)}),
     )
     assert told == {
         "frames of the video": (8, 8),
@@ -70,24 +77,36 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     assert result.num_images == 8
     assert result.num_registered >= 7, result.summary()
     names = sorted(p.name for p in (out / "images").iterdir())
-    assert names == [f"frame_{2 * i + 1:05d}.png" for i in range(8)], "of each window the sharper image"
+    assert names == [f"frame_{2 * i + 1:05d}.png" for i in range(8)], (
+        "of each window the sharper image"
+    )
     flip = np.diag([1.0, -1.0, -1.0])
     truth = {name: (pose[:3, :3] @ flip).T for name, pose in zip(names, poses, strict=True)}
     # An arc of 49 degrees fixes the focal length, and with it the angle, to some 5%.
     assert _rotation_errors_deg(result, truth).max() < 4.0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arc.mp4", "capture"]
-    assert sorted(p.name for p in out.iterdir()) == ["images", "sfm_report.json", "sparse", "times.json"]
+    assert sorted(p.name for p in out.iterdir()) == [
+        "images",
+        "sfm_report.json",
+        "sparse",
+        "times.json",
+    ]
     seconds = {view.name: view.time for view in all_views(read_capture(out).splits)}
     registered = [i for i, name in enumerate(names) if name.removesuffix(".png") in seconds]
-    first, last = registered[0], registered[-1]
+    first = registered[0]
+    last = registered[-1]
     for i in registered:
         assert seconds[names[i].removesuffix(".png")] == pytest.approx((i - first) / (last - first))
-    assert read_capture(out).seconds == pytest.approx(0.2 * (last - first)), "every second frame of 10 per second"
+    assert read_capture(out).seconds == pytest.approx(0.2 * (last - first)), (
+        "every second frame of 10 per second"
+    )
 
 
 def test_frames_of_hdr_video_are_tone_mapped_with_a_note(tmp_path: Path) -> None:
     write_clip(tmp_path / "a.mp4", encoded(patches(), BT2020, HLG), (BT2020, HLG, BT2020))
-    found = _frames_of(tmp_path / "a.mp4", tmp_path / "work" / "capture", SfmOptions(), report_nothing)
+    found = _frames_of(
+        tmp_path / "a.mp4", tmp_path / "work" / "capture", SfmOptions(), report_nothing
+    )
     image = read_image(tmp_path / "work" / "capture" / "images" / found.photos[0].name).numpy()
     assert np.sqrt(np.mean((image - 255 * patches()) ** 2)) < 2.5
     assert any("1 video: HLG is tone-mapped to SDR" in note for note in found.notes)
@@ -101,7 +120,9 @@ def test_real_photos_register_and_repeat_bytewise(tmp_path: Path) -> None:
         pixels = oiio.ImageBuf(str(images / f"{name}.jpg")).get_pixels(oiio.FLOAT)
         folder = tmp_path / "photos" / ("a" if i < 4 else "b")
         write_image(folder / f"{name}.png", resize_local_mean(pixels, (300, 400)))
-    results = [estimate_poses(tmp_path / "photos", tmp_path / name, FAST) for name in ("first", "second")]
+    results = [
+        estimate_poses(tmp_path / "photos", tmp_path / name, FAST) for name in ("first", "second")
+    ]
     assert results[0].num_registered == 8, results[0].summary()
     assert results[0].mean_error_px < 1.0, results[0].summary()
     for file in ("cameras.bin", "images.bin", "points3D.bin"):
@@ -113,19 +134,26 @@ def test_real_photos_register_and_repeat_bytewise(tmp_path: Path) -> None:
 def test_nothing_to_register_gives_advice_and_no_folder(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for i in range(3):
-        write_image(tmp_path / "photos" / f"{i}.png", rng.integers(0, 256, (64, 64, 3), dtype=np.uint8))
+        write_image(
+            tmp_path / "photos" / f"{i}.png", rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+        )
     with pytest.raises(DyngsError, match="overlap"):
         estimate_poses(tmp_path / "photos", tmp_path / "out", FAST)
     assert [p.name for p in tmp_path.iterdir()] == ["photos"]
 
 
-def test_masks_beside_the_photos_are_read_and_links_out_of_their_folder_are_not(tmp_path: Path) -> None:
+def test_masks_beside_the_photos_are_read_and_links_out_of_their_folder_are_not(
+    tmp_path: Path,
+) -> None:
     rng = np.random.default_rng(0)
     for i in range(3):
-        write_image(tmp_path / "photos" / f"{i}.png", rng.integers(0, 256, (64, 64, 3), dtype=np.uint8))
+        write_image(
+            tmp_path / "photos" / f"{i}.png", rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+        )
         write_image(tmp_path / "masks" / f"{i}.png", np.full((64, 64, 1), 255, np.uint8))
     options = replace(FAST, masks=tmp_path / "masks")
-    with pytest.raises(DyngsError, match="overlap"):  # as without masks: nothing in them fits together
+    with pytest.raises(DyngsError, match="overlap"):
+        # as without masks: nothing in them fits together
         estimate_poses(tmp_path / "photos", tmp_path / "out", options)
     (tmp_path / "masks" / "0.png").rename(tmp_path / "private.png")
     (tmp_path / "masks" / "0.png").symlink_to("../private.png")
@@ -160,11 +188,15 @@ def test_photos_that_are_links_are_followed_only_if_asked(tmp_path: Path) -> Non
         write_image(photos / f"{i}.png", np.zeros((8, 12, 3), np.uint8))
     (photos / "0.png").rename(tmp_path / "private.png")
     (photos / "0.png").symlink_to("../private.png")
-    with pytest.raises(DyngsError, match=r"0\.png: leads to .*private\.png.*data\.follow_links=true"):
+    with pytest.raises(
+        DyngsError, match=r"0\.png: leads to .*private\.png.*data\.follow_links=true"
+    ):
         estimate_poses(photos, tmp_path / "out", FAST)
     with pytest.raises(DyngsError, match="no poses could be found"):
         estimate_poses(photos, tmp_path / "out", replace(FAST, follow_links=True))
     assert (tmp_path / "private.png").is_file()
     with pytest.raises(DyngsError, match=r"12x8 .*data\.max_megapixels is 9e-05"):
-        estimate_poses(photos, tmp_path / "out", replace(FAST, follow_links=True, max_megapixels=9e-5))
+        estimate_poses(
+            photos, tmp_path / "out", replace(FAST, follow_links=True, max_megapixels=9e-5)
+        )
     assert not (tmp_path / "out").exists()

@@ -13,13 +13,17 @@ from dyngs.capture.sfm_matches import MatchedPair, Parallax, _distances, paralla
 SIDE = 480
 
 
-def _pairs(turn_deg: float, shift: float, focal: float = 0.8, noise_px: float = 0.2) -> list[MatchedPair]:
+def _pairs(
+    turn_deg: float, shift: float, focal: float = 0.8, noise_px: float = 0.2
+) -> list[MatchedPair]:
     """Matches of a clip of 6 frames; the shift is that of the last one, depths are from 2 to 6."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-3, -2, 2), (3, 2, 6), (300, 3))
     seen = []
     for place in np.linspace(0, 1, 6):
-        turned = (points - (shift * place, 0, 0)) @ Rotation.from_euler("y", turn_deg * place, degrees=True).as_matrix()
+        turned = (points - (shift * place, 0, 0)) @ Rotation.from_euler(
+            "y", turn_deg * place, degrees=True
+        ).as_matrix()
         xy = focal * turned[:, :2] / turned[:, 2:]
         seen.append(xy + rng.normal(0, noise_px / SIDE, xy.shape))
     pairs = []
@@ -45,7 +49,9 @@ def test_a_small_shift_is_seen_and_a_large_one_is_enough() -> None:
 
 def test_matches_of_a_small_part_of_the_images_refuse_nothing() -> None:
     part = [replace(pair, covered=0.3) for pair in _pairs(8.0, 0.0)]
-    assert parallax_of(part, SIDE).kind is Parallax.ENOUGH, "they may be those of a thing that moves"
+    assert parallax_of(part, SIDE).kind is Parallax.ENOUGH, (
+        "they may be those of a thing that moves"
+    )
 
 
 def test_matches_of_a_small_part_of_the_images_may_be_of_a_mover() -> None:

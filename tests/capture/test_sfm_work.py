@@ -49,12 +49,16 @@ def test_an_error_leaves_nothing_and_two_at_once_are_refused(tmp_path: Path) -> 
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
-def test_a_disk_without_room_is_told_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """By the process itself: no file may take more than 20 KB, the database of features needs more."""
+def test_a_disk_without_room_is_told_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """By the process itself: no file may take more than 20 KB, the database of features needs
+    more."""
     import resource
 
     pytest.importorskip("pycolmap")
-    photos, out = tmp_path / "photos", tmp_path / "capture"
+    photos = tmp_path / "photos"
+    out = tmp_path / "capture"
     photos.mkdir()
     for number in range(3):
         noise = np.random.default_rng(number).integers(0, 256, (64, 64, 3), np.uint8)

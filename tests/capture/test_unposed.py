@@ -94,7 +94,9 @@ def test_a_video_gets_poses_and_has_times(tmp_path: Path, asked: list[Path]) -> 
     assert asked == [tmp_path / "clip.mp4"]
 
 
-def test_no_output_replaces_the_video_that_a_run_is_made_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_output_replaces_the_video_that_a_run_is_made_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The run knows only the folder in the cache, which names the video."""
     video = tmp_path / "clip.mp4"
     with VideoWriter(video, fps=10) as writer:
@@ -103,7 +105,9 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(tmp_path: Path, caps
     for _ in ("estimated", "of before"):
         data = with_poses(DataConfig(root=video), say=lambda _: None)
         save_config(Config(data=data), tmp_path / "run" / "config.yaml")
-        assert main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
+        assert (
+            main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
+        )
         assert "clip.mp4: is the file that is read" in capsys.readouterr().err
         (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
     assert video.read_bytes() == before
@@ -115,7 +119,9 @@ def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> Non
     assert with_poses(data, needs_times=True, say=lambda _: None) == first
     assert asked == [tmp_path / "rig"]
     (tmp_path / "rig" / "videos.json").write_text('{"starts": 0}')
-    assert with_poses(data, needs_times=True, say=lambda _: None).root != first.root, "offsets are given now"
+    assert with_poses(data, needs_times=True, say=lambda _: None).root != first.root, (
+        "offsets are given now"
+    )
 
 
 def test_captures_and_other_folders_stay_as_they_are(tmp_path: Path, asked: list[Path]) -> None:
@@ -131,7 +137,9 @@ def test_captures_and_other_folders_stay_as_they_are(tmp_path: Path, asked: list
     assert asked == []
 
 
-def test_what_cannot_work_is_said_before_poses_are_estimated(tmp_path: Path, asked: list[Path]) -> None:
+def test_what_cannot_work_is_said_before_poses_are_estimated(
+    tmp_path: Path, asked: list[Path]
+) -> None:
     photos = DataConfig(root=_photos(tmp_path / "photos"))
     with pytest.raises(DyngsError, match=r"no times.*data\.times=order"):
         with_poses(photos, needs_times=True)
@@ -139,7 +147,9 @@ def test_what_cannot_work_is_said_before_poses_are_estimated(tmp_path: Path, ask
         with_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
     with pytest.raises(DyngsError, match=r"one video; give that: data\.root=.*cam0\.mp4"):
         with_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
-    with pytest.raises(DyngsError, match=r"two: holds 2 photos and no cameras; a scene needs at least 3 photos"):
+    with pytest.raises(
+        DyngsError, match=r"two: holds 2 photos and no cameras; a scene needs at least 3 photos"
+    ):
         with_poses(DataConfig(root=_photos(tmp_path / "two", 2)))
     assert asked == []
     ordered = photos.model_copy(update={"times": "order"})

@@ -1,4 +1,5 @@
-"""Arguments that name files: every command says which it reads and which it writes, and no output replaces an input.
+"""Arguments that name files: every command says which it reads and which it writes, and no output
+replaces an input.
 
 The first tests walk the parser, so that a new command, or a new argument, cannot forget it.
 """
@@ -19,7 +20,8 @@ from dyngs.cli.arguments import input_path, input_word, output_path, print_writt
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.view.source import open_source
 
-INPUTS, OUTPUT = (input_path, input_word), output_path
+INPUTS = (input_path, input_word)
+OUTPUT = output_path
 WORDS = {
     "eval": {"overrides"},
     "data fit": {"overrides"},
@@ -41,7 +43,9 @@ WORDS = {
 """Arguments that are plain words, no paths; the paths among overrides are found by their keys."""
 
 
-def commands(parser: argparse.ArgumentParser, name: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+def commands(
+    parser: argparse.ArgumentParser, name: str = ""
+) -> Iterator[tuple[str, argparse.ArgumentParser]]:
     """Every command with arguments of its own."""
     inner = [action for action in parser._actions if action.nargs == argparse.PARSER]
     if not inner:
@@ -52,7 +56,9 @@ def commands(parser: argparse.ArgumentParser, name: str = "") -> Iterator[tuple[
 
 
 COMMANDS = dict(commands(make_parser()))
-WRITING = [(n, a.dest) for n, parser in COMMANDS.items() for a in parser._actions if a.type is OUTPUT]
+WRITING = [
+    (n, a.dest) for n, parser in COMMANDS.items() for a in parser._actions if a.type is OUTPUT
+]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -60,13 +66,17 @@ def test_every_argument_says_whether_it_names_what_is_read_or_written(name: str)
     for action in COMMANDS[name]._actions:
         assert action.type is not Path, f"{action.dest} of {name}: say input_path or output_path"
         if action.type is None and action.nargs != 0 and action.choices is None:
-            assert action.dest in WORDS.get(name, ()), f"{action.dest} of {name}: a word, or input_path or output_path?"
+            assert action.dest in WORDS.get(name, ()), (
+                f"{action.dest} of {name}: a word, or input_path or output_path?"
+            )
 
 
 @pytest.fixture
 def known(tmp_path: Path) -> dict[str, Path]:
     """A capture, a run trained on it, and a file."""
-    capture, run, file = tmp_path / "capture", tmp_path / "runs" / "a", tmp_path / "motion.npz"
+    capture = tmp_path / "capture"
+    run = tmp_path / "runs" / "a"
+    file = tmp_path / "motion.npz"
     (capture / "images").mkdir(parents=True)
     for name in ("1.jpg", "2.jpg"):
         (capture / "images" / name).write_text(name)
@@ -80,7 +90,8 @@ def known(tmp_path: Path) -> dict[str, Path]:
 
 def read_of(known: dict[str, Path], kind: str) -> list[Path]:
     """What is read of it, and may not be replaced."""
-    capture, run = known["capture"], known["run"]
+    capture = known["capture"]
+    run = known["run"]
     own = [run / RESOLVED_NAME, run / "checkpoints" / "step_0000010.safetensors"]
     below = [capture, capture / "images", capture / "images" / "1.jpg"]
     return {"capture": below, "run": own + below, "file": [known["file"]]}[kind]
@@ -96,8 +107,10 @@ def names_of(path: Path, folder: Path) -> list[Path]:
 
 
 def line_of(name: str, output: str, read: Path, out: Path) -> list[str] | None:
-    """A command line that reads ``read`` by all of its arguments and writes ``out``; None if it reads nothing."""
-    positional, options = list[str](), list[str]()
+    """A command line that reads ``read`` by all of its arguments and writes ``out``; None if it
+    reads nothing."""
+    positional = list[str]()
+    options = list[str]()
     found = [action for action in COMMANDS[name]._actions if action.type in INPUTS]
     for action in COMMANDS[name]._actions:
         if action.dest == output or action in found:
@@ -114,7 +127,9 @@ def line_of(name: str, output: str, read: Path, out: Path) -> list[str] | None:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+    return {
+        str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()
+    }
 
 
 def require_refused(line: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -128,13 +143,27 @@ def require_refused(line: list[str], capsys: pytest.CaptureFixture[str]) -> None
 
 def test_the_walk_finds_the_commands_that_write() -> None:
     names = {name for name, _ in WRITING}
-    assert names >= {"export", "render", "convert", "prune", "predict", "tradeoff", "data sfm", "bench rasterize"}
+    assert names >= {
+        "export",
+        "render",
+        "convert",
+        "prune",
+        "predict",
+        "tradeoff",
+        "data sfm",
+        "bench rasterize",
+    }
 
 
 @pytest.mark.parametrize("kind", ["capture", "run", "file"])
 @pytest.mark.parametrize(("name", "output"), WRITING)
 def test_no_output_of_any_command_replaces_what_it_reads(
-    name: str, output: str, kind: str, known: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    output: str,
+    kind: str,
+    known: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """However it is named: by its path, and in turn by another spelling and by links."""
     turn = WRITING.index((name, output))
@@ -159,7 +188,9 @@ def test_overrides_are_read_and_written_as_well(
         require_refused(["train", "static", f"data.root={capture}", f"run.dir={out}"], capsys)
         require_refused(["tradeoff", "static", f"data.root={capture}", "--out", str(out)], capsys)
     (tmp_path / "own.yaml").write_text("{}")
-    require_refused(["train", str(tmp_path / "own.yaml"), f"run.dir={tmp_path / 'own.yaml'}"], capsys)
+    require_refused(
+        ["train", str(tmp_path / "own.yaml"), f"run.dir={tmp_path / 'own.yaml'}"], capsys
+    )
     (tmp_path / "own.yaml").unlink()
     assert contents(tmp_path) == before
 
@@ -171,8 +202,15 @@ Capture = pytest.CaptureFixture[str]
 def moved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A run of 10 steps, and where its capture was moved to."""
     folder = tmp_path_factory.mktemp("moved")
-    assert main(["data", "synth", "still", str(folder / "old"), "--size", "24", "--views", "6"]) == 0
-    words = [f"data.root={folder / 'old'}", "train.steps=10", "init.num_random=200", "run.threads=1"]
+    assert (
+        main(["data", "synth", "still", str(folder / "old"), "--size", "24", "--views", "6"]) == 0
+    )
+    words = [
+        f"data.root={folder / 'old'}",
+        "train.steps=10",
+        "init.num_random=200",
+        "run.threads=1",
+    ]
     assert main(["train", "static", *words, f"run.dir={folder / 'my run'}"]) == 0
     (folder / "old").rename(folder / "new place")
     return folder / "my run", folder / "new place"
@@ -194,7 +232,9 @@ def test_the_command_says_how_and_works_so(
 ) -> None:
     run, new = moved
     before = (run / "config.yaml").read_bytes()
-    words = [word.replace("OUT", str(tmp_path)).replace("RUN", str(run)) for word in command.split()]
+    words = [
+        word.replace("OUT", str(tmp_path)).replace("RUN", str(run)) for word in command.split()
+    ]
     assert main(words) == 2
     error = capsys.readouterr().err
     assert "no such folder" in error
@@ -206,8 +246,12 @@ def test_the_command_says_how_and_works_so(
         assert load_resolved(tmp_path / "pruned").data.root == new
 
 
-@pytest.mark.parametrize(("name", "suffix"), [("dyngs", ""), ("html", "/page.html"), ("ply", "/splats.ply")])
-def test_exports(name: str, suffix: str, moved: tuple[Path, Path], tmp_path: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize(
+    ("name", "suffix"), [("dyngs", ""), ("html", "/page.html"), ("ply", "/splats.ply")]
+)
+def test_exports(
+    name: str, suffix: str, moved: tuple[Path, Path], tmp_path: Path, capsys: Capture
+) -> None:
     run, new = moved
     out = tmp_path / f"out{suffix}"
     assert main(["export", str(run), "--format", name, "--out", str(out), f"data.root={new}"]) == 0
@@ -242,7 +286,8 @@ def test_resuming_notes_it_for_later_commands(
     assert main(["train", "--resume", str(run), "data.root=nowhere"]) == 2
     assert (run / "config.yaml").read_bytes() == before
     monkeypatch.chdir(new.parent)
-    assert main(["train", "--resume", str(run), f"data.root={new.name}"]) == 0  # it is finished: only this is noted
+    # it is finished: only this is noted
+    assert main(["train", "--resume", str(run), f"data.root={new.name}"]) == 0
     assert load_resolved(run).data.root == new
     assert main(["train", "--resume", str(run), "train.steps=12"]) == 0
     assert main(["eval", str(run)]) == 0

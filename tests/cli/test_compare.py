@@ -38,16 +38,26 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out") / "comparison"
-    assert main(["compare", str(capture), "--models", "static,mip,dynamic", *OPTIONS, "--out", str(out)]) == 0
+    assert (
+        main(
+            ["compare", str(capture), "--models", "static,mip,dynamic", *OPTIONS, "--out", str(out)]
+        )
+        == 0
+    )
     return out
 
 
 def test_a_table_curves_and_a_page(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = list(csv.DictReader((finished / "comparison.csv").read_text().splitlines()))
     assert {row["model"] for row in rows} == {"static", "mip"}
-    assert all(float(row["psnr"]) > 5 and float(row["fps"]) > 0 and row["steps"] == "20" for row in rows)
+    assert all(
+        float(row["psnr"]) > 5 and float(row["fps"]) > 0 and row["steps"] == "20" for row in rows
+    )
     stored = json.loads((finished / "results" / "static.json").read_text())
-    assert stored["psnr"] == json.loads((finished / "runs" / "static" / "metrics.json").read_text())["psnr"]
+    assert (
+        stored["psnr"]
+        == json.loads((finished / "runs" / "static" / "metrics.json").read_text())["psnr"]
+    )
     assert [point["step"] for point in stored["curve"]] == [10, 20]
     assert "Left out: dynamic: the images have no times" in (finished / "comparison.md").read_text()
     assert (finished / "comparison.png").read_bytes().startswith(b"\x89PNG")
@@ -63,13 +73,18 @@ def test_the_page_has_everything_in_it(finished: Path) -> None:
     parser.feed(text)
     assert fetched
     assert all(address.startswith("data:") for address in fetched)
-    (views,) = re.findall(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)
+    (views,) = re.findall(
+        r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL
+    )
     shown = json.loads(views)
-    assert [[model["name"] for model in view["models"]] for view in shown] == [["static", "mip"]] * 2
+    assert [[model["name"] for model in view["models"]] for view in shown] == [
+        ["static", "mip"]
+    ] * 2
     png = base64.b64decode(shown[1]["truth"].partition(",")[2])
     assert png == (finished / "images" / TRUTH / "01.png").read_bytes()
     truth, model = (
-        np.asarray(Image.open(finished / "images" / name / "01.png"), np.float64) for name in (TRUTH, "static")
+        np.asarray(Image.open(finished / "images" / name / "01.png"), np.float64)
+        for name in (TRUTH, "static")
     )
     assert 10 * np.log10(255**2 / ((truth - model) ** 2).mean()) == pytest.approx(
         shown[1]["models"][0]["psnr"], abs=0.2
@@ -77,17 +92,32 @@ def test_the_page_has_everything_in_it(finished: Path) -> None:
 
 
 def test_the_same_command_trains_nothing(
-    finished: Path, capture: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    finished: Path,
+    capture: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.delattr(result, "finished")
-    words = ["compare", str(capture), "--models", "mip,static,dynamic", *OPTIONS, "--out", str(finished)]
+    words = [
+        "compare",
+        str(capture),
+        "--models",
+        "mip,static,dynamic",
+        *OPTIONS,
+        "--out",
+        str(finished),
+    ]
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "holds just this comparison, finished: nothing was trained" in said
     before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     said = error_line(capsys, *words, "init.half_extent=2", "--split", "train")
     assert "split is test there and train here" in said
-    assert "overrides is init.num_random=100 there and init.num_random=100, init.half_extent=2 here" in said
+    assert (
+        "overrides is init.num_random=100 there and init.num_random=100, init.half_extent=2 here"
+        in said
+    )
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 
 
@@ -122,9 +152,15 @@ def test_what_was_stopped_goes_on(
         ("--models statik --steps 3", "statik: no such preset (did you mean 'static'?)"),
         ("--models static,static --steps 3", "two models called static"),
         ("--models static,,mip --steps 3", "has an empty name"),
-        ("--models static", "say what all models get the same of: --minutes M, --steps N or --max-mb MB"),
+        (
+            "--models static",
+            "say what all models get the same of: --minutes M, --steps N or --max-mb MB",
+        ),
         ("--models static --steps 3 --minutes 2", "not allowed with"),
-        ("--models dynamic,human,human_predictor --steps 3", "none of the models can be trained on"),
+        (
+            "--models dynamic,human,human_predictor --steps 3",
+            "none of the models can be trained on",
+        ),
         ("--models static --steps 3 train.steps=9", "the comparison sets this itself"),
         ("--models static --steps 3 --split val", "the split 'val' has no views"),
         ("--models static --steps 3 train.stesp=2", "did you mean 'train.steps'?"),
@@ -140,12 +176,17 @@ def test_wrong_usage_ends_in_one_line(
 
 @pytest.mark.parametrize(
     ("kind", "part"),
-    [("unposed", "pictures without cameras"), ("single", "has one picture"), ("black", "are of one colour")],
+    [
+        ("unposed", "pictures without cameras"),
+        ("single", "has one picture"),
+        ("black", "are of one colour"),
+    ],
 )
 def test_captures_on_which_nothing_can_be_compared(
     kind: str, part: str, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, out = tmp_path / kind, tmp_path / "out"
+    folder = tmp_path / kind
+    out = tmp_path / "out"
     shutil.copytree(capture, folder)
     match kind:
         case "unposed":
@@ -166,11 +207,14 @@ def test_captures_on_which_nothing_can_be_compared(
 def test_what_is_not_made_of_gaussians_takes_part(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    own, out = tmp_path / "grid.yaml", tmp_path / "out"
+    own = tmp_path / "grid.yaml"
+    out = tmp_path / "out"
     own.write_text("model:\n  kind: toy\n")
     with registered():
         words = ["compare", str(capture), "--models", str(own), "--out", str(out)]
-        assert "has no Gaussians that could be limited" in error_line(capsys, *words, "--max-mb", "1")
+        assert "has no Gaussians that could be limited" in error_line(
+            capsys, *words, "--max-mb", "1"
+        )
         assert main([*words, "--steps", "20", "--threads", "1"]) == 0
     stored = json.loads((out / "results" / "grid.json").read_text())
     assert (stored["kind"], stored["gaussians"], stored["steps"]) == ("toy", 0, 20)
@@ -178,7 +222,10 @@ def test_what_is_not_made_of_gaussians_takes_part(
 
 
 def test_a_model_whose_images_were_shrunk_is_left_out(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("dyngs.budget.time.SMALLEST_SIDE", 8)
     words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
@@ -191,7 +238,12 @@ def test_a_comparison_that_comes_to_nothing_leaves_nothing(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert main(["compare", str(capture), "--models", "static", "--max-mb", "0.0001", "--out", str(out)]) == 2
+    assert (
+        main(
+            ["compare", str(capture), "--models", "static", "--max-mb", "0.0001", "--out", str(out)]
+        )
+        == 2
+    )
     said = capsys.readouterr()
     assert "no model could be trained; static: budget.max_mb=0.0001: has no room" in said.err
     assert "static (1 of 1): left out" in said.out
@@ -199,7 +251,16 @@ def test_a_comparison_that_comes_to_nothing_leaves_nothing(
 
 
 def test_to_the_same_size(capture: Path, tmp_path: Path) -> None:
-    words = ["--models", "static", "--max-mb", "0.05", *OPTIONS[2:], "train.steps=20", "--out", str(tmp_path / "out")]
+    words = [
+        "--models",
+        "static",
+        "--max-mb",
+        "0.05",
+        *OPTIONS[2:],
+        "train.steps=20",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(["compare", str(capture), *words]) == 0
     stored = json.loads((tmp_path / "out" / "results" / "static.json").read_text())
     file = tmp_path / "out" / "runs" / "static" / "export" / "scene.dyngs"
@@ -208,7 +269,9 @@ def test_to_the_same_size(capture: Path, tmp_path: Path) -> None:
     assert stored["seconds"] > 0
 
 
-def test_networks_are_compared_on_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_networks_are_compared_on_people(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = stereo_people(tmp_path / "set")
     network = train(stereo_config(folder, tmp_path / "net"))
     given = ["compare", str(folder), "--models", str(network), "--predict", "2"]
@@ -217,4 +280,6 @@ def test_networks_are_compared_on_people(tmp_path: Path, capsys: pytest.CaptureF
     assert (tmp_path / "out" / "comparison.csv").is_file()
     assert "only data.* can be given" in error_line(capsys, *[*given, "model.eps2d=1"])
     assert "--steps does not go with --predict" in error_line(capsys, *[*given, "--steps", "3"])
-    assert "--spread goes with --predict" in error_line(capsys, *[*given[:4], "--spread", "--steps", "3"])
+    assert "--spread goes with --predict" in error_line(
+        capsys, *[*given[:4], "--spread", "--steps", "3"]
+    )

@@ -16,7 +16,9 @@ def _printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 
 @pytest.mark.parametrize("preset", sorted(packaged_presets()))
-def test_what_is_printed_is_a_preset(preset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_printed_is_a_preset(
+    preset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = _printed(capsys, preset)
     (tmp_path / "all.yaml").write_text(text)
     root = f"data.root={tmp_path}"
@@ -25,14 +27,18 @@ def test_what_is_printed_is_a_preset(preset: str, tmp_path: Path, capsys: pytest
     assert all(len(line) <= 160 for line in text.splitlines())
 
 
-def test_overrides_count_and_every_key_has_its_default_and_meaning(capsys: pytest.CaptureFixture[str]) -> None:
+def test_overrides_count_and_every_key_has_its_default_and_meaning(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     text = _printed(capsys, "static", "train.steps=123", "strategy.kind=mcmc")
     assert "  steps: 123  # default 7000" in text
     assert "  # optimisation steps; all schedules follow this number (an integer >= 1)" in text
     assert "kind is one of default, mcmc, fixed" in text
     assert "  opacity_reg: " in text
     assert "prune_opacity" not in text
-    values = [line for line in text.splitlines() if ": " in line and not line.lstrip().startswith("#")]
+    values = [
+        line for line in text.splitlines() if ": " in line and not line.lstrip().startswith("#")
+    ]
     assert all("  # default " in line for line in values), "each has its default"
 
 

@@ -1,4 +1,5 @@
-"""``dyngs convert`` and the suffixes of ``dyngs export``: one line for each thing that is chosen or lost."""
+"""``dyngs convert`` and the suffixes of ``dyngs export``: one line for each thing that is chosen or
+lost."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
     said = capsys.readouterr().out
     assert "note: 200 Gaussians; up is y in the file, it was -y" in said
     assert "note: drawn again from 4 cameras: " in said
-    assert main(["convert", str(tmp_path / "b.spz"), str(tmp_path / "c.ply"), "--sh-degree", "4"]) == 0
+    assert (
+        main(["convert", str(tmp_path / "b.spz"), str(tmp_path / "c.ply"), "--sh-degree", "4"]) == 0
+    )
     assert "up is -y in the file, it was y" in capsys.readouterr().out
     assert read_splats(tmp_path / "c.ply").gaussians.sh_degree == 4
     means = read_splats(tmp_path / "c.ply").gaussians.means
@@ -47,10 +50,14 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
 
 def test_what_convert_refuses(tmp_path: Path, capsys: Capture) -> None:
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(5))).path
-    assert "names no format of Gaussians; use one of" in refused(capsys, "convert", plain, tmp_path / "b.xyz")
+    assert "names no format of Gaussians; use one of" in refused(
+        capsys, "convert", plain, tmp_path / "b.xyz"
+    )
     assert "is the file that is read" in refused(capsys, "convert", plain, plain)
     assert "no such file" in refused(capsys, "convert", tmp_path / "no.ply", tmp_path / "b.ply")
-    assert "at most degree 0" in refused(capsys, "convert", plain, tmp_path / "b.splat", "--sh-degree", 3)
+    assert "at most degree 0" in refused(
+        capsys, "convert", plain, tmp_path / "b.splat", "--sh-degree", 3
+    )
 
 
 def test_the_suffix_decides_what_export_writes(tmp_path: Path, capsys: Capture) -> None:
@@ -62,17 +69,40 @@ def test_the_suffix_decides_what_export_writes(tmp_path: Path, capsys: Capture) 
         assert len(read_splats(path).gaussians) == 5
     for name in ("b", "b.xyz"):
         said = refused(capsys, "export", run, "--out", tmp_path / name)
-        assert "which format? Give --format, or a name that ends in one of .compressed.ply, .ply, .spz" in said
-    assert "which is that of ply" in refused(capsys, "export", run, "--format", "spz", "--out", tmp_path / "a.ply")
+        assert (
+            "which format? Give --format, or a name that ends in one of .compressed.ply, .ply, .spz"
+            in said
+        )
+    assert "which is that of ply" in refused(
+        capsys, "export", run, "--format", "spz", "--out", tmp_path / "a.ply"
+    )
     assert "do not know this suffix as spz" in refused(
         capsys, "export", run, "--format", "spz", "--out", tmp_path / "a.xyz"
     )
-    assert main(["export", str(run), "--times", "0:1:2", "--format", "spz", "--out", str(tmp_path / "seq")]) == 0
-    assert sorted(p.name for p in (tmp_path / "seq").iterdir()) == ["frame_0000.spz", "frame_0001.spz"]
+    assert (
+        main(
+            [
+                "export",
+                str(run),
+                "--times",
+                "0:1:2",
+                "--format",
+                "spz",
+                "--out",
+                str(tmp_path / "seq"),
+            ]
+        )
+        == 0
+    )
+    assert sorted(p.name for p in (tmp_path / "seq").iterdir()) == [
+        "frame_0000.spz",
+        "frame_0001.spz",
+    ]
 
 
 def test_axes_of_an_export(tmp_path: Path, capsys: Capture) -> None:
-    run, path = write_moving_run(tmp_path / "run"), tmp_path / "a.ply"
+    run = write_moving_run(tmp_path / "run")
+    path = tmp_path / "a.ply"
     assert main(["export", str(run), "--out", str(path), "--up", "keep"]) == 0
     kept = read_splats(path).gaussians.means
     assert main(["export", str(run), "--out", str(path), "--from-up=x", "--up=y"]) == 0
@@ -100,18 +130,30 @@ def test_versions_of_spz_and_compressed_glb(tmp_path: Path, capsys: Capture) -> 
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(60), up="-y")).path
     run = write_moving_run(tmp_path, moves=False)
     for command in (["convert", str(plain)], ["export", str(run), "--from-up", "z", "--out"]):
-        for name, option, start in (("b.spz", "--spz-version=4", b"NGSP"), ("b.glb", "--compress=spz", b"glTF")):
+        for name, option, start in (
+            ("b.spz", "--spz-version=4", b"NGSP"),
+            ("b.glb", "--compress=spz", b"glTF"),
+        ):
             out = tmp_path / name
             for up in ("y", "-y"):
                 assert main([*command, str(out), option, f"--up={up}"]) == 0
-                figure = re.findall(r"drawn again from 4 cameras: (the same images|[\d.]+)", capsys.readouterr().out)
+                figure = re.findall(
+                    r"drawn again from 4 cameras: (the same images|[\d.]+)", capsys.readouterr().out
+                )
                 assert figure == ["the same images"] or float(figure[0]) > 25
             assert out.read_bytes()[:4] == start
             out.unlink()
     assert "--spz-version goes with .spz files" in refused(
         capsys, "convert", plain, tmp_path / "c.ply", "--spz-version=4"
     )
-    assert "--compress goes with .glb files" in refused(capsys, "convert", plain, tmp_path / "c.spz", "--compress=spz")
-    for options in (["--spz-version=4", "--out", tmp_path / "c.ply"], ["--compress=spz", "--bodies"]):
-        assert refused(capsys, "export", run, *options).startswith(f"dyngs: error: {options[0].split('=')[0]} ")
+    assert "--compress goes with .glb files" in refused(
+        capsys, "convert", plain, tmp_path / "c.spz", "--compress=spz"
+    )
+    for options in (
+        ["--spz-version=4", "--out", tmp_path / "c.ply"],
+        ["--compress=spz", "--bodies"],
+    ):
+        assert refused(capsys, "export", run, *options).startswith(
+            f"dyngs: error: {options[0].split('=')[0]} "
+        )
     assert not list(tmp_path.glob("c.*"))

@@ -1,4 +1,5 @@
-"""``dyngs data`` motion, synth human and fit as a user calls them; the other commands are in other tests."""
+"""``dyngs data`` motion, synth human and fit as a user calls them; the other commands are in other
+tests."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ TEMPLATE = Path(body_module.__file__).parent / "files" / "anny_smplx55.npz"
 
 
 def known_motion() -> Motion:
-    """3 frames at 2 per second: two joints turn, a third stays turned; the root moves by 0.5 m, then by 0.1 m."""
+    """3 frames at 2 per second: two joints turn, a third stays turned; the root moves by 0.5 m,
+    then by 0.1 m."""
     poses = torch.zeros(3, 55, 3)
     poses[:, 16, 2] = torch.tensor([0.0, 0.2, 0.4])
     poses[1, 15, 0] = 0.1
@@ -45,9 +47,16 @@ def test_a_motion_is_converted_and_summed_up(tmp_path: Path, capsys: PrintedOutp
     out = tmp_path / "new" / "out.npz"
     assert main(["data", "motion", str(tmp_path / "in.npz"), str(out)]) == 0
     printed = capsys.readouterr().out
-    for part in (str(out), "3 frames, 1.00 s at 2 frames per second", "2 of 55 joints", "up to 1.00 m/s"):
+    for part in (
+        str(out),
+        "3 frames, 1.00 s at 2 frames per second",
+        "2 of 55 joints",
+        "up to 1.00 m/s",
+    ):
         assert part in printed
-    assert out.read_bytes() == (tmp_path / "in.npz").read_bytes(), "what is of the template already stays as it is"
+    assert out.read_bytes() == (tmp_path / "in.npz").read_bytes(), (
+        "what is of the template already stays as it is"
+    )
 
 
 def test_one_frame_has_no_speed(tmp_path: Path, capsys: PrintedOutput) -> None:
@@ -57,11 +66,16 @@ def test_one_frame_has_no_speed(tmp_path: Path, capsys: PrintedOutput) -> None:
     assert text in capsys.readouterr().out
 
 
-def test_frames_per_second_and_the_up_axis_are_passed_on(tmp_path: Path, capsys: PrintedOutput) -> None:
-    """Five frames of three; what moved along the file's z moves along y, what moved along y away from z."""
+def test_frames_per_second_and_the_up_axis_are_passed_on(
+    tmp_path: Path, capsys: PrintedOutput
+) -> None:
+    """Five frames of three; what moved along the file's z moves along y, what moved along y away
+    from z."""
     write_amass(known_motion(), tmp_path / "in.npz")
     words = ["--up", "z", "--fps", "4"]
-    assert main(["data", "motion", str(tmp_path / "in.npz"), str(tmp_path / "out.npz"), *words]) == 0
+    assert (
+        main(["data", "motion", str(tmp_path / "in.npz"), str(tmp_path / "out.npz"), *words]) == 0
+    )
     assert "5 frames, 1.00 s at 4 frames" in capsys.readouterr().out
     found = read_motion(tmp_path / "out.npz").trans
     np.testing.assert_allclose(found[2] - found[0], [0.3, 0.0, -0.4], atol=1e-6)
@@ -96,22 +110,33 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
 
 def test_the_clip_and_the_body_are_passed_on(tmp_path: Path) -> None:
     """A body of half the size, and one of two animations."""
-    own, motion = skeleton(), random_motion(3, angle=0.2)
+    own = skeleton()
+    motion = random_motion(3, angle=0.2)
     glb = glb_of(own, Clip(as_local(motion, own), pelvis_path(tiny_body(), motion)))
     first = glb.json["animations"][0]
-    glb.json["animations"] = [first | {"name": "walk"}, first | {"name": "still", "channels": first["channels"][:1]}]
+    glb.json["animations"] = [
+        first | {"name": "walk"},
+        first | {"name": "still", "channels": first["channels"][:1]},
+    ]
     clip = glb.write(tmp_path / "x.glb")
     with np.load(TEMPLATE) as arrays:
-        small = {key: arrays[key] * (0.5 if key in ("v_template", "J") else 1) for key in arrays.files}
+        small = {
+            key: arrays[key] * (0.5 if key in ("v_template", "J") else 1) for key in arrays.files
+        }
     np.savez(tmp_path / "small.npz", **small)
     for words, body, name in (
         (["--clip", "walk"], None, "walk"),
         (["--clip", "still"], None, "still"),
-        (["--clip", "walk", "--body", str(tmp_path / "small.npz")], read_body(tmp_path / "small.npz"), "walk"),
+        (
+            ["--clip", "walk", "--body", str(tmp_path / "small.npz")],
+            read_body(tmp_path / "small.npz"),
+            "walk",
+        ),
     ):
         out = tmp_path / f"{name}_{len(words)}.npz"
         assert main(["data", "motion", str(clip), str(out), *words]) == 0
-        found, expected = read_motion(out), read_motion(clip, body, clip=name)
+        found = read_motion(out)
+        expected = read_motion(clip, body, clip=name)
         assert torch.equal(found.poses, expected.poses)
         assert torch.equal(found.trans, expected.trans)
     written = {path.read_bytes() for path in tmp_path.glob("*_*.npz")}
@@ -155,7 +180,9 @@ def test_motion_explains_itself(capsys: PrintedOutput) -> None:
 
 def test_an_unknown_format_is_answered_with_every_format(capsys: PrintedOutput) -> None:
     line = error_line(capsys, "data", "inspect", ".", "--format", "blendr")
-    assert [name for name in get_args(DataConfig.model_fields["format"].annotation) if name not in line] == []
+    assert [
+        name for name in get_args(DataConfig.model_fields["format"].annotation) if name not in line
+    ] == []
 
 
 def test_a_person_is_synthesised_and_inspected(tmp_path: Path, capsys: PrintedOutput) -> None:
@@ -173,7 +200,8 @@ def test_a_person_is_synthesised_and_inspected(tmp_path: Path, capsys: PrintedOu
 
 
 def test_people_are_synthesised(tmp_path: Path, capsys: PrintedOutput) -> None:
-    """Again with more of them: those are added. Options of one person, and other options than before, are refused."""
+    """Again with more of them: those are added. Options of one person, and other options than
+    before, are refused."""
     out = tmp_path / "people"
     words = ["data", "synth", "people", str(out), "--size", "12", "--cameras", "3", "--people"]
     for count in (1, 2):
@@ -184,13 +212,18 @@ def test_people_are_synthesised(tmp_path: Path, capsys: PrintedOutput) -> None:
         assert [sum(map(len, capture.splits.values())) for capture in captures] == [3] * count
     assert "leave them out" in error_line(capsys, *words, "2", "--varied")
     assert "other options" in error_line(capsys, *words, "2", "--seed", "5")
-    assert "--people" in error_line(capsys, "data", "synth", "human", str(tmp_path / "x"), "--people", "2")
+    assert "--people" in error_line(
+        capsys, "data", "synth", "human", str(tmp_path / "x"), "--people", "2"
+    )
 
 
 @pytest.mark.parametrize(
-    ("words", "part"), [("--views 0", "--views"), ("--cameras 0", "--cameras"), ("--seed -1", "--seed")]
+    ("words", "part"),
+    [("--views 0", "--views"), ("--cameras 0", "--cameras"), ("--seed -1", "--seed")],
 )
-def test_a_person_is_refused_in_one_line(words: str, part: str, tmp_path: Path, capsys: PrintedOutput) -> None:
+def test_a_person_is_refused_in_one_line(
+    words: str, part: str, tmp_path: Path, capsys: PrintedOutput
+) -> None:
     assert main(["data", "synth", "human", str(tmp_path / "new"), *words.split()]) != 0
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
@@ -199,13 +232,26 @@ def test_a_person_is_refused_in_one_line(words: str, part: str, tmp_path: Path, 
 
 
 def test_a_varied_person_has_a_shape_of_its_own(tmp_path: Path, capsys: PrintedOutput) -> None:
-    words = ["--size", "8", "--views", "1", "--cameras", "2", "--seed", "4", "--varied", "--usual-clothes"]
+    words = [
+        "--size",
+        "8",
+        "--views",
+        "1",
+        "--cameras",
+        "2",
+        "--seed",
+        "4",
+        "--varied",
+        "--usual-clothes",
+    ]
     assert main(["data", "synth", "human", str(tmp_path / "new"), *words]) == 0
     capture = read_capture(DataConfig(root=tmp_path / "new"))  # type: ignore[call-arg]
     assert capture.body is not None
     assert np.abs(capture.body["train"].betas).max() > 0
     capsys.readouterr()
-    assert "human only" in error_line(capsys, "data", "synth", "still", str(tmp_path / "other"), "--varied")
+    assert "human only" in error_line(
+        capsys, "data", "synth", "still", str(tmp_path / "other"), "--varied"
+    )
 
 
 def test_the_scene_is_listed() -> None:
@@ -219,15 +265,23 @@ def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> No
     image.rename(tmp_path / "own.png")
     image.symlink_to(tmp_path / "own.png")
     capsys.readouterr()
-    assert "set data.follow_links=true" in error_line(capsys, "data", "inspect", str(root), begun=True)
+    assert "set data.follow_links=true" in error_line(
+        capsys, "data", "inspect", str(root), begun=True
+    )
     assert main(["data", "inspect", str(root), "--deep", "data.follow_links=true"]) == 0
     assert "a link that leads out of the capture" in capsys.readouterr().out
     assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "train.steps=3")
-    assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "data.root=elsewhere")
-    assert "did you mean" in error_line(capsys, "data", "inspect", str(root), "data.follow_link=true")
+    assert "give keys of data" in error_line(
+        capsys, "data", "inspect", str(root), "data.root=elsewhere"
+    )
+    assert "did you mean" in error_line(
+        capsys, "data", "inspect", str(root), "data.follow_link=true"
+    )
 
 
-@pytest.mark.parametrize("words", [["--matching", "sequential"], ["--mapper", "global"], ["--masks", "masks"]])
+@pytest.mark.parametrize(
+    "words", [["--matching", "sequential"], ["--mapper", "global"], ["--masks", "masks"]]
+)
 def test_options_of_one_video_are_refused_for_several(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -251,7 +305,9 @@ def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOut
     assert report["taken"] == "the poses as given"
     assert set(report["iou_per_frame"]) == {"0", "1"}
     body = str(tmp_path / "out" / "body_train.npz")
-    assert main(["data", "motion", body, str(tmp_path / "moves.npz")]) == 0, "a fit is a motion, too"
+    assert main(["data", "motion", body, str(tmp_path / "moves.npz")]) == 0, (
+        "a fit is a motion, too"
+    )
     assert "2 frames" in capsys.readouterr().out
 
 
@@ -261,7 +317,9 @@ def test_the_run_of_a_known_person_finds_poses_by_its_avatar(
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
     options = HumanOptions(size=32, num_frames=1, num_new=0, num_cameras=3, num_test=1, samples=1)
-    root, fitted, run = write_human_capture(tmp_path / "person", options), tmp_path / "fitted", tmp_path / "run"
+    root = write_human_capture(tmp_path / "person", options)
+    fitted = tmp_path / "fitted"
+    run = tmp_path / "run"
     assert main(["data", "fit", str(root), str(fitted)]) == 0
     small = ["model.resolution=24", "train.steps=1", "run.threads=1"]
     assert main(["train", "human", f"data.root={fitted}", f"run.dir={run}", *small]) == 0
@@ -273,7 +331,9 @@ def test_the_run_of_a_known_person_finds_poses_by_its_avatar(
     assert "avatar" not in capsys.readouterr().out, "a capture has none"
 
 
-def test_what_cannot_be_fitted_is_refused_in_one_line(tmp_path: Path, capsys: PrintedOutput) -> None:
+def test_what_cannot_be_fitted_is_refused_in_one_line(
+    tmp_path: Path, capsys: PrintedOutput
+) -> None:
     write_colmap(tmp_path / "scene")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
@@ -291,17 +351,24 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(tmp_path: Path, capsys: Pr
 
 @pytest.mark.usefixtures("short_fits")
 def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
-    tmp_path: Path, capsys: PrintedOutput, monkeypatch: pytest.MonkeyPatch, smpl_files: tuple[Path, Path]
+    tmp_path: Path,
+    capsys: PrintedOutput,
+    monkeypatch: pytest.MonkeyPatch,
+    smpl_files: tuple[Path, Path],
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
     options = HumanOptions(size=32, num_frames=1, num_new=0, num_cameras=3, num_test=1, samples=1)
-    root, fitted, run = write_human_capture(tmp_path / "person", options), tmp_path / "fitted", tmp_path / "run"
+    root = write_human_capture(tmp_path / "person", options)
+    fitted = tmp_path / "fitted"
+    run = tmp_path / "run"
     body, uv = map(str, smpl_files)
     assert main(["data", "fit", str(root), str(fitted), "--template", body, "--uv", uv]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("smpl (smpl.npz), 1 frame; overlap of silhouettes")
     keys = [f"model.body={body}", f"model.uv={uv}"]
-    assert printed.splitlines()[-1] == f"next: dyngs train human data.root={fitted} {' '.join(keys)}"
+    assert (
+        printed.splitlines()[-1] == f"next: dyngs train human data.root={fitted} {' '.join(keys)}"
+    )
     small = ["model.resolution=24", "train.steps=1", "run.threads=1"]
     assert main(["train", "human", f"data.root={fitted}", f"run.dir={run}", *keys, *small]) == 0
     assert "fitted to the silhouettes" not in capsys.readouterr().out, "that was done"
@@ -309,21 +376,32 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     printed = capsys.readouterr().out
     assert printed.startswith("smpl (smpl.npz), 1 frame")
     assert "poses by the silhouette of the person's avatar: " in printed
-    with np.load(fitted / "body_train.npz") as old, np.load(tmp_path / "new" / "body_train.npz") as new:
+    with (
+        np.load(fitted / "body_train.npz") as old,
+        np.load(tmp_path / "new" / "body_train.npz") as new,
+    ):
         assert np.array_equal(old["betas"], new["betas"])
         assert str(new["surface_model_type"]) == "smpl"
     assert main(["data", "fit", str(root), str(tmp_path / "other"), "--person", str(fitted)]) == 2
-    assert "is of another template than anny; name that of the person with --template" in capsys.readouterr().err
-    assert main(["data", "motion", str(fitted / "body_train.npz"), str(tmp_path / "moves.npz")]) == 0
+    assert (
+        "is of another template than anny; name that of the person with --template"
+        in capsys.readouterr().err
+    )
+    assert (
+        main(["data", "motion", str(fitted / "body_train.npz"), str(tmp_path / "moves.npz")]) == 0
+    )
 
 
 def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
     tmp_path: Path, capsys: PrintedOutput, smpl_files: tuple[Path, Path]
 ) -> None:
     root = tmp_path / "ann"
-    write_human_capture(root, HumanOptions(size=16, num_frames=1, num_new=0, num_cameras=1, num_test=1))
+    write_human_capture(
+        root, HumanOptions(size=16, num_frames=1, num_new=0, num_cameras=1, num_test=1)
+    )
     body, uv = map(str, smpl_files)
-    damaged, wrong = tmp_path / "damaged.npz", tmp_path / "wrong.obj"
+    damaged = tmp_path / "damaged.npz"
+    wrong = tmp_path / "wrong.obj"
     damaged.write_bytes(Path(body).read_bytes()[:5000])
     wrong.write_text("v 0 0 0\nvt 0 0\nf 1/1 1/1 1/1\n")
     for file, atlas, wanted in (
@@ -345,4 +423,8 @@ def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
             assert len(said.err.strip().splitlines()) == 1
             assert wanted in said.err
             assert "fitted" not in said.out
-            assert sorted(path.name for path in tmp_path.iterdir()) == ["ann", "damaged.npz", "wrong.obj"]
+            assert sorted(path.name for path in tmp_path.iterdir()) == [
+                "ann",
+                "damaged.npz",
+                "wrong.obj",
+            ]

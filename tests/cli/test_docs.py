@@ -29,9 +29,14 @@ def test_pages_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_links_in_a_terminal_are_commands() -> None:
-    text = "([longer.md](longer.md#x)) [b](https://x.y/z.md) [c](none.md) [d](#e) [the keys](cli.md)"
+    text = (
+        "([longer.md](longer.md#x)) [b](https://x.y/z.md) [c](none.md) [d](#e) [the keys](cli.md)"
+    )
     found = docs._with_commands(text, docs_folder())
-    assert found == "(`dyngs docs longer`) [b](https://x.y/z.md) [c](none.md) [d](#e) the keys (`dyngs docs cli`)"
+    assert (
+        found
+        == "(`dyngs docs longer`) [b](https://x.y/z.md) [c](none.md) [d](#e) the keys (`dyngs docs cli`)"
+    )
 
 
 def test_links_lead_to_what_is_installed() -> None:
@@ -40,7 +45,9 @@ def test_links_lead_to_what_is_installed() -> None:
     packed = dict(re.findall(r'^"(\S+)" = "(dyngs/\S+)"', project, re.MULTILINE))
     assert packed["docs"] == "dyngs/docs"
     for page in sorted((ROOT / "docs").rglob("*.md")):
-        for target in re.findall(r"\]\(([^)#\s:]+)(?:#[^)\s]*)?\)", page.read_text(encoding="utf-8")):
+        for target in re.findall(
+            r"\]\(([^)#\s:]+)(?:#[^)\s]*)?\)", page.read_text(encoding="utf-8")
+        ):
             place = (page.parent / target).resolve()
             assert place.exists(), (page, target)
             inside = place.relative_to(ROOT).as_posix()

@@ -34,9 +34,14 @@ def test_doctor_reports_kernels_that_this_processor_cannot_run() -> None:
     assert done.stderr.startswith("dyngs: error: this installation cannot work: native core")
 
 
-def test_doctor_reports_a_faster_instruction_set(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_doctor_reports_a_faster_instruction_set(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
     monkeypatch.setattr("dyngs.ops.native.built_isas", lambda: ("v2",))
     monkeypatch.setattr("dyngs.ops.native.core", SimpleNamespace(best_isa=lambda: "v4"))
     assert main(["doctor"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert "compiled: v2; this processor also runs v4 (AVX-512): install again on it for more speed" in text
+    assert (
+        "compiled: v2; this processor also runs v4 (AVX-512): install again on it for more speed"
+        in text
+    )

@@ -1,4 +1,5 @@
-"""``dyngs edit``: words that begin with a minus, lines about what was done, and about each thing that is refused."""
+"""``dyngs edit``: words that begin with a minus, lines about what was done, and about each thing
+that is refused."""
 
 from __future__ import annotations
 
@@ -30,10 +31,26 @@ def edit(*words: str) -> int:
 
 
 def test_options_one_after_another(plain: Path, capsys: Capture) -> None:
-    words = ["--crop", "-1,-1,-1", "1,1,1", "--merge", "plain.ply", "--origin", "-1,0,0", "--scale", "0,0,0 -1,0,0 2m"]
+    words = [
+        "--crop",
+        "-1,-1,-1",
+        "1,1,1",
+        "--merge",
+        "plain.ply",
+        "--origin",
+        "-1,0,0",
+        "--scale",
+        "0,0,0 -1,0,0 2m",
+    ]
     assert edit("plain.ply", *words, "--up", "-z", "--clean", "--out", "a.ply") == 0
     said = capsys.readouterr().out
-    for line in ("needles", "without the cameras of a run", "crop: ", "plain.ply: 400 Gaussians added", "up is -y"):
+    for line in (
+        "needles",
+        "without the cameras of a run",
+        "crop: ",
+        "plain.ply: 400 Gaussians added",
+        "up is -y",
+    ):
         assert line in said
     assert "next:    dyngs view a.ply" in said
     assert len(read_splats("a.ply").gaussians) > 400

@@ -32,7 +32,12 @@ def test_eval_of_a_moving_run(moving_run: Path, capsys: pytest.CaptureFixture[st
     text = capsys.readouterr().out
     report = json.loads((moving_run / "metrics.json").read_text())
     worst = min(report["psnr_per_time"], key=lambda at: at["psnr"])
-    for part in (f"worst at time {worst['time']:g}", "2 (40.0%)", f"{report['flicker']:.3f} of 255", "deforming"):
+    for part in (
+        f"worst at time {worst['time']:g}",
+        "2 (40.0%)",
+        f"{report['flicker']:.3f} of 255",
+        "deforming",
+    ):
         assert part in " ".join(text.replace("│", " ").split())
     assert "flicker error" in text
 
@@ -58,5 +63,7 @@ def test_only_the_command_line_lets_a_capture_name_files_elsewhere(
     preset.write_text(
         f"data:\n  root: {tmp_path / 'capture'}\n  follow_links: true\nrun: {{dir: {tmp_path / 'new'}}}\n"
     )
-    assert "preset.yaml:3: only the command line may set data.follow_links" in error_line(capsys, "train", preset)
+    assert "preset.yaml:3: only the command line may set data.follow_links" in error_line(
+        capsys, "train", preset
+    )
     assert not (tmp_path / "new").exists()

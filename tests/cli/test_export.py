@@ -1,4 +1,5 @@
-"""``dyngs export`` of all that moves, cameras, pages and people with their skeleton, from the command line."""
+"""``dyngs export`` of all that moves, cameras, pages and people with their skeleton, from the
+command line."""
 
 from __future__ import annotations
 
@@ -27,7 +28,13 @@ from dyngs.splats.formats import read_splats
 
 
 def run_of(still: Path, folder: Path, refine: str) -> Path:
-    keys = [f"data.root={still}", f"run.dir={folder}", "train.steps=30", "init.num_random=60", "run.threads=1"]
+    keys = [
+        f"data.root={still}",
+        f"run.dir={folder}",
+        "train.steps=30",
+        "init.num_random=60",
+        "run.threads=1",
+    ]
     return dyngs.train(dyngs.load_config("static", [*keys, f"camera.refine={refine}"]))
 
 
@@ -47,8 +54,13 @@ def test_refined_cameras_are_a_capture_of_their_own(
     found = read_capture(DataConfig(root=refined / "cameras", follow_links=True)).splits
     for moves in (True, False):
         split = "train" if moves else "test"
-        there = {view.image_path.resolve(): camera_center(view.cam_from_world) for view in found[split]}
-        shifts = [np.abs(there[v.image_path.resolve()] - camera_center(v.cam_from_world)).max() for v in given[split]]
+        there = {
+            view.image_path.resolve(): camera_center(view.cam_from_world) for view in found[split]
+        }
+        shifts = [
+            np.abs(there[v.image_path.resolve()] - camera_center(v.cam_from_world)).max()
+            for v in given[split]
+        ]
         assert bool(max(shifts) > 1e-6) is moves
 
 
@@ -83,7 +95,12 @@ def test_cameras_of_the_capture_are_not_written_over(
 ) -> None:
     assert main(["export", str(refined), "--format", "cameras", "--out", str(still)]) == 2
     assert "is the folder that is read" in capsys.readouterr().err
-    assert main(["export", str(refined), "--format", "cameras", "--out", str(still / "transforms.json")]) == 2
+    assert (
+        main(
+            ["export", str(refined), "--format", "cameras", "--out", str(still / "transforms.json")]
+        )
+        == 2
+    )
     assert "stand in for the cameras of the capture" in capsys.readouterr().err
     assert not (still / "transforms.json").exists()
 
@@ -103,14 +120,25 @@ def test_a_page_is_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_a_page_as_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     still = write_moving_run(tmp_path / "still", moves=False)
-    assert main(["export", str(still), "--format", "html", "--folder", "--max-gaussians-drawn", "9000"]) == 0
-    assert sorted(path.name for path in (still / "scene").iterdir()) == ["0-0.bin", "dyngs-scene.js", "index.html"]
+    assert (
+        main(
+            ["export", str(still), "--format", "html", "--folder", "--max-gaussians-drawn", "9000"]
+        )
+        == 0
+    )
+    assert sorted(path.name for path in (still / "scene").iterdir()) == [
+        "0-0.bin",
+        "dyngs-scene.js",
+        "index.html",
+    ]
     assert "python -m http.server -d" in capsys.readouterr().out
     assert main(["export", str(still), "--format", "html", "--folder"]) == 2
     assert "exists already" in capsys.readouterr().err
 
 
-def test_sog_in_levels_is_a_folder(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sog_in_levels_is_a_folder(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["export", str(run), "--format", "sog", "--folder", "--out"]
     assert main([*words, str(tmp_path / "town"), "--time", "0.5"]) == 0
     assert (tmp_path / "town" / "lod-meta.json").is_file()
@@ -161,7 +189,9 @@ def test_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 @pytest.fixture(scope="module")
 def avatar(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_avatar(bare_run(bare_scene(resolution=24)), tmp_path_factory.mktemp("person") / "ann.safetensors")
+    return write_avatar(
+        bare_run(bare_scene(resolution=24)), tmp_path_factory.mktemp("person") / "ann.safetensors"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -172,9 +202,16 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_mesh_that_walks(avatar: Path, motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mesh_that_walks(
+    avatar: Path, motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "ann.glb"
-    assert main(["export", str(avatar), "--format", "mesh", "--motion", str(motion), "--out", str(out)]) == 0
+    assert (
+        main(
+            ["export", str(avatar), "--format", "mesh", "--motion", str(motion), "--out", str(out)]
+        )
+        == 0
+    )
     said = capsys.readouterr()
     assert f"written: {out}" in said.out
     assert "texture of 96 x 96" in said.out + said.err
@@ -199,8 +236,14 @@ def test_gaussians_with_joints(avatar: Path, tmp_path: Path, suffix: str) -> Non
         ("--format mesh --time 0 --out x.glb", "--time does not go with --format mesh"),
         ("--format mesh --up y --out x.glb", "--up does not go with --format mesh"),
         ("--format mesh --motion no.npz --out x.glb", r"no\.npz: no such file"),
-        ("--format mesh --cells 30 --out x.glb", "--cells goes with --format mesh, not of a person"),
-        ("--format mesh --joints --out x.glb", "--joints goes with --format ply and glb, not with mesh"),
+        (
+            "--format mesh --cells 30 --out x.glb",
+            "--cells goes with --format mesh, not of a person",
+        ),
+        (
+            "--format mesh --joints --out x.glb",
+            "--joints goes with --format ply and glb, not with mesh",
+        ),
         ("--joints --out x.spz", "--joints goes with --format ply and glb, not with spz"),
         ("--joints --static --out x.ply", "--static does not go with --joints"),
         ("--joints --motion no.npz --out x.ply", "--motion does not go with --joints in a .ply"),
@@ -225,7 +268,9 @@ def test_wrong_options_end_in_one_line(
 def test_a_scene_without_a_person(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_moving_run(tmp_path / "run")
     assert main(["export", str(run), "--joints", "--out", "x.ply"]) == 2
-    assert re.search(r"needs the run of a person \(model\.kind=human\), this one is", capsys.readouterr().err)
+    assert re.search(
+        r"needs the run of a person \(model\.kind=human\), this one is", capsys.readouterr().err
+    )
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +281,9 @@ def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 ROUNDING = 1e-7  # of float32, where weights of nodes add up to nearly 1
 
 
-def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_of_a_moving_run(
+    moving_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def export(*words: object) -> str:
         assert main(["export", str(moving_run), *[str(w) for w in words]]) == 0
         return capsys.readouterr().out
@@ -244,13 +291,21 @@ def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: pytest
     def x_of(path: Path) -> list[float]:
         return read_splats(path).gaussians.means[:, 0].tolist()
 
-    every, moving, still = (0, 1, 2, 3, 4), (1, 3), (0, 2, 4)
+    every = (0, 1, 2, 3, 4)
+    moving = (1, 3)
+    still = (0, 2, 4)
     assert "note: this is time 0" in export()
-    assert x_of(moving_run / "splats.ply") == pytest.approx(moved_x(every, 0.0).tolist(), abs=ROUNDING)
+    assert x_of(moving_run / "splats.ply") == pytest.approx(
+        moved_x(every, 0.0).tolist(), abs=ROUNDING
+    )
     assert "this is time" not in export("--time", 0.5, "--out", tmp_path / "middle.ply")
-    assert x_of(tmp_path / "middle.ply") == pytest.approx(moved_x(every, 0.5).tolist(), abs=ROUNDING)
+    assert x_of(tmp_path / "middle.ply") == pytest.approx(
+        moved_x(every, 0.5).tolist(), abs=ROUNDING
+    )
     assert "3 files" in export("--times", "0:1:3", "--out", tmp_path / "seq")
-    assert x_of(tmp_path / "seq" / "frame_0002.ply") == pytest.approx(moved_x(every, 1.0).tolist(), abs=ROUNDING)
+    assert x_of(tmp_path / "seq" / "frame_0002.ply") == pytest.approx(
+        moved_x(every, 1.0).tolist(), abs=ROUNDING
+    )
     export("--times", "0:1:3", "--dynamic")
     assert x_of(moving_run / "splats_dynamic" / "frame_0001.ply") == pytest.approx(
         moved_x(moving, 0.5).tolist(), abs=ROUNDING
@@ -258,7 +313,10 @@ def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: pytest
     for words, path in (
         (["--static"], moving_run / "splats_static.ply"),
         (["--static", "--times", "0:1:3", "--out", tmp_path / "still.ply"], tmp_path / "still.ply"),
-        (["--static", "--times", "0:1:3", "--out", tmp_path / "still"], tmp_path / "still" / "splats_static.ply"),
+        (
+            ["--static", "--times", "0:1:3", "--out", tmp_path / "still"],
+            tmp_path / "still" / "splats_static.ply",
+        ),
     ):
         export(*words)
         assert x_of(path) == pytest.approx(moved_x(still, 0.0).tolist(), abs=ROUNDING)
@@ -266,28 +324,46 @@ def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: pytest
     assert "a sequence is a folder of files" in error_line(capsys, "export", moving_run, *wrong)
 
 
-def test_export_of_tracks(moving_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_of_tracks(
+    moving_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["export", str(moving_run), "--format", "tracks"]) == 0
     assert "5 Gaussians, 2 of them moving, at 5 times" in capsys.readouterr().out
     with np.load(moving_run / "tracks.npz", allow_pickle=False) as stored:
         assert stored["times"].tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
         assert stored["positions"].shape == (5, 5, 3)
-    words = ["--format", "tracks", "--dynamic", "--times", "0:2:3", "--out", str(tmp_path / "t.npz")]
+    words = [
+        "--format",
+        "tracks",
+        "--dynamic",
+        "--times",
+        "0:2:3",
+        "--out",
+        str(tmp_path / "t.npz"),
+    ]
     assert main(["export", str(moving_run), *words]) == 0
     assert "1 of 3 times lie outside" in capsys.readouterr().err
     with np.load(tmp_path / "t.npz", allow_pickle=False) as stored:
-        assert stored["positions"][:, 0, 0] == pytest.approx(moved_x((1, 3), 0.0).tolist(), abs=ROUNDING)
+        assert stored["positions"][:, 0, 0] == pytest.approx(
+            moved_x((1, 3), 0.0).tolist(), abs=ROUNDING
+        )
         assert stored["ids"].tolist() == [1, 3]
 
 
-def test_export_accepts_every_suffix_that_its_help_names(capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_accepts_every_suffix_that_its_help_names(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["export", "--help"]) == 0
     text = capsys.readouterr().out
     motions = re.search(r"motion for a person: (.*?)--max", text, re.DOTALL)
     assert motions is not None
     others = {".kind", ".js", ".root", ".follow_links"}  # model.kind, three.js, data.root
-    found = set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
+    found = (
+        set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
+    )
     assert {".ply", ".spz", ".4dgs", ".safetensors", ".html"} <= found
     for suffix in found:
-        arguments = argparse.Namespace(out=Path(f"x{suffix}"), format=None, times=None, motion=None, time=None)
+        arguments = argparse.Namespace(
+            out=Path(f"x{suffix}"), format=None, times=None, motion=None, time=None
+        )
         assert export._kind(arguments)

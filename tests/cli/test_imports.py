@@ -10,14 +10,17 @@ import pytest
 from dyngs.cli.imports import heavy_imports
 
 
-def test_the_collector_rests_during_imports_and_forgets_what_they_made(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_collector_rests_during_imports_and_forgets_what_they_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delitem(sys.modules, "torch")  # as at the start of a command
     frozen = gc.get_freeze_count()
     with heavy_imports():
         assert not gc.isenabled()
         kept = [[] for _ in range(100_000)]
     assert gc.isenabled()
-    assert gc.get_freeze_count() > frozen + len(kept) // 2  # half, as what was frozen before may be freed meanwhile
+    # half, as what was frozen before may be freed meanwhile
+    assert gc.get_freeze_count() > frozen + len(kept) // 2
 
 
 def test_the_collector_stays_as_it_is_where_torch_is_there_already() -> None:
@@ -25,7 +28,8 @@ def test_the_collector_stays_as_it_is_where_torch_is_there_already() -> None:
     with heavy_imports():
         assert gc.isenabled()
         kept = [[] for _ in range(1000)]
-    # What was frozen before can be freed at any moment, so the count may fall; it must not take up what is new.
+    # What was frozen before can be freed at any moment, so the count may fall; it must not take up
+    # what is new.
     assert gc.get_freeze_count() < frozen + len(kept)
 
 

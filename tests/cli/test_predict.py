@@ -39,7 +39,8 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert error.count("\n") == 1
 
 
-# --- what gps cannot predict from -----------------------------------------------------------------------------------
+# --- what gps cannot predict from
+# -----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +64,11 @@ def twice_as_long(frames: Frames) -> None:
 
 
 def turned_away(frames: Frames) -> None:
-    """The pose of a camera that looks past the person, of an image that shows the person: nothing fits."""
+    """The pose of a camera that looks past the person, of an image that shows the person: nothing
+    fits."""
     pose = np.array(frames[2]["transform_matrix"])
-    c, s = np.cos(0.6), np.sin(0.6)
+    c = np.cos(0.6)
+    s = np.sin(0.6)
     pose[:3, :3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ pose[:3, :3]
     frames[2]["transform_matrix"] = pose.tolist()
 
@@ -118,7 +121,10 @@ def test_views_that_do_not_suit_are_one_line(
     (capture / "transforms_train.json").write_text(json.dumps(listed))
     files(capture)
     names = ",".join(f"f000_{view}.png" for view in views.split(","))
-    assert main(["predict", str(run), str(capture), "--out", str(tmp_path / "out"), "--views", names]) == 2
+    assert (
+        main(["predict", str(run), str(capture), "--out", str(tmp_path / "out"), "--views", names])
+        == 2
+    )
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -131,16 +137,26 @@ def test_weights_that_do_not_suit_are_one_line(
     """Of another kind of network, and a file of which the second half is missing."""
     run, person = stereo
     values = {"data": {"root": people(tmp_path / "p", (1,))}, "model": NET, "train": {"steps": 1}}
-    other = train(Config.model_validate(values | {"run": {"dir": tmp_path / "other", "threads": 1}}))
+    other = train(
+        Config.model_validate(values | {"run": {"dir": tmp_path / "other", "threads": 1}})
+    )
     capsys.readouterr()
     for name, written in (
         ("mixed", checkpoint_paths(other)[-1].read_bytes()),
-        ("half", checkpoint_paths(run)[-1].read_bytes()[: checkpoint_paths(run)[-1].stat().st_size // 2]),
+        (
+            "half",
+            checkpoint_paths(run)[-1].read_bytes()[: checkpoint_paths(run)[-1].stat().st_size // 2],
+        ),
     ):
         copy = shutil.copytree(run, tmp_path / name)
         file = checkpoint_paths(copy)[-1]
         file.write_bytes(written)
-        assert main(["predict", str(copy), str(person), "--out", str(tmp_path / "out"), "--views", "2"]) == 2
+        assert (
+            main(
+                ["predict", str(copy), str(person), "--out", str(tmp_path / "out"), "--views", "2"]
+            )
+            == 2
+        )
         error = capsys.readouterr().err
         assert error.count("\n") == 1
         assert str(file) in error

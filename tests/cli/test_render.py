@@ -34,17 +34,22 @@ def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_render_of_a_split(run_dir: Path, tmp_path: Path, capsys: Capture) -> None:
-    assert main(["render", str(run_dir), "--out", str(tmp_path / "test"), "--alpha", "--depth"]) == 0
+    assert (
+        main(["render", str(run_dir), "--out", str(tmp_path / "test"), "--alpha", "--depth"]) == 0
+    )
     names = {f.name for f in (tmp_path / "test").iterdir()}
     assert "sheet.png" in names
     assert any(n.endswith("_alpha.png") for n in names)
     assert any(n.endswith("_depth.exr") for n in names)
     assert "sheet.png" in capsys.readouterr().out
-    assert "--size goes with --path" in error_line(capsys, "render", run_dir, "--out", tmp_path, "--size", "8x8")
+    assert "--size goes with --path" in error_line(
+        capsys, "render", run_dir, "--out", tmp_path, "--size", "8x8"
+    )
 
 
 def test_the_views_of_a_split_before_another_background(run_dir: Path, tmp_path: Path) -> None:
-    """A corner that nothing covers has it in the render, in the truth of the sheet, and in the video."""
+    """A corner that nothing covers has it in the render, in the truth of the sheet, and in the
+    video."""
 
     def images(name: str, *words: str) -> dict[str, np.ndarray]:
         out = tmp_path / name
@@ -64,7 +69,18 @@ def test_the_views_of_a_split_before_another_background(run_dir: Path, tmp_path:
 def test_render_of_a_path_with_a_video(run_dir: Path, tmp_path: Path) -> None:
     pytest.importorskip("av")
     video = tmp_path / "orbit.mp4"
-    words = ["--path", "orbit", "--frames", "3", "--size", "32x16", "--background", "black", "--video", str(video)]
+    words = [
+        "--path",
+        "orbit",
+        "--frames",
+        "3",
+        "--size",
+        "32x16",
+        "--background",
+        "black",
+        "--video",
+        str(video),
+    ]
     assert main(["render", str(run_dir), "--out", str(tmp_path / "frames"), *words]) == 0
     assert len(list((tmp_path / "frames").glob("*.png"))) == 3
     assert video.stat().st_size > 0
@@ -80,7 +96,12 @@ def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> N
     assert images("frozen", "--path", "orbit", "--frames", "3", "--time", "0.5") == 3
     assert images("together", "--path", "spiral", "--times", "0:1:4") == 4
     assert images("one", "--time", "0.5") == 1
-    assert images("many", "--times", "0:1:4", "--view", "r_001", "--size", "8x8", "--background", "black") == 4
+    assert (
+        images(
+            "many", "--times", "0:1:4", "--view", "r_001", "--size", "8x8", "--background", "black"
+        )
+        == 4
+    )
     assert images("view", "--view", "1", "--split", "train") == 1
     assert capsys.readouterr().err == ""
     assert images("clamped", "--time", "7") == 1
@@ -88,8 +109,12 @@ def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> N
     assert re.fullmatch(r"dyngs: warning: .*clamped\n", output.err)
     few = ("--max-gaussians-drawn", 9, "--view", 0)
     assert "for still scenes" in error_line(capsys, "render", moving_run, "--out", tmp_path, *few)
-    assert "no view 'r_9'" in error_line(capsys, "render", moving_run, "--out", tmp_path, "--view", "r_9")
-    assert "no range of times" in error_line(capsys, "render", moving_run, "--out", tmp_path, "--times", "x")
+    assert "no view 'r_9'" in error_line(
+        capsys, "render", moving_run, "--out", tmp_path, "--view", "r_9"
+    )
+    assert "no range of times" in error_line(
+        capsys, "render", moving_run, "--out", tmp_path, "--times", "x"
+    )
     assert "'val' has no views" in error_line(
         capsys, "render", moving_run, "--out", tmp_path, "--split", "val", "--time", "0"
     )
@@ -97,7 +122,10 @@ def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> N
 
 def test_a_video_of_a_camera_that_stands_needs_no_folder(moving_run: Path, tmp_path: Path) -> None:
     pytest.importorskip("av")
-    assert main(["render", str(moving_run), "--times", "0:1:3", "--video", str(tmp_path / "a.mp4")]) == 0
+    assert (
+        main(["render", str(moving_run), "--times", "0:1:3", "--video", str(tmp_path / "a.mp4")])
+        == 0
+    )
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 
@@ -108,6 +136,8 @@ def test_times_where_nothing_moves(run_dir: Path, tmp_path: Path, capsys: Captur
     assert main(["export", str(run_dir), "--out", str(ply), "--time", "0.5"]) == 0
     assert "note: nothing moves in this run" in capsys.readouterr().out
     for words in (["--time", "0"], ["--times", "0:1:2"], ["--view", "0"]):
-        assert "holds one time and no views" in error_line(capsys, "render", ply, "--out", tmp_path, *words)
+        assert "holds one time and no views" in error_line(
+            capsys, "render", ply, "--out", tmp_path, *words
+        )
     for words in (["--dynamic"], ["--dynamic", "--format", "tracks"]):
         assert "nothing moves in this run" in error_line(capsys, "export", run_dir, *words)

@@ -18,17 +18,40 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_a_table_files_and_a_chosen_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """But for the memory, measured in processes that import the renderer: tests/tradeoff/test_sweep.py."""
+    """But for the memory, measured in processes that import the renderer:
+    tests/tradeoff/test_sweep.py."""
     monkeypatch.setattr("dyngs.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
     run = str(write_moving_run(tmp_path))
     out = tmp_path / "out"
-    words = ["tradeoff", run, "--out", str(out), "--vary", "scale=0.5", "--vary", "storage=2", "--rounds", "1"]
-    assert main([*words, "--threads", "1", "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
+    words = [
+        "tradeoff",
+        run,
+        "--out",
+        str(out),
+        "--vary",
+        "scale=0.5",
+        "--vary",
+        "storage=2",
+        "--rounds",
+        "1",
+    ]
+    assert (
+        main([*words, "--threads", "1", "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
+    )
     text = capsys.readouterr().out
-    for word in ("as it is", "scale=0.5", "storage=2", "each setting alone", "tradeoff.csv", "chosen:"):
+    for word in (
+        "as it is",
+        "scale=0.5",
+        "storage=2",
+        "each setting alone",
+        "tradeoff.csv",
+        "chosen:",
+    ):
         assert word in text
     assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 100
-    assert {f.name for f in out.iterdir()} >= {f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html", "png")}
+    assert {f.name for f in out.iterdir()} >= {
+        f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html", "png")
+    }
     (chosen,) = (out / "chosen").iterdir()
     assert len(load_run(chosen).scene) == 5
     error = error_line(capsys, *words, "--require", "mb<=0.000001", begun=True)
@@ -49,14 +72,17 @@ def test_a_table_files_and_a_chosen_run(
         (". --minimize mb --maximize psnr", "not allowed with"),
     ],
 )
-def test_wrong_usage_ends_in_one_line(words: str, part: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_ends_in_one_line(
+    words: str, part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = [] if "static" in words else ["--out", "x"]
     assert part in error_line(capsys, "tradeoff", *words.split(), *out)
     assert list(Path().iterdir()) == []
 
 
 def test_two_sweeps_do_not_mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, out = write_moving_run(tmp_path), tmp_path / "out"
+    run = write_moving_run(tmp_path)
+    out = tmp_path / "out"
     with writing(out):
         assert main(["tradeoff", str(run), "--out", str(out), "--vary", "scale=0.5"]) == 2
         assert [path.name for path in out.iterdir()] == [LOCK_NAME]

@@ -34,7 +34,11 @@ def test_a_page_is_served_until_it_is_ended(
     ],
 )
 def test_what_cannot_be_shown_is_one_line(
-    words: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    words: list[str],
+    line: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
     monkeypatch.chdir(tmp_path)
@@ -44,7 +48,9 @@ def test_what_cannot_be_shown_is_one_line(
     assert error.count("\n") == 1
 
 
-def test_a_taken_port_and_motions_of_no_person_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_port_and_motions_of_no_person_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
     run = str(write_moving_run(tmp_path))
     (tmp_path / "walk.npz").write_bytes(b"")

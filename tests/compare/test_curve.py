@@ -1,4 +1,5 @@
-"""The curve is read from a log as it is, also from one that a kill has torn; drawing changes nothing."""
+"""The curve is read from a log as it is, also from one that a kill has torn; drawing changes
+nothing."""
 
 from __future__ import annotations
 
@@ -15,8 +16,14 @@ from dyngs.runs.log import LOG_NAME
 
 
 def test_lines_that_are_damaged_are_passed_over(tmp_path: Path) -> None:
-    lines = [{"step": 10, "seconds": 1.5, "psnr": 9.0}, {"step": 10, "split": "test", "psnr": 20.0, "ssim": 0.5}]
-    lines += [{"step": 20, "split": "test", "psnr": 21.0}, {"step": 10, "split": "val", "psnr": 1.0}]
+    lines = [
+        {"step": 10, "seconds": 1.5, "psnr": 9.0},
+        {"step": 10, "split": "test", "psnr": 20.0, "ssim": 0.5},
+    ]
+    lines += [
+        {"step": 20, "split": "test", "psnr": 21.0},
+        {"step": 10, "split": "val", "psnr": 1.0},
+    ]
     torn = ["[1]", '"x"', '{"step": "a", "split": "test", "psnr": 1}', '{"step": 20, "sec']
     (tmp_path / LOG_NAME).write_text("\n".join([*map(json.dumps, lines), *torn]))
     assert read_curve(tmp_path, "test") == (CurvePoint(10, 1.5, 20.0),)
@@ -27,7 +34,13 @@ def test_lines_that_are_damaged_are_passed_over(tmp_path: Path) -> None:
 def test_it_changes_nothing_of_the_training(tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     write_still_capture(capture, StillOptions(size=16, num_train=4, num_test=2, samples=1))
-    words = [f"data.root={capture}", "train.steps=20", "train.log_every=5", "init.num_random=50", "run.threads=1"]
+    words = [
+        f"data.root={capture}",
+        "train.steps=20",
+        "train.log_every=5",
+        "init.num_random=50",
+        "run.threads=1",
+    ]
     runs = []
     for name, listeners in (("plain", []), ("watched", [QualityCurve("test", None)])):
         config = dyngs.load_config("static", [*words, f"run.dir={tmp_path / name}"])

@@ -25,7 +25,9 @@ def test_names_of_captures_views_and_models_are_shown_and_never_run(tmp_path: Pa
     for name in (TRUTH, "model"):
         write_image(bench.image_path(name, 0), np.zeros((8, 8, 3), np.uint8))
     file = tmp_path / "page.html"
-    file.write_text(page_text(bench, [result], {NAME: NAME}, (NAME, ["model"], [[NAME]], "")), encoding="utf-8")
+    file.write_text(
+        page_text(bench, [result], {NAME: NAME}, (NAME, ["model"], [[NAME]], "")), encoding="utf-8"
+    )
     with Browser() as browser:
         page = browser.open(file.as_uri())
         page.wait_for("document.querySelectorAll('canvas').length > 0")

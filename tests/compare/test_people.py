@@ -1,4 +1,5 @@
-"""Networks are compared on people from the same views, and with views that none of them was given."""
+"""Networks are compared on people from the same views, and with views that none of them was
+given."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ def test_nobody_is_given_what_is_compared_with(folder: Path, spread: bool) -> No
     assert len(task.sources) == len(set(task.sources)) == 3
     assert len(task.targets) == (3 if spread else 2)
     assert not {views[i].name for i in task.sources} & {view.name for view in task.targets}
-    apart = [angle(views[a], views[b]) for a, b in zip(task.sources, task.sources[1:], strict=False)]
+    apart = [
+        angle(views[a], views[b]) for a, b in zip(task.sources, task.sources[1:], strict=False)
+    ]
     # directions tilt towards the person, which makes angles less than those around the ring
     assert all((90 if spread else 25) < x < (121 if spread else 31) for x in apart)
     nearest = [min(angle(views[i], view) for i in task.sources) for view in task.targets]
@@ -49,18 +52,26 @@ def test_a_table_scores_and_pictures(network: Path, folder: Path, tmp_path: Path
     assert (head[:3], name, said) == (["method", "2 views", "3 views"], "net", [])
     rows = list(csv.DictReader((tmp_path / "out" / "comparison.csv").read_text().splitlines()))
     assert [row["count"] for row in rows] == ["2", "3", "3"] * PEOPLE.people
-    assert two.startswith(f"{sum(float(row['psnr']) for row in rows if row['count'] == '2') / PEOPLE.people:.2f} dB")
+    assert two.startswith(
+        f"{sum(float(row['psnr']) for row in rows if row['count'] == '2') / PEOPLE.people:.2f} dB"
+    )
     assert three != two
     assert len([*(tmp_path / "out" / "pictures").iterdir()]) == len(rows)
     assert f"| net | {two} | {three} |" in (tmp_path / "out" / "comparison.md").read_text()
     with pytest.raises(DyngsError, match="nothing could be predicted"):
-        compare_people(PeopleBench(folder, [network], (2,), spread=True), tmp_path / "other", said.append)
+        compare_people(
+            PeopleBench(folder, [network], (2,), spread=True), tmp_path / "other", said.append
+        )
     assert all("net left out: " in line and "degrees apart" in line for line in said)
     assert len(said) == PEOPLE.people
     assert not (tmp_path / "other").exists()
 
 
-def test_networks_of_the_same_name_are_not_mixed(network: Path, folder: Path, tmp_path: Path) -> None:
+def test_networks_of_the_same_name_are_not_mixed(
+    network: Path, folder: Path, tmp_path: Path
+) -> None:
     with pytest.raises(DyngsError, match="two networks are named net"):
-        compare_people(PeopleBench(folder, [network, tmp_path / "other" / "net"], (2,)), tmp_path / "out")
+        compare_people(
+            PeopleBench(folder, [network, tmp_path / "other" / "net"], (2,)), tmp_path / "out"
+        )
     assert not (tmp_path / "out").exists()

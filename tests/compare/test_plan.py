@@ -1,4 +1,5 @@
-"""All models see the same images, whatever their presets say, and none writes outside the folder."""
+"""All models see the same images, whatever their presets say, and none writes outside the
+folder."""
 
 from __future__ import annotations
 
@@ -26,7 +27,9 @@ def test_data_are_those_of_the_comparison(capture: Path, tmp_path: Path) -> None
     first, second = (entry.config for entry in plan.entries)
     assert first.data == second.data
     assert (second.data.longest_side, second.strategy.kind, second.train.steps) == (12, "mcmc", 30)
-    assert plan.notes == ("own: its data.background are left out, so that all have the same images",)
+    assert plan.notes == (
+        "own: its data.background are left out, so that all have the same images",
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -45,7 +48,11 @@ def test_any_name_of_a_file_stays_inside(capture: Path, tmp_path: Path, name: st
     assert entry.config.run.dir.name[0] not in ".-"
 
 
-def test_a_broken_file_is_an_error_and_no_model_that_is_left_out(capture: Path, tmp_path: Path) -> None:
+def test_a_broken_file_is_an_error_and_no_model_that_is_left_out(
+    capture: Path, tmp_path: Path
+) -> None:
     (tmp_path / "own.yaml").write_text("train:\n  stesp: 3\n")
     with pytest.raises(DyngsError, match=r"own\.yaml.*unknown key"):
-        planned(Bench(capture, tmp_path / "out", Limit(steps=3)), ["static", str(tmp_path / "own.yaml")])
+        planned(
+            Bench(capture, tmp_path / "out", Limit(steps=3)), ["static", str(tmp_path / "own.yaml")]
+        )

@@ -1,4 +1,5 @@
-"""Configuration files: what is read is what was meant, what is wrong is named, what is saved comes back."""
+"""Configuration files: what is read is what was meant, what is wrong is named, what is saved comes
+back."""
 
 from __future__ import annotations
 
@@ -52,7 +53,9 @@ def refusal(preset: Path | None, *overrides: str) -> str:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_packaged_presets_load_from_an_empty_folder(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packaged_presets_load_from_an_empty_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     config = load_config(Path(f"configs/{name}.yaml"), [ROOT])
     assert config.run.name == name
@@ -60,7 +63,9 @@ def test_packaged_presets_load_from_an_empty_folder(name: str, tmp_path: Path, m
     assert load_config(Path(name), [ROOT]) == config
 
 
-def test_a_file_of_ones_own_goes_before_the_packaged_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_ones_own_goes_before_the_packaged_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "static.yaml").write_text("train: {steps: 123}")
     assert load_config(Path("static.yaml"), [ROOT]).train.steps == 123
@@ -74,7 +79,11 @@ def test_published_protocols() -> None:
     assert blender.init == RandomInit(num_random=100_000)
     assert (blender.strategy, blender.optim) == (DefaultStrategy(), OptimConfig())
     colmap = load_config(packaged_preset("colmap"), [ROOT])
-    assert (colmap.train.steps, colmap.data.test_every, colmap.data.longest_side) == (30_000, 8, 1600)
+    assert (colmap.train.steps, colmap.data.test_every, colmap.data.longest_side) == (
+        30_000,
+        8,
+        1600,
+    )
     mip = load_config(packaged_preset("mip"), [ROOT]).model
     assert (mip.rasterize_mode, mip.eps2d, mip.filter_3d) == (RasterizeMode.ANTIALIASED, 0.1, True)
     assert isinstance(load_config(packaged_preset("static_mcmc"), [ROOT]).strategy, McmcStrategy)
@@ -93,46 +102,71 @@ def test_a_mistyped_path_is_not_taken_for_a_packaged_preset(tmp_path: Path) -> N
 
 def test_overrides_are_laid_over_the_preset(tmp_path: Path) -> None:
     preset = write(tmp_path, "data: {root: a}\ntrain:\n  steps: 10\n  ssim_weight: 0.5\n")
-    config = load_config(preset, ["train.steps=20", "data.longest_side=null", "optim.lr_means=1e-4", "train.steps=30"])
+    config = load_config(
+        preset,
+        ["train.steps=20", "data.longest_side=null", "optim.lr_means=1e-4", "train.steps=30"],
+    )
     assert (config.train.steps, config.train.ssim_weight, config.optim.lr_means) == (30, 0.5, 1e-4)
 
 
 @pytest.mark.parametrize(
     "overrides",
-    [("strategy.kind=mcmc", "strategy.max_gaussians=9"), ("strategy.max_gaussians=9", "strategy.kind=mcmc")],
+    [
+        ("strategy.kind=mcmc", "strategy.max_gaussians=9"),
+        ("strategy.max_gaussians=9", "strategy.kind=mcmc"),
+    ],
 )
-def test_another_kind_replaces_its_section_in_any_order(overrides: tuple[str, ...], tmp_path: Path) -> None:
+def test_another_kind_replaces_its_section_in_any_order(
+    overrides: tuple[str, ...], tmp_path: Path
+) -> None:
     preset = write(tmp_path, "strategy: {absgrad: true, max_gaussians: 5}\n")
     assert load_config(preset, [ROOT, *overrides]).strategy == McmcStrategy(max_gaussians=9)
 
 
 def test_the_same_kind_keeps_its_section(tmp_path: Path) -> None:
     preset = write(tmp_path, "strategy: {kind: mcmc, max_gaussians: 5}\n")
-    assert load_config(preset, [ROOT, "strategy.kind=mcmc"]).strategy == McmcStrategy(max_gaussians=5)
+    assert load_config(preset, [ROOT, "strategy.kind=mcmc"]).strategy == McmcStrategy(
+        max_gaussians=5
+    )
 
 
 def test_a_section_can_be_given_as_a_whole() -> None:
-    config = load_config(None, [ROOT, "strategy={max_gaussians: 4, kind: mcmc}", "init={kind: random}"])
+    config = load_config(
+        None, [ROOT, "strategy={max_gaussians: 4, kind: mcmc}", "init={kind: random}"]
+    )
     assert config.strategy == McmcStrategy(max_gaussians=4)
     assert isinstance(config.init, RandomInit)
 
 
-@pytest.mark.parametrize("order", list(permutations(["kind=dynamic", "deform.kind=mlp", "deform.width=64"])))
+@pytest.mark.parametrize(
+    "order", list(permutations(["kind=dynamic", "deform.kind=mlp", "deform.width=64"]))
+)
 def test_nested_kinds_in_any_order(order: tuple[str, ...], tmp_path: Path) -> None:
     expected = DynamicModel(deform=MlpField(width=64))
     overrides = [f"model.{text}" for text in order]
     assert load_config(None, [ROOT, *overrides]).model == expected
     preset = write(tmp_path, "model: {sh_degree: 1}\n")
-    assert load_config(preset, [ROOT, *overrides]).model == expected, "the static model's keys are dropped"
+    assert load_config(preset, [ROOT, *overrides]).model == expected, (
+        "the static model's keys are dropped"
+    )
 
 
 def test_an_inner_kind_replaces_nothing_outside_it(tmp_path: Path) -> None:
-    preset = write(tmp_path, "model:\n  kind: dynamic\n  sh_degree: 1\n  deform: {channels: 8, width: 32}\n")
-    assert load_config(preset, [ROOT, "model.deform.kind=mlp"]).model == DynamicModel(sh_degree=1, deform=MlpField())
-    same = load_config(preset, [ROOT, "model.deform.kind=hexplane", "model.kind=dynamic", "model.deform.levels=[4, 2]"])
+    preset = write(
+        tmp_path, "model:\n  kind: dynamic\n  sh_degree: 1\n  deform: {channels: 8, width: 32}\n"
+    )
+    assert load_config(preset, [ROOT, "model.deform.kind=mlp"]).model == DynamicModel(
+        sh_degree=1, deform=MlpField()
+    )
+    same = load_config(
+        preset,
+        [ROOT, "model.deform.kind=hexplane", "model.kind=dynamic", "model.deform.levels=[4, 2]"],
+    )
     expected = DynamicModel(sh_degree=1, deform=HexplaneField(channels=8, width=32, levels=(4, 2)))
     assert same.model == expected
-    assert load_config(preset, [ROOT, "model.kind=static", "model.eps2d=0.1"]).model == StaticModel(eps2d=0.1)
+    assert load_config(preset, [ROOT, "model.kind=static", "model.eps2d=0.1"]).model == StaticModel(
+        eps2d=0.1
+    )
 
 
 def test_a_nested_section_can_be_given_as_a_whole() -> None:
@@ -141,10 +175,15 @@ def test_a_nested_section_can_be_given_as_a_whole() -> None:
     assert load_config(None, [ROOT, whole]).model == expected
     split = ["model.sh_degree=2", "model.deform={width: 2, kind: mlp}", "model={kind: dynamic}"]
     assert load_config(None, [ROOT, *split]).model == expected
-    assert load_config(None, [ROOT, "model.kind=dynamic", "model={}", "model.deform={}"]).model == DynamicModel()
+    assert (
+        load_config(None, [ROOT, "model.kind=dynamic", "model={}", "model.deform={}"]).model
+        == DynamicModel()
+    )
 
 
-@pytest.mark.parametrize("text", ["2024-01-01", "007", "yes", "1e3", "null-ish", "[x", "C:\\scans", "a b"])
+@pytest.mark.parametrize(
+    "text", ["2024-01-01", "007", "yes", "1e3", "null-ish", "[x", "C:\\scans", "a b"]
+)
 def test_names_and_paths_are_taken_as_written(text: str) -> None:
     config = load_config(None, [f"data.root={text}", f"run.name={text}"])
     assert config.run.name == text
@@ -172,11 +211,22 @@ def test_home_is_expanded() -> None:
         ("optim.lr_means=inf", ["optim.lr_means must be a number > 0"]),
         ("optim.lr_means=.nan", ["optim.lr_means must be a number > 0"]),
         ("data.background=whit", ["one of auto, white, black, random", "did you mean 'white'"]),
-        ("model.rasterize_mode=antialias", ["one of classic, antialiased", "did you mean 'antialiased'"]),
-        ("strategy.kind=mcm", ["strategy.kind must be one of default, mcmc, fixed", "did you mean 'mcmc'"]),
+        (
+            "model.rasterize_mode=antialias",
+            ["one of classic, antialiased", "did you mean 'antialiased'"],
+        ),
+        (
+            "strategy.kind=mcm",
+            ["strategy.kind must be one of default, mcmc, fixed", "did you mean 'mcmc'"],
+        ),
         ("strategy.noise=1", ["strategy.noise belongs to strategy.kind=mcmc, not to default"]),
         ("model.deform.width=64", ["model.deform belongs to model.kind=dynamic, not to static"]),
-        ("model.width=64", ["model.width belongs to model.kind=keypoint_nerf or eg_human_nerf or nerf, not to static"]),
+        (
+            "model.width=64",
+            [
+                "model.width belongs to model.kind=keypoint_nerf or eg_human_nerf or nerf, not to static"
+            ],
+        ),
         ("deform.width=64", ["unknown key 'deform'", "did you mean 'model.deform.width'"]),
         ("train=5", ["train is a section", "steps"]),
         ("model=5", ["model is a section", "sh_degree", "deform"]),
@@ -195,20 +245,46 @@ def test_wrong_overrides_are_named_with_what_is_allowed(override: str, parts: li
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
-        ("model.deform.kind=mpl", ["model.deform.kind must be one of hexplane, mlp, cont", "did you mean 'mlp'"]),
-        ("model.deform.chanels=5", ["unknown key 'model.deform.chanels'", "did you mean 'model.deform.channels'"]),
-        ("model.defrom.width=5", ["unknown key 'model.defrom'", "did you mean 'model.deform.width'"]),
-        ("model.defrom.kind=mlp", ["unknown key 'model.defrom'", "did you mean 'model.deform.kind'"]),
-        ("model.deform.nodes=5", ["model.deform.nodes belongs to model.deform.kind=control_nodes, not to hexplane"]),
+        (
+            "model.deform.kind=mpl",
+            ["model.deform.kind must be one of hexplane, mlp, cont", "did you mean 'mlp'"],
+        ),
+        (
+            "model.deform.chanels=5",
+            ["unknown key 'model.deform.chanels'", "did you mean 'model.deform.channels'"],
+        ),
+        (
+            "model.defrom.width=5",
+            ["unknown key 'model.defrom'", "did you mean 'model.deform.width'"],
+        ),
+        (
+            "model.defrom.kind=mlp",
+            ["unknown key 'model.defrom'", "did you mean 'model.deform.kind'"],
+        ),
+        (
+            "model.deform.nodes=5",
+            ["model.deform.nodes belongs to model.deform.kind=control_nodes, not to hexplane"],
+        ),
         ("model.deform.channels=0", ["model.deform.channels must be an integer >= 1, not 0"]),
-        ("model.deform.levels=[1, 0]", ["model.deform.levels must be a non-empty list of integers >= 1, not [1, 0]"]),
-        ("model.deform.levels=2", ["model.deform.levels must be a non-empty list of integers >= 1, not 2"]),
-        ("model.deform.levels=[]", ["model.deform.levels must be a non-empty list of integers >= 1, not []"]),
+        (
+            "model.deform.levels=[1, 0]",
+            ["model.deform.levels must be a non-empty list of integers >= 1, not [1, 0]"],
+        ),
+        (
+            "model.deform.levels=2",
+            ["model.deform.levels must be a non-empty list of integers >= 1, not 2"],
+        ),
+        (
+            "model.deform.levels=[]",
+            ["model.deform.levels must be a non-empty list of integers >= 1, not []"],
+        ),
         ("model.deform=mlp", ["model.deform is a section", "kind", "rigidity"]),
         ("model.dynamic=1", ["unknown key 'model.dynamic'"]),
     ],
 )
-def test_wrong_nested_overrides_are_named_with_what_is_allowed(override: str, parts: list[str]) -> None:
+def test_wrong_nested_overrides_are_named_with_what_is_allowed(
+    override: str, parts: list[str]
+) -> None:
     message = refusal(None, ROOT, "model.kind=dynamic", override)
     assert message.startswith(f"{override}: ")
     for part in parts:
@@ -228,11 +304,21 @@ def test_wrong_nested_overrides_are_named_with_what_is_allowed(override: str, pa
         ("? [a]\n: 1\n", 1, "keys must be plain words"),
         ("run: {seed: -1}\n", 1, "run.seed must be an integer >= 0"),
         ("model:\n  deform:\n    width: 5\n", 3, "model.deform belongs to model.kind=dynamic"),
-        ("model:\n  kind: dynamic\n  deform:\n    levels:\n      - x\n", 4, "list of integers >= 1, not ['x']"),
-        ("model:\n  kind: dynamic\n  deform:\n    kind: mlp\n    widht: 5\n", 5, "did you mean 'model.deform.width'"),
+        (
+            "model:\n  kind: dynamic\n  deform:\n    levels:\n      - x\n",
+            4,
+            "list of integers >= 1, not ['x']",
+        ),
+        (
+            "model:\n  kind: dynamic\n  deform:\n    kind: mlp\n    widht: 5\n",
+            5,
+            "did you mean 'model.deform.width'",
+        ),
     ],
 )
-def test_wrong_files_are_named_with_the_line(text: str, line: int, part: str, tmp_path: Path) -> None:
+def test_wrong_files_are_named_with_the_line(
+    text: str, line: int, part: str, tmp_path: Path
+) -> None:
     preset = write(tmp_path, text)
     message = refusal(preset, ROOT)
     assert message.startswith(f"{preset}:{line}: ")
@@ -256,7 +342,9 @@ def test_a_missing_capture_is_asked_for() -> None:
 
 
 def test_several_faults_are_counted() -> None:
-    assert refusal(None, ROOT, "train.steps=0", "run.seed=-1", "data.downscale=0").endswith("(and 2 more)")
+    assert refusal(None, ROOT, "train.steps=0", "run.seed=-1", "data.downscale=0").endswith(
+        "(and 2 more)"
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -278,16 +366,23 @@ configs = st.builds(
         root=st.text("abc: #'\"~-é", min_size=1).map(lambda s: Path("x" + s)),
         longest_side=st.none() | st.integers(1, 9999),
     ),
-    model=st.builds(StaticModel, rasterize_mode=st.sampled_from(RasterizeMode), filter_3d=st.booleans())
+    model=st.builds(
+        StaticModel, rasterize_mode=st.sampled_from(RasterizeMode), filter_3d=st.booleans()
+    )
     | st.builds(
         DynamicModel,
         motion_from=fractions,
-        deform=st.builds(HexplaneField, levels=st.lists(st.integers(1, 9), min_size=1).map(tuple), lr_planes=rates)
+        deform=st.builds(
+            HexplaneField,
+            levels=st.lists(st.integers(1, 9), min_size=1).map(tuple),
+            lr_planes=rates,
+        )
         | st.builds(MlpField, lr=rates, move_scales=st.booleans())
         | st.builds(ControlNodesField, rigidity=rates),
     ),
     init=st.builds(RandomInit, half_extent=st.just("auto") | st.floats(1e-30, 1e9)),
-    strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),
+    strategy=st.builds(McmcStrategy, noise=rates)
+    | st.builds(DefaultStrategy, prune_opacity=fractions),
     optim=st.builds(OptimConfig, lr_means=rates, lr_scales=rates),
     train=st.builds(TrainConfig, steps=st.integers(1, 10**9), ssim_weight=fractions),
     run=st.builds(RunConfig, name=names, seed=st.integers(0, 2**63 - 1)),
@@ -349,11 +444,15 @@ def test_folders_of_data_are_absolute_so_that_later_commands_find_them(
     assert load_config("human", ["data.root=capture"]).data.body is None
 
 
-def test_a_run_of_an_earlier_version_may_have_a_removed_key_that_had_no_effect(tmp_path: Path) -> None:
+def test_a_run_of_an_earlier_version_may_have_a_removed_key_that_had_no_effect(
+    tmp_path: Path,
+) -> None:
     save_config(load_config("human", [ROOT]), tmp_path / "config.yaml")
     text = (tmp_path / "config.yaml").read_text(encoding="utf-8")
     for value, works in (("false", True), ("true", False)):
-        (tmp_path / "config.yaml").write_text(text.replace("model:\n", f"model:\n  loose: {value}\n"), encoding="utf-8")
+        (tmp_path / "config.yaml").write_text(
+            text.replace("model:\n", f"model:\n  loose: {value}\n"), encoding="utf-8"
+        )
         if works:
             assert load_resolved(tmp_path).model.kind == "human"
         else:

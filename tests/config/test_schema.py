@@ -53,16 +53,25 @@ def test_nested_keys_name_the_kinds_that_have_them() -> None:
     names = [(key.name, key.kinds) for key in config_keys()]
     assert len(set(names)) == len(names)
     assert ("data.root", ()) in names
-    assert ("model.sh_degree", ("static or dynamic or human or human_predictor or gps",)) in names, "fields have none"
+    assert (
+        "model.sh_degree",
+        ("static or dynamic or human or human_predictor or gps",),
+    ) in names, "fields have none"
     assert ("model.motion_from", ("dynamic",)) in names
     assert ("model.deform.kind", ("dynamic",)) in names
-    assert ("model.deform.move_scales", ("dynamic", "hexplane or mlp or control_nodes")) in names, "those have it alike"
+    assert ("model.deform.move_scales", ("dynamic", "hexplane or mlp or control_nodes")) in names, (
+        "those have it alike"
+    )
     assert ("model.deform.width", ("dynamic", "hexplane")) in names
     assert ("model.deform.width", ("dynamic", "mlp")) in names
     written = [line.split("|")[1].strip() for line in keys_table().splitlines()]
     assert "`model.deform.width` (dynamic, mlp)" in written
     for field in (HexplaneField(), MlpField()):
-        known = {name for name, kinds in names if kinds[:1] == ("dynamic",) and field.kind in kinds[-1].split(" or ")}
+        known = {
+            name
+            for name, kinds in names
+            if kinds[:1] == ("dynamic",) and field.kind in kinds[-1].split(" or ")
+        }
         known |= {name for name, kinds in names if kinds == ("dynamic",)}
         assert known >= {f"model.deform.{key}" for key in field.model_dump()}
 
@@ -84,7 +93,9 @@ def test_lists_in_words() -> None:
         return allowed_values(FieldInfo.from_annotation(annotation))
 
     assert words(tuple[int, ...]) == "a list of integers"
-    assert words(tuple[Annotated[float, Field(gt=0, le=2)], ...]) == "a list of numbers > 0 and <= 2"
+    assert (
+        words(tuple[Annotated[float, Field(gt=0, le=2)], ...]) == "a list of numbers > 0 and <= 2"
+    )
     assert words(tuple[str, ...] | None) == "a list of texts or null"
 
 
@@ -95,7 +106,8 @@ def test_cells_of_the_table_hold_together() -> None:
 
 
 def test_a_section_is_found_by_its_kind() -> None:
-    strategy, init = Config.model_fields["strategy"], Config.model_fields["init"]
+    strategy = Config.model_fields["strategy"]
+    init = Config.model_fields["init"]
     assert section_class(strategy, "mcmc") is McmcStrategy
     assert section_class(strategy, "none such") is DefaultStrategy
     assert section_class(init, "points") is section_class(init, "auto") is section_class(init, None)
@@ -115,8 +127,16 @@ def test_a_section_is_found_in_a_tree() -> None:
 
 
 def test_locations_of_pydantic_lose_kinds_and_indices() -> None:
-    assert keys_of_location(("model", "dynamic", "deform", "mlp", "width")) == ("model", "deform", "width")
-    assert keys_of_location(("model", "dynamic", "deform", "hexplane", "levels", 1)) == ("model", "deform", "levels")
+    assert keys_of_location(("model", "dynamic", "deform", "mlp", "width")) == (
+        "model",
+        "deform",
+        "width",
+    )
+    assert keys_of_location(("model", "dynamic", "deform", "hexplane", "levels", 1)) == (
+        "model",
+        "deform",
+        "levels",
+    )
     assert keys_of_location(("model", "dynamic", "dynamic")) == ("model", "dynamic")
     assert keys_of_location(("model", "dynamic", "deform")) == ("model", "deform")
     assert keys_of_location(("train", "steps")) == ("train", "steps")

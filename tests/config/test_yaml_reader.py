@@ -1,4 +1,5 @@
-"""Whatever YAML makes of a preset or an override: a configuration, or one line that says where and what."""
+"""Whatever YAML makes of a preset or an override: a configuration, or one line that says where and
+what."""
 
 from __future__ import annotations
 
@@ -28,8 +29,24 @@ ODD = (
         "1e400",
         "-1e400",
     ),
-    *(".inf", "-.inf", ".nan", "!!int abc", "!!int ''", "!!float x", "!!timestamp x", "!!timestamp 2024-99-99"),
-    *("!!binary é", "!!bool maybe", "!!set {a, b}", "!!omap [a: 1]", "!!python/object:os.system x", "!unknown x"),
+    *(
+        ".inf",
+        "-.inf",
+        ".nan",
+        "!!int abc",
+        "!!int ''",
+        "!!float x",
+        "!!timestamp x",
+        "!!timestamp 2024-99-99",
+    ),
+    *(
+        "!!binary é",
+        "!!bool maybe",
+        "!!set {a, b}",
+        "!!omap [a: 1]",
+        "!!python/object:os.system x",
+        "!unknown x",
+    ),
     *(
         "&a 1",
         "*a",
@@ -45,13 +62,27 @@ ODD = (
         '"\\x00"',
         '"\\ud800"',
     ),
-    *("\x00", "\x1b[31m", "\ud800", "\t1", "- a", "? a", "| x", "%YAML 1.1", "---", "@x", "`x", "190:20:30"),
+    *(
+        "\x00",
+        "\x1b[31m",
+        "\ud800",
+        "\t1",
+        "- a",
+        "? a",
+        "| x",
+        "%YAML 1.1",
+        "---",
+        "@x",
+        "`x",
+        "190:20:30",
+    ),
     *("[" * 5000, "{a: " * 2000, "a" * 100_000, "[2024-02-30]", "!!int [1]", "!!merge <<"),
 )
 
 
 def refused(preset: Path | None, *overrides: str) -> str:
-    """What is said about a configuration that must be refused: one short line of printable characters."""
+    """What is said about a configuration that must be refused: one short line of printable
+    characters."""
     with pytest.raises(DyngsError) as caught:
         load_config(preset, overrides)
     text = str(caught.value)
@@ -61,10 +92,14 @@ def refused(preset: Path | None, *overrides: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "text", ["2024-02-30", "2024-01-01", "0x_", "1e400", "9" * 200, "12:30", "!!int abc", "nan", "[a"]
+    "text",
+    ["2024-02-30", "2024-01-01", "0x_", "1e400", "9" * 200, "12:30", "!!int abc", "nan", "[a"],
 )
 def test_a_name_may_look_like_anything_else(text: str) -> None:
-    assert load_config(None, [ROOT, f"run.name={text}"]).run.name in (text, text.removeprefix("!!int "))
+    assert load_config(None, [ROOT, f"run.name={text}"]).run.name in (
+        text,
+        text.removeprefix("!!int "),
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,7 +126,9 @@ def test_odd_values_are_named_with_what_is_allowed(text: str, said: str) -> None
 
 @pytest.mark.parametrize("text", [f"/a/{chr(0)}b", '"/a/\\x00"', '"\\ud800"'])
 def test_paths_hold_no_nul_and_no_half_characters(text: str) -> None:
-    assert "holds a character that no name or path may hold; remove it" in refused(None, f"data.root={text}")
+    assert "holds a character that no name or path may hold; remove it" in refused(
+        None, f"data.root={text}"
+    )
 
 
 def test_a_path_that_is_not_utf8_is_kept(tmp_path: Path) -> None:
@@ -105,8 +142,14 @@ def test_a_path_that_is_not_utf8_is_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"train:\n  steps: 2024-02-30\n", "file.yaml:2: train.steps must be an integer >= 1, not '2024-02-30'"),
-        (b"run:\n  name: x\x05y\n", r"file.yaml:2: not valid YAML: the control character '\x05'; remove it"),
+        (
+            b"train:\n  steps: 2024-02-30\n",
+            "file.yaml:2: train.steps must be an integer >= 1, not '2024-02-30'",
+        ),
+        (
+            b"run:\n  name: x\x05y\n",
+            r"file.yaml:2: not valid YAML: the control character '\x05'; remove it",
+        ),
         (b"run:\n\tname: x\n", "file.yaml:2: not valid YAML: a tab where YAML wants spaces"),
         (b"run: {name: \xe9}\n", "file.yaml: not a text file in UTF-8"),
         (b"run: {name: a}\nrun: {name: b}\n", "file.yaml:2: duplicate key run"),
@@ -115,14 +158,26 @@ def test_a_path_that_is_not_utf8_is_kept(tmp_path: Path) -> None:
         (b"run: {<<: {name: x}}\n", "unknown key 'run.<<"),
         (b"run: " + b"[" * 5000, "file.yaml:1: not valid YAML: nested too deeply"),
         (b"".join(b" " * i + b"k:\n" for i in range(MAX_DEPTH + 2)), "nested too deeply"),
-        (b"run: {seed: " + b"9" * 5000 + b"}\n", "run.seed must be an integer >= 0 and < 9.22337e+18, not '9999"),
-        (b"run:\n  seed: [2024-02-30]\n", "run.seed must be an integer >= 0 and < 9.22337e+18, not ['2024-02-30']"),
-        (b"run: {seed: 1" + b":5" * 130_000 + b"}\n", "run.seed must be an integer >= 0 and < 9.22337e+18, not '1:5:5"),
+        (
+            b"run: {seed: " + b"9" * 5000 + b"}\n",
+            "run.seed must be an integer >= 0 and < 9.22337e+18, not '9999",
+        ),
+        (
+            b"run:\n  seed: [2024-02-30]\n",
+            "run.seed must be an integer >= 0 and < 9.22337e+18, not ['2024-02-30']",
+        ),
+        (
+            b"run: {seed: 1" + b":5" * 130_000 + b"}\n",
+            "run.seed must be an integer >= 0 and < 9.22337e+18, not '1:5:5",
+        ),
         (b"run: {seed: !!int '_1" + b":5" * 130_000 + b"'}\n", "run.seed must be an integer >= 0"),
         (b"run: {seed: !!float 1" + b":5" * 130_000 + b".5}\n", "run.seed must be an integer >= 0"),
         (b"run: {seed: 0x" + b"f" * 260_000 + b"}\n", "run.seed must be an integer >= 0"),
         (b"run: {seed: [" + b"1:1," * 60_000 + b"]}\n", "run.seed must be an integer >= 0"),
-        (b"run: {seed: 12:30}\n", "run.seed must be an integer >= 0 and < 9.22337e+18, not '12:30'"),
+        (
+            b"run: {seed: 12:30}\n",
+            "run.seed must be an integer >= 0 and < 9.22337e+18, not '12:30'",
+        ),
         (b"#" * (MAX_BYTES + 1), "larger than 256 KiB"),
         (b"- a\n", "must be a mapping of sections"),
         (b"a: 1\n---\nb: 2\n", "file.yaml:2: not valid YAML"),
@@ -141,7 +196,9 @@ def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
     assert load_config(tmp_path / "file.yaml").data.root == Path("/x")
 
 
-def test_a_file_is_read_as_it_is_by_now_and_what_is_read_belongs_to_the_reader(tmp_path: Path) -> None:
+def test_a_file_is_read_as_it_is_by_now_and_what_is_read_belongs_to_the_reader(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "a.yaml"
     for number in (1, 2):
         file.write_text(f"train: {{steps: {number}, eval_at: []}}\nstrategy: {{}}\n")
@@ -153,11 +210,14 @@ def test_a_file_is_read_as_it_is_by_now_and_what_is_read_belongs_to_the_reader(t
 
 
 def test_mutated_overrides_and_presets_end_in_a_configuration_or_one_line(tmp_path: Path) -> None:
-    chance, keys = random.Random(0), [key.name for key in config_keys()]
+    chance = random.Random(0)
+    keys = [key.name for key in config_keys()]
     presets = [packaged_preset(name).read_bytes() for name in ("static", "dynamic", "human")]
-    file, told = tmp_path / "file.yaml", []
+    file = tmp_path / "file.yaml"
+    told = []
     for trial in range(200):
-        data, overrides = bytearray(chance.choice(presets)), [ROOT]
+        data = bytearray(chance.choice(presets))
+        overrides = [ROOT]
         for _ in range(chance.randint(1, 3)):
             if trial % 2:
                 overrides.append(f"{chance.choice(keys)}={chance.choice(ODD)}")

@@ -35,11 +35,15 @@ def encoded(rgb: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
     if transfer == HLG:
         a, b, c = 0.17883277, 0.28466892, 0.55991073
         scene = linear * 0.26496256  # the light whose signal is 75 %
-        return np.where(scene <= 1 / 12, np.sqrt(3 * scene), a * np.log(np.maximum(12 * scene - b, 1e-9)) + c)
+        return np.where(
+            scene <= 1 / 12, np.sqrt(3 * scene), a * np.log(np.maximum(12 * scene - b, 1e-9)) + c
+        )
     if transfer == PQ:
         power = (linear * 203 / 10_000) ** 0.1593017578125
         return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    )
 
 
 def write_clip(
@@ -53,13 +57,22 @@ def write_clip(
     codec: str = "libx264",
     count: int = 2,
 ) -> None:
-    """A clip of an RGB ``signal`` (H, W, 3), stored by ``matrix``, tagged (primaries, transfer, matrix)."""
+    """A clip of an RGB ``signal`` (H, W, 3), stored by ``matrix``, tagged (primaries, transfer,
+    matrix)."""
     red, blue = _LUMA[matrix]
     luma = signal @ [red, 1 - red - blue, blue]
-    planes = [luma, (signal[..., 2] - luma) / (2 - 2 * blue), (signal[..., 0] - luma) / (2 - 2 * red)]
+    planes = [
+        luma,
+        (signal[..., 2] - luma) / (2 - 2 * blue),
+        (signal[..., 0] - luma) / (2 - 2 * red),
+    ]
     step = 2 ** (bits - 8)
     most = 2**bits - 1
-    scales = [(most, 0), (most, 128 * step)] if is_full_range else [(219 * step, 16 * step), (224 * step, 128 * step)]
+    scales = (
+        [(most, 0), (most, 128 * step)]
+        if is_full_range
+        else [(219 * step, 16 * step), (224 * step, 128 * step)]
+    )
     numbers = []
     for index, plane in enumerate(planes):
         scale, offset = scales[min(index, 1)]
@@ -88,8 +101,11 @@ def write_clip(
         container.mux(stream.encode(None))
 
 
-def add_colour_box(path: Path, primaries: int, transfer: int, matrix: int, is_full_range: bool = False) -> None:
-    """Give the first track of an MP4, whose index comes last, the box ``colr`` of a container's tags."""
+def add_colour_box(
+    path: Path, primaries: int, transfer: int, matrix: int, is_full_range: bool = False
+) -> None:
+    """Give the first track of an MP4, whose index comes last, the box ``colr`` of a container's
+    tags."""
     data = bytearray(path.read_bytes())
     begin = 0
     end = len(data)
@@ -103,13 +119,17 @@ def add_colour_box(path: Path, primaries: int, transfer: int, matrix: int, is_fu
         end = begin + size
         begin += 16 if name == b"stsd" else 8
     old = data.find(b"colr", begin, end)
-    box = struct.pack(">I4s4s3HB", 19, b"colr", b"nclx", primaries, transfer, matrix, is_full_range << 7)
+    box = struct.pack(
+        ">I4s4s3HB", 19, b"colr", b"nclx", primaries, transfer, matrix, is_full_range << 7
+    )
     removed = 0 if old < 0 else struct.unpack_from(">I", data, old - 4)[0]
     if removed:
         del data[old - 4 : old - 4 + removed]
     data[end - removed : end - removed] = box
     for place in opened:
-        struct.pack_into(">I", data, place, struct.unpack_from(">I", data, place)[0] + len(box) - removed)
+        struct.pack_into(
+            ">I", data, place, struct.unpack_from(">I", data, place)[0] + len(box) - removed
+        )
     path.write_bytes(data)
 
 

@@ -1,4 +1,5 @@
-"""Writers of tiny captures as phone apps and photogrammetry programs export them, by their published definitions."""
+"""Writers of tiny captures as phone apps and photogrammetry programs export them, by their
+published definitions."""
 
 from __future__ import annotations
 
@@ -15,13 +16,18 @@ from tiny_captures import WIDTH as PHONE_WIDTH
 WIDTH, HEIGHT = 48, 36
 POINTS = np.array([[0.3, -0.2, 0.1], [-0.5, 0.4, 0.3], [0.1, 0.6, -0.4], [0.0, 0.0, 0.0]])
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-POSES = [opengl_pose(0.7 * i) @ np.diag([-1.0, -1, 1, 1]) if i % 2 else opengl_pose(0.7 * i) for i in range(4)]
+POSES = [
+    opengl_pose(0.7 * i) @ np.diag([-1.0, -1, 1, 1]) if i % 2 else opengl_pose(0.7 * i)
+    for i in range(4)
+]
 """OpenGL camera-to-world poses, every second one upside down."""
 NAMES = [f"DSC_{i}.jpg" for i in range(4)]
 PHONE_POSES = side_poses(4)
 
 
-def write_photos(root: Path, names: Sequence[str] = NAMES, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+def write_photos(
+    root: Path, names: Sequence[str] = NAMES, size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> None:
     for i, name in enumerate(names):
         write_image(root / name, random_pixels(size[1], size[0], 3, seed=i))
 
@@ -54,9 +60,11 @@ def write_metashape(
     labels: Sequence[str] = NAMES,
     unaligned: Sequence[int] = (),
 ) -> Path:
-    """cameras.xml; the chunk is turned, three times smaller and shifted if ``placement`` says where that is written."""
+    """cameras.xml; the chunk is turned, three times smaller and shifted if ``placement`` says where
+    that is written."""
     write_photos(root / "images")
-    scale, shift = 3.0, np.array([1.0, -2, 0.5])
+    scale = 3.0
+    shift = np.array([1.0, -2, 0.5])
     transform = (
         f"<transform><rotation>{' '.join(map(str, TURN.ravel()))}</rotation>"
         f"<translation>{' '.join(map(str, shift))}</translation><scale>{scale}</scale></transform>"
@@ -65,7 +73,8 @@ def write_metashape(
     for i, (label, pose) in enumerate(zip(labels, POSES, strict=True)):
         rotation, _ = cv_from_world(pose)
         local = np.eye(4)
-        local[:3, :3], local[:3, 3] = rotation.T, pose[:3, 3]
+        local[:3, :3] = rotation.T
+        local[:3, 3] = pose[:3, 3]
         if placement is not None:  # world = scale * turn * local + shift
             local[:3, :3] = TURN.T @ rotation.T
             local[:3, 3] = TURN.T @ (pose[:3, 3] - shift) / scale
@@ -106,8 +115,9 @@ REALITY = {
 
 
 def angles_of(pose: np.ndarray) -> tuple[float, float, float]:
-    """Heading, pitch and roll in degrees: a camera that looks straight down, its top to the north, is rolled about its
-    own y axis (the top), pitched about x (east), then turned clockwise, as seen from above, by its heading."""
+    """Heading, pitch and roll in degrees: a camera that looks straight down, its top to the north,
+    is rolled about its own y axis (the top), pitched about x (east), then turned clockwise, as seen
+    from above, by its heading."""
     right, up, back = pose[:3, :3].T
     # The rows of the product of the three turns, solved for the angles by hand.
     pitch = math.asin(up[2])
@@ -149,7 +159,11 @@ def axis_angle(rotation: np.ndarray) -> list[float]:
     axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
     angle = math.acos(max(-1.0, min(1.0, (np.trace(rotation) - 1) / 2)))
     turned = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
     )
     return (axis * angle * (1 if turned @ axis >= 0 else -1)).tolist()
 
@@ -159,8 +173,15 @@ def write_odm(root: Path, lens: dict[str, object] = ODM) -> Path:  # type: ignor
     shots = {}
     for name, pose in zip(NAMES, POSES, strict=True):
         rotation, shift = cv_from_world(pose)
-        shots[name] = {"rotation": axis_angle(rotation), "translation": shift.tolist(), "camera": "dji"}
-    points = {str(i): {"coordinates": point.tolist(), "color": [i, 100.0, 200.0]} for i, point in enumerate(POINTS)}
+        shots[name] = {
+            "rotation": axis_angle(rotation),
+            "translation": shift.tolist(),
+            "camera": "dji",
+        }
+    points = {
+        str(i): {"coordinates": point.tolist(), "color": [i, 100.0, 200.0]}
+        for i, point in enumerate(POINTS)
+    }
     model = {"cameras": {"dji": lens}, "shots": shots, "points": points}
     small = {"cameras": {"dji": lens}, "shots": {"other.jpg": shots[NAMES[0]]}, "points": {}}
     (root / "opensfm").mkdir()
@@ -176,10 +197,23 @@ def write_shots(root: Path) -> Path:
     (root / "opensfm" / "reconstruction.json").unlink()
     features = []
     for (name, shot), pose in zip(models[1]["shots"].items(), POSES, strict=True):
-        own = {"filename": name, "rotation": shot["rotation"], "translation": pose[:3, 3].tolist(), "width": WIDTH}
-        features.append({"type": "Feature", "properties": own, "geometry": {"type": "Point", "coordinates": [0, 0, 0]}})
+        own = {
+            "filename": name,
+            "rotation": shot["rotation"],
+            "translation": pose[:3, 3].tolist(),
+            "width": WIDTH,
+        }
+        features.append(
+            {
+                "type": "Feature",
+                "properties": own,
+                "geometry": {"type": "Point", "coordinates": [0, 0, 0]},
+            }
+        )
     (root / "odm_report").mkdir()
-    (root / "odm_report" / "shots.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    (root / "odm_report" / "shots.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": features})
+    )
     return root
 
 
@@ -188,12 +222,15 @@ def write_polycam(root: Path, prefix: str = "corrected_", depth: bool = True) ->
     for i, pose in enumerate(PHONE_POSES):
         name = str(1_700_000_000 + i)
         write_image(
-            root / "keyframes" / f"{prefix}images" / f"{name}.jpg", random_pixels(PHONE_HEIGHT, PHONE_WIDTH, 3, seed=i)
+            root / "keyframes" / f"{prefix}images" / f"{name}.jpg",
+            random_pixels(PHONE_HEIGHT, PHONE_WIDTH, 3, seed=i),
         )
         if depth:
             metres = np.full((3, 4, 1), 4000, np.uint16)
             write_image(root / "keyframes" / "depth" / f"{name}.png", metres)
-        own = {f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)}
+        own = {
+            f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)
+        }
         own |= {
             "fx": FOCAL,
             "fy": FOCAL,
@@ -223,11 +260,16 @@ def quaternion(rotation: np.ndarray) -> list[float]:
     return np.linalg.eigh(matrix / 3)[1][:, -1].tolist()
 
 
-def write_record3d(root: Path, metadata: str = "metadata.json", images: str = "rgb", **more: object) -> Path:
+def write_record3d(
+    root: Path, metadata: str = "metadata.json", images: str = "rgb", **more: object
+) -> Path:
     numbers = [0, 1, 2, 10]  # so that the order of names is not that of numbers
     poses = [[0.0, 0, 0, 1, 0, 0, 0]] * 11
     for number, pose in zip(numbers, PHONE_POSES, strict=True):
-        write_image(root / images / f"{number}.jpg", random_pixels(PHONE_HEIGHT, PHONE_WIDTH, 3, seed=number))
+        write_image(
+            root / images / f"{number}.jpg",
+            random_pixels(PHONE_HEIGHT, PHONE_WIDTH, 3, seed=number),
+        )
         poses[number] = [*quaternion(pose[:3, :3]), *pose[:3, 3].tolist()]
     write_image(root / images / "10(1).jpg", random_pixels(PHONE_HEIGHT, PHONE_WIDTH, 3))
     fields = {

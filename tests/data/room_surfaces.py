@@ -15,7 +15,10 @@ def distances_to_surface(points: np.ndarray, views: list[View], time: float) -> 
         center = -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]
         offset = points - center
         far = np.linalg.norm(offset, axis=1)
-        origins, rays = np.tile(center.astype(np.float32), (len(points), 1)), (offset / far[:, None]).astype(np.float32)
-        hits = np.min([thing.intersect(origins, rays) for thing in scene_at("room", time).primitives], axis=0)
+        origins = np.tile(center.astype(np.float32), (len(points), 1))
+        rays = (offset / far[:, None]).astype(np.float32)
+        hits = np.min(
+            [thing.intersect(origins, rays) for thing in scene_at("room", time).primitives], axis=0
+        )
         best = np.minimum(best, np.abs(hits - far))
     return best

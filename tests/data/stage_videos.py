@@ -13,7 +13,8 @@ WIDTH, HEIGHT, FOCAL = 240, 180, 260.0
 
 
 def camera(azimuth_deg: float, height: float = 1.0) -> np.ndarray:
-    """Return the (4, 4) world-to-camera matrix of a camera that looks into the corner; z points up."""
+    """Return the (4, 4) world-to-camera matrix of a camera that looks into the corner; z points
+    up."""
     angle = np.radians(azimuth_deg)
     center = np.array([3.4 * np.cos(angle), 3.4 * np.sin(angle), height])
     forward = np.array([0.0, 0.0, 0.45]) - center
@@ -22,18 +23,25 @@ def camera(azimuth_deg: float, height: float = 1.0) -> np.ndarray:
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ center
     return pose
 
 
 def corner(pose: np.ndarray, time: float) -> np.ndarray:
-    """Return the (H, W, 3) uint8 image of two walls and a floor, with a disc that faces the camera at ``time``."""
+    """Return the (H, W, 3) uint8 image of two walls and a floor, with a disc that faces the camera
+    at ``time``."""
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     disc = pose[:3, :3] @ (
-        np.array([0.6 * np.cos(2 * time), 0.5 * np.sin(3.1 * time), 0.5 + 0.25 * np.sin(4.7 * time)])
+        np.array(
+            [0.6 * np.cos(2 * time), 0.5 * np.sin(3.1 * time), 0.5 + 0.25 * np.sin(4.7 * time)]
+        )
     )
     disc += pose[:3, 3]
-    across = np.hypot(columns - WIDTH / 2 - FOCAL * disc[0] / disc[2], rows - HEIGHT / 2 - FOCAL * disc[1] / disc[2])
+    across = np.hypot(
+        columns - WIDTH / 2 - FOCAL * disc[0] / disc[2],
+        rows - HEIGHT / 2 - FOCAL * disc[1] / disc[2],
+    )
     image = np.where(across < 0.22 * FOCAL / disc[2], 245.0, _scenery(pose.tobytes()))
     return np.repeat(image[..., None], 3, axis=2).astype(np.uint8)
 
@@ -43,9 +51,13 @@ def _scenery(pose_bytes: bytes) -> np.ndarray:
     """Return the (H, W) grey levels of the walls and the floor."""
     pose = np.frombuffer(pose_bytes).reshape(4, 4)
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
-    local = np.stack([(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(rows)], axis=-1)
-    rays, center = local @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
-    nearest, image = np.full(rows.shape, np.inf), np.zeros((HEIGHT, WIDTH))
+    local = np.stack(
+        [(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(rows)], axis=-1
+    )
+    rays = local @ pose[:3, :3]
+    center = -pose[:3, :3].T @ pose[:3, 3]
+    nearest = np.full(rows.shape, np.inf)
+    image = np.zeros((HEIGHT, WIDTH))
     for axis, place in ((0, -1.0), (1, -1.0), (2, 0.0)):
         depth = (place - center[axis]) / rays[..., axis]
         hit = center + depth[..., None] * rays
@@ -56,7 +68,9 @@ def _scenery(pose_bytes: bytes) -> np.ndarray:
     return image
 
 
-def write_videos(folder: Path, azimuths: dict[str, float], starts: dict[str, float], rate: float, count: int) -> None:
+def write_videos(
+    folder: Path, azimuths: dict[str, float], starts: dict[str, float], rate: float, count: int
+) -> None:
     """Write a video per camera, with ``count`` frames from its start on."""
     folder.mkdir(parents=True)
     for number, (name, azimuth) in enumerate(azimuths.items()):
@@ -71,7 +85,8 @@ def _spots(u: np.ndarray, v: np.ndarray, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     grid = rng.uniform(60, 200, (48, 48))
     at_u, at_v = (np.clip((x + 1.2) * 14, 0, 45.999) for x in (u, v))
-    i, j = at_u.astype(int), at_v.astype(int)
+    i = at_u.astype(int)
+    j = at_v.astype(int)
     fu, fv = (x * x * (3 - 2 * x) for x in (at_u - i, at_v - j))
     upper = grid[i, j] * (1 - fv) + grid[i, j + 1] * fv
     lower = grid[i + 1, j] * (1 - fv) + grid[i + 1, j + 1] * fv

@@ -14,7 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
-from dyngs.data.body_frames import about_pelvis, body_frames, moved, numbered, read_body_file, rows_of, with_fitted_body
+from dyngs.data.body_frames import (
+    about_pelvis,
+    body_frames,
+    moved,
+    numbered,
+    read_body_file,
+    rows_of,
+    with_fitted_body,
+)
 from dyngs.data.capture import BodyFrames, Capture, Splits, View
 from dyngs.errors import DyngsError
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -23,7 +31,9 @@ PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 FILE = Path("body.npz")
 
 
-def posed(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def posed(
+    points: np.ndarray, joints: np.ndarray, weights: np.ndarray, pose: np.ndarray
+) -> np.ndarray:
     """(M, 3) linear blend skinning, one joint after the other: ``v = sum_j w_j A_j v``."""
     to_world: list[np.ndarray] = []
     total = np.zeros_like(points)
@@ -49,7 +59,9 @@ def random_body(seed: int, count: int = 3, turned: bool = True) -> BodyFrames:
     )
 
 
-def in_world(body: BodyFrames, row: int, points: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def in_world(
+    body: BodyFrames, row: int, points: np.ndarray, joints: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
     """Where the points of a template are, as ``BodyFrames`` says it."""
     at_rest = posed(points, joints, weights, body.poses[row])
     if body.turns is not None:
@@ -61,18 +73,24 @@ def in_world(body: BodyFrames, row: int, points: np.ndarray, joints: np.ndarray,
 @given(st.integers(0, 1000))
 def test_turns_about_the_origin_become_turns_about_the_pelvis(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    points, joints, weights = rng.normal(size=(8, 3)), rng.normal(size=(24, 3)), rng.dirichlet(np.ones(24), 8)
+    points = rng.normal(size=(8, 3))
+    joints = rng.normal(size=(24, 3))
+    weights = rng.dirichlet(np.ones(24), 8)
     body = random_body(seed)
     same = about_pelvis(body, joints[0])
     assert same.turns is None
     for row in range(3):
         expected = in_world(body, row, points, joints, weights)
-        np.testing.assert_allclose(in_world(same, row, points, joints, weights), expected, atol=1e-11)
+        np.testing.assert_allclose(
+            in_world(same, row, points, joints, weights), expected, atol=1e-11
+        )
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.booleans())
-def test_another_template_has_its_pelvis_where_the_fitted_body_had_it(seed: int, turned: bool) -> None:
+def test_another_template_has_its_pelvis_where_the_fitted_body_had_it(
+    seed: int, turned: bool
+) -> None:
     rng = np.random.default_rng(seed)
     fitted, own = rng.normal(size=(2, 3))
     body = replace(random_body(seed, turned=turned), pelvis=fitted)
@@ -80,7 +98,9 @@ def test_another_template_has_its_pelvis_where_the_fitted_body_had_it(seed: int,
     turns = Rotation.from_rotvec(np.zeros((3, 3)) if body.turns is None else body.turns)
     expected = body.scale[:, None] * turns.apply(fitted) + body.trans
     np.testing.assert_allclose(other.scale[:, None] * own + other.trans, expected, atol=1e-12)
-    np.testing.assert_allclose(about_pelvis(other, fitted).trans, about_pelvis(body, fitted).trans, atol=1e-12)
+    np.testing.assert_allclose(
+        about_pelvis(other, fitted).trans, about_pelvis(body, fitted).trans, atol=1e-12
+    )
 
 
 def test_nothing_to_turn_leaves_everything_and_moves_with_the_cameras() -> None:
@@ -88,17 +108,27 @@ def test_nothing_to_turn_leaves_everything_and_moves_with_the_cameras() -> None:
     same = about_pelvis(body, np.array([0.1, -0.2, 0.3]))
     assert np.array_equal(same.poses, body.poses)
     assert np.array_equal(same.trans, body.trans)
-    assert np.array_equal(moved(body, np.array([1e6, -2.0, 3.0]), 0.5).trans, 0.5 * (body.trans - [1e6, -2.0, 3.0]))
+    assert np.array_equal(
+        moved(body, np.array([1e6, -2.0, 3.0]), 0.5).trans, 0.5 * (body.trans - [1e6, -2.0, 3.0])
+    )
 
 
 def test_rows_in_any_order_and_shape() -> None:
-    poses, trans = np.arange(3 * 165.0).reshape(3, 1, 165), np.arange(9.0).reshape(3, 1, 3)
+    poses = np.arange(3 * 165.0).reshape(3, 1, 165)
+    trans = np.arange(9.0).reshape(3, 1, 3)
     body = body_frames(FILE, [7, 2, 5], poses, trans, np.ones((3, 10)) * [[0], [1], [2]], 2.0)
-    assert (body.frames, body.kind, body.betas.tolist(), body.scale.tolist()) == ((2, 5, 7), "smplx", [1] * 10, [2] * 3)
+    assert (body.frames, body.kind, body.betas.tolist(), body.scale.tolist()) == (
+        (2, 5, 7),
+        "smplx",
+        [1] * 10,
+        [2] * 3,
+    )
     assert body.poses.shape == (3, 55, 3)
     assert body.poses[:, 0, 0].tolist() == [165, 330, 0]
     assert body.trans[:, 0].tolist() == [3, 6, 0]
-    kinds = [body_frames(FILE, [0], np.zeros((1, w)), [[0, 0, 0]], [0.0]).kind for w in (72, 156, 165)]
+    kinds = [
+        body_frames(FILE, [0], np.zeros((1, w)), [[0, 0, 0]], [0.0]).kind for w in (72, 156, 165)
+    ]
     assert kinds == ["smpl", "smplh", "smplx"]
 
 
@@ -114,7 +144,10 @@ GOOD: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"poses": np.zeros((4, 87))}, "'poses' has 87 numbers per frame; the known bodies have 72"),
+        (
+            {"poses": np.zeros((4, 87))},
+            "'poses' has 87 numbers per frame; the known bodies have 72",
+        ),
         ({"poses": np.zeros((4, 73))}, "'poses' has 73 numbers per frame"),
         ({"poses": np.zeros((3, 72))}, "'poses' has 3 rows for 4 frames"),
         ({"poses": np.zeros(())}, "'poses' has 1 rows for 4 frames"),
@@ -124,8 +157,14 @@ GOOD: dict[str, Any] = {
         ({"trans": np.zeros((5, 3))}, "'trans' has 5 rows for 4 frames"),
         ({"trans": np.zeros((4, 4))}, "'trans' has 4 numbers per frame instead of 3"),
         ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
-        ({"trans": np.full((4, 3), 1e39)}, "'trans' of frame 0 holds NaN, infinite or huge numbers"),
-        ({"poses": np.where(np.arange(4)[:, None] == 2, np.inf, np.zeros(72))}, "'poses' of frame 2 holds NaN"),
+        (
+            {"trans": np.full((4, 3), 1e39)},
+            "'trans' of frame 0 holds NaN, infinite or huge numbers",
+        ),
+        (
+            {"poses": np.where(np.arange(4)[:, None] == 2, np.inf, np.zeros(72))},
+            "'poses' of frame 2 holds NaN",
+        ),
         ({"betas": [0, np.nan]}, "'betas' must hold finite numbers"),
         ({"betas": [0, 1e39]}, "'betas' must hold finite numbers"),
         ({"betas": np.zeros((3, 10))}, "'betas' has 3 rows for 4 frames"),
@@ -153,7 +192,9 @@ def view_of(frame: int | None) -> View:
 def test_views_find_their_rows_by_frame() -> None:
     body = replace(random_body(0), frames=(2, 5, 9))
     assert rows_of(FILE, body, [view_of(9), view_of(2), view_of(9)]).tolist() == [2, 0, 2]
-    with pytest.raises(DyngsError, match=r"2 frames that have images \(3, 4\).* 3 frames from 2 to 9"):
+    with pytest.raises(
+        DyngsError, match=r"2 frames that have images \(3, 4\).* 3 frames from 2 to 9"
+    ):
         rows_of(FILE, body, [view_of(2), view_of(4), view_of(3), view_of(4)])
     with pytest.raises(DyngsError, match=r"None\.png has no frame number"):
         rows_of(FILE, body, [view_of(None)])
@@ -162,12 +203,16 @@ def test_views_find_their_rows_by_frame() -> None:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     options = HumanOptions(size=16, num_frames=3, num_new=2, num_cameras=2, num_test=1, samples=1)
-    return read_capture(DataConfig(root=write_human_capture(tmp_path_factory.mktemp("body") / "person", options)))
+    return read_capture(
+        DataConfig(root=write_human_capture(tmp_path_factory.mktemp("body") / "person", options))
+    )
 
 
 def write(path: Path, count: int = 3, **more: np.ndarray) -> Path:
     rows = np.arange(count, dtype=np.float64)[:, None]
-    np.savez(path, poses=np.zeros((count, 165)), trans=rows * np.ones(3), betas=np.zeros(44), **more)
+    np.savez(
+        path, poses=np.zeros((count, 165)), trans=rows * np.ones(3), betas=np.zeros(44), **more
+    )
     return path
 
 
@@ -180,12 +225,16 @@ def test_rows_are_for_the_frames_that_the_file_names(tmp_path: Path) -> None:
 
 
 def test_a_fit_says_which_template_it_is_of(tmp_path: Path) -> None:
-    body = read_body_file(write(tmp_path / "b.npz", surface_model_type=np.array("smplx"), fitted_to=np.array("0a1b")))
+    body = read_body_file(
+        write(tmp_path / "b.npz", surface_model_type=np.array("smplx"), fitted_to=np.array("0a1b"))
+    )
     assert (body.shape_space, body.fitted_to) == ("smpl", "0a1b")
 
 
 @pytest.mark.parametrize("frames", [np.zeros((3, 1), int), np.array([0.0, 1, 2]), np.array([1, 2])])
-def test_frames_that_are_no_numbers_of_the_rows_are_refused(tmp_path: Path, frames: np.ndarray) -> None:
+def test_frames_that_are_no_numbers_of_the_rows_are_refused(
+    tmp_path: Path, frames: np.ndarray
+) -> None:
     with pytest.raises(DyngsError, match=r"b\.npz: 'frames' must hold one whole number"):
         read_body_file(write(tmp_path / "b.npz", frames=frames))
 
@@ -201,7 +250,9 @@ def test_a_fit_replaces_the_bodies_of_a_capture(capture: Capture, tmp_path: Path
     assert "pose" in with_fitted_body(capture, tmp_path).splits
 
 
-def test_a_capture_is_read_with_the_fit_that_the_options_name(capture: Capture, tmp_path: Path) -> None:
+def test_a_capture_is_read_with_the_fit_that_the_options_name(
+    capture: Capture, tmp_path: Path
+) -> None:
     write(tmp_path / "body_train.npz")
     found = read_capture(DataConfig(root=capture.root, body=tmp_path))
     assert found.body is not None
@@ -212,7 +263,8 @@ def test_a_capture_is_read_with_the_fit_that_the_options_name(capture: Capture, 
 
 def test_views_without_frames_are_numbered_by_time(capture: Capture) -> None:
     splits: Splits = {
-        name: tuple(replace(view, frame=None) for view in capture.splits[name]) for name in ("train", "test")
+        name: tuple(replace(view, frame=None) for view in capture.splits[name])
+        for name in ("train", "test")
     }
     for name, views in numbered(splits).items():
         assert [view.frame for view in views] == [view.frame for view in capture.splits[name]]

@@ -14,12 +14,17 @@ from dyngs.data.decoding import Ahead, Decoded, usual_threads
 def test_bytes_count_everything_that_is_there() -> None:
     pixels = torch.zeros(4, 5, 3, dtype=torch.uint8)
     assert Decoded(pixels, None).num_bytes == 60
-    assert Decoded(pixels, torch.ones(4, 5, dtype=torch.bool), depth=torch.zeros(4, 5)).num_bytes == 60 + 20 + 80
+    assert (
+        Decoded(pixels, torch.ones(4, 5, dtype=torch.bool), depth=torch.zeros(4, 5)).num_bytes
+        == 60 + 20 + 80
+    )
 
 
 def test_a_copy_has_the_same_parts() -> None:
     here = Decoded(
-        torch.arange(6, dtype=torch.uint8).view(1, 2, 3), torch.ones(1, 2, dtype=torch.bool), moves=torch.ones(1, 2)
+        torch.arange(6, dtype=torch.uint8).view(1, 2, 3),
+        torch.ones(1, 2, dtype=torch.bool),
+        moves=torch.ones(1, 2),
     )
     copy = here.upload(torch.device("cpu"))()
     assert torch.equal(copy.pixels, here.pixels)
@@ -47,7 +52,8 @@ def test_what_is_expected_is_ready_once() -> None:
 
 
 def test_what_is_no_longer_expected_is_dropped() -> None:
-    begun, go = Event(), Event()
+    begun = Event()
+    go = Event()
 
     def work(index: int) -> int:
         begun.set()

@@ -18,7 +18,9 @@ from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError
 
 
-def views_of(root: Path, count: int = 3, channels: int = 4, size: tuple[int, int] = (12, 8)) -> tuple[View, ...]:
+def views_of(
+    root: Path, count: int = 3, channels: int = 4, size: tuple[int, int] = (12, 8)
+) -> tuple[View, ...]:
     width, height = size
     intrinsics = np.array([[20.0, 0, 6.5], [0, 21.0, 3.5], [0, 0, 1]])
     views = []
@@ -45,7 +47,9 @@ def test_images_without_alpha_are_opaque(tmp_path: Path) -> None:
     image = loader(views_of(tmp_path, channels=3))[0]
     assert image.alpha is None
     assert image.mask is None
-    np.testing.assert_allclose(image.composite(torch.ones(3)), random_pixels(8, 12, 3) / 255, atol=1e-6)
+    np.testing.assert_allclose(
+        image.composite(torch.ones(3)), random_pixels(8, 12, 3) / 255, atol=1e-6
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -53,15 +57,19 @@ def test_images_without_alpha_are_opaque(tmp_path: Path) -> None:
 def test_downscaled_compositing_and_intrinsics(
     tmp_path_factory: pytest.TempPathFactory, downscale: float, longest: int | None
 ) -> None:
-    """Downscaling and compositing commute to 1/255; a ray through the image's corner stays the same ray."""
+    """Downscaling and compositing commute to 1/255; a ray through the image's corner stays the same
+    ray."""
     root = tmp_path_factory.mktemp("views")
     view = views_of(root, 1)[0]
     options = {"downscale": downscale} | ({} if longest is None else {"longest_side": longest})
     small = loader((view,), **options)[0]
     background = torch.tensor([0.3, 0.6, 0.9])
     full = loader((view,))[0].composite(background)
-    width, height = small.cameras.width, small.cameras.height
-    rows = torch.nn.functional.interpolate(full.permute(2, 0, 1)[None], (8 * height, 12 * width), mode="nearest")
+    width = small.cameras.width
+    height = small.cameras.height
+    rows = torch.nn.functional.interpolate(
+        full.permute(2, 0, 1)[None], (8 * height, 12 * width), mode="nearest"
+    )
     wanted = torch.nn.functional.avg_pool2d(rows, (8, 12))[0].permute(1, 2, 0)
     torch.testing.assert_close(small.composite(background), wanted, rtol=0, atol=1 / 255)
     corner = torch.tensor([float(width), float(height), 1.0])
@@ -81,7 +89,9 @@ def test_a_shrunk_image_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
     assert small.alpha is not None
     assert small.mask is not None
     torch.testing.assert_close(small.alpha, image.alpha.reshape(2, 4, 3, 4).mean((1, 3)))
-    torch.testing.assert_close(small.rgb_premultiplied, image.rgb_premultiplied.reshape(2, 4, 3, 4, 3).mean((1, 3)))
+    torch.testing.assert_close(
+        small.rgb_premultiplied, image.rgb_premultiplied.reshape(2, 4, 3, 4, 3).mean((1, 3))
+    )
     assert small.mask.tolist() == [[1, 1, 1], [0, 1, 1]]
     torch.testing.assert_close(
         small.cameras.intrinsics[0], torch.tensor([[5.0, 0, 1.625], [0, 5.25, 0.875], [0, 0, 1]])
@@ -96,7 +106,8 @@ def test_shrunk_images_are_the_same_cached_or_not(cache_mb: float, tmp_path: Pat
     images = loader(views_of(tmp_path, 4), cache_mb=cache_mb)
     for factor in (4, 2, 1, 2):
         for i in (0, 1, 0, 3, -1):
-            wanted, found = images[i].shrunk(factor), images.shrunk(i, factor)
+            wanted = images[i].shrunk(factor)
+            found = images.shrunk(i, factor)
             assert found.name == wanted.name
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
             assert torch.equal(found.cameras.intrinsics, wanted.cameras.intrinsics)
@@ -104,18 +115,23 @@ def test_shrunk_images_are_the_same_cached_or_not(cache_mb: float, tmp_path: Pat
     for i in range(4):
         (tmp_path / f"{i}.png").unlink()
     if cache_mb == 1:
-        assert torch.equal(images.shrunk(0, 2).rgb_premultiplied, images[0].shrunk(2).rgb_premultiplied)
+        assert torch.equal(
+            images.shrunk(0, 2).rgb_premultiplied, images[0].shrunk(2).rgb_premultiplied
+        )
 
 
 def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
     views = views_of(tmp_path, 4)
     views = tuple(replace(view, lens=Lens("opencv", (0.1, 0.0, 0.0, 0.0))) for view in views)
-    cached, uncached = loader(views, downscale=1.5), loader(views, downscale=1.5, cache_mb=0)
+    cached = loader(views, downscale=1.5)
+    uncached = loader(views, downscale=1.5, cache_mb=0)
     assert uncached.cached_bytes == 0
     with ThreadPoolExecutor(4) as pool:
         images = list(pool.map(lambda i: cached[i % 4], range(16)))
     for i, image in enumerate(images):
-        torch.testing.assert_close(image.rgb_premultiplied, uncached[i % 4].rgb_premultiplied, rtol=0, atol=0)
+        torch.testing.assert_close(
+            image.rgb_premultiplied, uncached[i % 4].rgb_premultiplied, rtol=0, atol=0
+        )
     assert uncached.cached_bytes == 0
 
 
@@ -137,10 +153,16 @@ def test_images_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> N
     """In any order, also one that was not foretold, and within the limit."""
     views = views_of(tmp_path, 6)
     options = DataConfig(root=Path(), cache_mb=cache_mb)
-    ahead, plain = ImageLoader(views, options, decoding_threads=2), loader(views, cache_mb=0)
-    for factor, order in ((2, (3, 1, 4, 0, 2, 5)), (1, (5, 0, 1, 2, 4, 3)), (1, (0, 1, 2, 3, 4, 5))):
+    ahead = ImageLoader(views, options, decoding_threads=2)
+    plain = loader(views, cache_mb=0)
+    for factor, order in (
+        (2, (3, 1, 4, 0, 2, 5)),
+        (1, (5, 0, 1, 2, 4, 3)),
+        (1, (0, 1, 2, 3, 4, 5)),
+    ):
         for position, index in enumerate(order):
-            found, wanted = ahead.shrunk(index, factor), plain.shrunk(index, factor)
+            found = ahead.shrunk(index, factor)
+            wanted = plain.shrunk(index, factor)
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
             ahead.expect((*order[position + 1 : position + 4], 0))
             assert ahead.cached_bytes <= cache_mb * 1e6
@@ -151,18 +173,30 @@ def test_images_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> N
 @pytest.mark.parametrize("cache_mb", [1e-3, 1])
 @pytest.mark.parametrize("threads", [0, 2])
 def test_images_given_out_on_a_gpu_are_the_same(
-    free: float | None, cache_mb: float, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    free: float | None,
+    cache_mb: float,
+    threads: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Whether they are kept there, on the CPU, or nowhere; within both limits."""
     views = views_of(tmp_path, 6)
-    monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: None if free is None else (free, 0))
+    monkeypatch.setattr(
+        "dyngs.data.loader.gpu_memory", lambda _: None if free is None else (free, 0)
+    )
     options = DataConfig(root=Path(), cache_mb=cache_mb)
-    there, plain = ImageLoader(views, options, decoding_threads=threads), loader(views, cache_mb=0)
+    there = ImageLoader(views, options, decoding_threads=threads)
+    plain = loader(views, cache_mb=0)
     with pretend_gpu():
         there.device = GPU
-        for factor, order in ((2, (3, 1, 4, 0, 2, 5)), (1, (5, 0, 1, 2, 4, 3)), (1, (0, 1, 2, 3, 4, 5))):
+        for factor, order in (
+            (2, (3, 1, 4, 0, 2, 5)),
+            (1, (5, 0, 1, 2, 4, 3)),
+            (1, (0, 1, 2, 3, 4, 5)),
+        ):
             for position, index in enumerate(order):
-                found, wanted = there.shrunk(index, factor), plain.shrunk(index, factor)
+                found = there.shrunk(index, factor)
+                wanted = plain.shrunk(index, factor)
                 assert found.rgb_premultiplied.device == found.cameras.intrinsics.device == GPU
                 assert torch.equal(found.rgb_premultiplied.cpu(), wanted.rgb_premultiplied)
                 there.expect((*order[position + 1 : position + 4], 0))
@@ -215,7 +249,9 @@ def test_camera_and_time_are_the_view_s(tmp_path: Path) -> None:
 def test_times_are_known_without_decoding(tmp_path: Path) -> None:
     """In the order of the views; None where a view has none."""
     times = (0.75, None, 0.0)
-    views = tuple(replace(view, time=time) for view, time in zip(views_of(tmp_path), times, strict=True))
+    views = tuple(
+        replace(view, time=time) for view, time in zip(views_of(tmp_path), times, strict=True)
+    )
     images = loader(views)
     for view in views:
         view.image_path.unlink()
@@ -252,7 +288,10 @@ def test_missing_images_are_found_at_once(tmp_path: Path) -> None:
     views = views_of(tmp_path, 5)
     for i in (1, 3):
         (tmp_path / f"{i}.png").unlink()
-    with pytest.raises(DyngsError, match=r"1\.png: no such file; restore it, or leave out .*data\.skip_missing=true"):
+    with pytest.raises(
+        DyngsError,
+        match=r"1\.png: no such file; restore it, or leave out .*data\.skip_missing=true",
+    ):
         loader(views)
 
 
@@ -276,7 +315,8 @@ def test_sizes_that_disagree(tmp_path: Path) -> None:
         loader((replace(views[0], height=9),))
     write_image(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
     with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):
-        loader((replace(views[0], mask_path=tmp_path / "mask.png"),))  # before an image is asked for
+        # before an image is asked for
+        loader((replace(views[0], mask_path=tmp_path / "mask.png"),))
 
 
 def test_silhouettes_become_alpha(tmp_path: Path) -> None:
@@ -284,7 +324,8 @@ def test_silhouettes_become_alpha(tmp_path: Path) -> None:
     person[2:4, 3:6] = 7
     write_image(tmp_path / "person.png", person)
     views = [
-        replace(v, silhouette=Silhouette(tmp_path / "person.png", "nonzero")) for v in views_of(tmp_path, channels=3)
+        replace(v, silhouette=Silhouette(tmp_path / "person.png", "nonzero"))
+        for v in views_of(tmp_path, channels=3)
     ]
     alpha = loader(tuple(views))[1].alpha
     assert alpha is not None
@@ -299,8 +340,14 @@ def test_a_image_on_another_device(tmp_path: Path) -> None:
     view = views_of(tmp_path)[0]
     write_image(tmp_path / "mask.png", random_pixels(8, 12, 1))
     moved = ImageLoader([replace(view, mask_path=tmp_path / "mask.png")])[0].to("meta").shrunk(2)
-    cameras, background = moved.cameras, torch.zeros(3, device="meta")
-    tensors = (cameras.cam_from_world, cameras.intrinsics, moved.rgb_premultiplied, moved.composite(background))
+    cameras = moved.cameras
+    background = torch.zeros(3, device="meta")
+    tensors = (
+        cameras.cam_from_world,
+        cameras.intrinsics,
+        moved.rgb_premultiplied,
+        moved.composite(background),
+    )
     assert moved.alpha is not None
     assert moved.mask is not None
     assert {x.device.type for x in (*tensors, moved.alpha, moved.mask)} == {"meta"}
@@ -308,6 +355,15 @@ def test_a_image_on_another_device(tmp_path: Path) -> None:
 
 def test_images_beyond_the_limit_are_refused_at_the_beginning(blender_root: Path) -> None:
     views = views_of(blender_root)
-    with pytest.raises(DyngsError, match=r"12x8 pixels are 9\.6e-05 megapixels, but data\.max_megapixels is 9e-05"):
+    with pytest.raises(
+        DyngsError, match=r"12x8 pixels are 9\.6e-05 megapixels, but data\.max_megapixels is 9e-05"
+    ):
         ImageLoader(views, DataConfig(root=blender_root, max_megapixels=9e-5))
-    assert len(ImageLoader(views, DataConfig(root=blender_root, max_megapixels=1e-4))[0].rgb_premultiplied) == 8
+    assert (
+        len(
+            ImageLoader(views, DataConfig(root=blender_root, max_megapixels=1e-4))[
+                0
+            ].rgb_premultiplied
+        )
+        == 8
+    )

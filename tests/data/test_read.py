@@ -48,12 +48,19 @@ def names(capture: Capture, split: str) -> list[str]:
 
 def test_readers_configuration_and_docs_name_the_same_formats() -> None:
     """What a module in ``readers/`` declares as a format is in the list."""
-    modules = [import_module(f"{readers.__name__}.{path.stem}") for path in Path(readers.__file__).parent.glob("*.py")]
-    declared = [x for module in modules for x in vars(module).values() if isinstance(x, CaptureFormat)]
+    modules = [
+        import_module(f"{readers.__name__}.{path.stem}")
+        for path in Path(readers.__file__).parent.glob("*.py")
+    ]
+    declared = [
+        x for module in modules for x in vars(module).values() if isinstance(x, CaptureFormat)
+    ]
     names = {format.name for format in FORMATS}
     assert (len(names), {format.name for format in declared}) == (len(FORMATS), names)
     assert set(get_args(DataConfig.model_fields["format"].annotation)) == {"auto", *names}
-    table = (Path(__file__).resolve().parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    table = (Path(__file__).resolve().parents[2] / "docs" / "formats.md").read_text(
+        encoding="utf-8"
+    )
     assert [name for name in names if f"\n| `{name}` |" not in table] == []
     assert {format.extends for format in FORMATS} - {None} <= names
 
@@ -61,7 +68,11 @@ def test_readers_configuration_and_docs_name_the_same_formats() -> None:
 def test_formats_are_recognised(blender_root: Path) -> None:
     capture = read(blender_root)
     assert (capture.format, capture.has_alpha) == ("blender", True)
-    assert {name: len(views) for name, views in capture.splits.items()} == {"train": 16, "val": 0, "test": 2}
+    assert {name: len(views) for name, views in capture.splits.items()} == {
+        "train": 16,
+        "val": 0,
+        "test": 2,
+    }
     assert capture.world_offset.tolist() == [0, 0, 0]
     assert capture.warnings == ()
 
@@ -164,11 +175,16 @@ def test_views_without_images_may_be_left_out(colmap_root: Path) -> None:
     """Before every n-th of the others is held out; the count is of all splits."""
     for name in ("left/01.jpg", "left/03.jpg"):
         (colmap_root / "images" / name).unlink()
-    with pytest.raises(DyngsError, match=r"2 of 9 images are missing, first .*left/03\.jpg; .*skip_missing=true"):
+    with pytest.raises(
+        DyngsError, match=r"2 of 9 images are missing, first .*left/03\.jpg; .*skip_missing=true"
+    ):
         require_images(read(colmap_root))
     capture = require_images(read(colmap_root, skip_missing=True))
     assert (names(capture, "test"), len(capture.splits["train"])) == (["left/05"], 6)
-    assert any("2 of 9 images are missing" in line and line.endswith("left out") for line in capture.warnings)
+    assert any(
+        "2 of 9 images are missing" in line and line.endswith("left out")
+        for line in capture.warnings
+    )
     ImageLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
 
 
@@ -183,7 +199,10 @@ def test_without_any_image_there_is_nothing_to_train_on(nerfstudio_root: Path) -
 def test_the_layer_that_is_read_of_exr_images_is_named(tmp_path: Path) -> None:
     for i in range(4):
         spec = oiio.ImageSpec(8, 6, 7, "half")
-        spec.channelnames = [*(f"N.{c}" for c in "RGB"), *(f"ViewLayer.Combined.{c}" for c in "RGBA")]
+        spec.channelnames = [
+            *(f"N.{c}" for c in "RGB"),
+            *(f"ViewLayer.Combined.{c}" for c in "RGBA"),
+        ]
         output = oiio.ImageOutput.create(str(tmp_path / f"{i}.exr"))
         assert output.open(str(tmp_path / f"{i}.exr"), spec)
         assert output.write_image(np.full((6, 8, 7), 0.2 * i, np.float32))
@@ -196,14 +215,22 @@ def test_the_layer_that_is_read_of_exr_images_is_named(tmp_path: Path) -> None:
 
 
 def test_two_images_of_one_name(nerfstudio_root: Path) -> None:
-    edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][1].update(file_path="images/00.png"))
+    edit_json(
+        nerfstudio_root / "transforms.json",
+        lambda c: c["frames"][1].update(file_path="images/00.png"),
+    )
     with pytest.raises(DyngsError, match=r"00\.(png|jpg) share the name images/00"):
         read(nerfstudio_root)
 
 
 def test_training_on_the_test_set_is_a_warning(blender_root: Path) -> None:
-    edit_json(blender_root / "transforms_test.json", lambda c: c["frames"][0].update(file_path="train/r_1"))
-    assert read(blender_root).warnings == ("1 test images are also training images, first train/r_1",)
+    edit_json(
+        blender_root / "transforms_test.json",
+        lambda c: c["frames"][0].update(file_path="train/r_1"),
+    )
+    assert read(blender_root).warnings == (
+        "1 test images are also training images, first train/r_1",
+    )
 
 
 def set_times(root: Path, split: str, times: list[float]) -> None:
@@ -219,7 +246,12 @@ def test_times_in_frames_are_scaled_to_one(blender_root: Path) -> None:
     set_times(blender_root, "test", [7.5, 20.0])
     capture = read(blender_root)
     times = {view.name: view.time for views in capture.splits.values() for view in views}
-    assert (times["train/r_0"], times["train/r_15"], times["test/r_0"], times["test/r_1"]) == (0, 0.75, 0.375, 1)
+    assert (times["train/r_0"], times["train/r_15"], times["test/r_0"], times["test/r_1"]) == (
+        0,
+        0.75,
+        0.375,
+        1,
+    )
     assert "times run from 0 to 20" in capture.warnings[0]
 
 
@@ -230,7 +262,9 @@ def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> No
     edit_json(blender_root / "transforms_train.json", lambda c: c.update(fps=30))
     capture = read(blender_root)
     assert [view.time for view in capture.splits["test"]] == pytest.approx([0.25, 1.0])
-    assert sorted(view.time or 0.0 for view in capture.splits["train"]) == pytest.approx([0.05 * i for i in range(16)])
+    assert sorted(view.time or 0.0 for view in capture.splits["train"]) == pytest.approx(
+        [0.05 * i for i in range(16)]
+    )
     assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
     assert (capture.span, capture.seconds) == ((0.0, 0.06), None)
     assert dict(report_on(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
@@ -245,7 +279,10 @@ def test_times_from_0_to_1_are_kept_exactly(blender_root: Path) -> None:
     assert {view.time for view in capture.splits["train"]} == {i / 15 for i in range(16)}
     assert (capture.span, capture.seconds) == ((0.0, 1.0), pytest.approx(0.5))
     facts = dict(report_on(capture).facts)
-    assert (facts["times"], facts["duration"]) == ("16 in 0 to 1", "0.5 seconds from time 0 to time 1")
+    assert (facts["times"], facts["duration"]) == (
+        "16 in 0 to 1",
+        "0.5 seconds from time 0 to time 1",
+    )
 
 
 def test_time_for_some_is_an_error(blender_root: Path) -> None:
@@ -258,7 +295,9 @@ def test_time_for_some_is_an_error(blender_root: Path) -> None:
 def test_a_time_that_is_no_number_names_its_frame(blender_root: Path, time: object) -> None:
     set_times(blender_root, "train", [0.5] * 16)
     edit_json(blender_root / "transforms_train.json", lambda c: c["frames"][3].update(time=time))
-    with pytest.raises(DyngsError, match=r"frame 3 \(\./train/r_3\): 'time' must be a finite number"):
+    with pytest.raises(
+        DyngsError, match=r"frame 3 \(\./train/r_3\): 'time' must be a finite number"
+    ):
         read(blender_root)
 
 
@@ -288,7 +327,10 @@ def test_order_of_times_does_not_matter(blender_root: Path) -> None:
     set_times(blender_root, "train", [(7 * i % 16) / 15 for i in range(16)])
     set_times(blender_root, "test", [1.0, 0.0])
     capture = read(blender_root)
-    assert {view.name: view.time for view in capture.splits["test"]} == {"test/r_0": 1.0, "test/r_1": 0.0}
+    assert {view.name: view.time for view in capture.splits["test"]} == {
+        "test/r_0": 1.0,
+        "test/r_1": 0.0,
+    }
     assert capture.warnings == ()
 
 
@@ -309,7 +351,9 @@ def test_frames_of_any_format_with_times(blender_root: Path) -> None:
     assert len(names(capture, "train")) == 6
 
 
-@pytest.mark.parametrize(("frames", "line"), [("1-2", "start:stop:step"), ("5:5", "picks none of"), ("0:9:0", "step")])
+@pytest.mark.parametrize(
+    ("frames", "line"), [("1-2", "start:stop:step"), ("5:5", "picks none of"), ("0:9:0", "step")]
+)
 def test_bad_choices_of_frames(blender_root: Path, frames: str, line: str) -> None:
     set_times(blender_root, "train", [i / 15 for i in range(16)])
     set_times(blender_root, "test", [0.5, 0.5])
@@ -344,7 +388,9 @@ def test_dynamic_formats_are_recognised_and_load(tmp_path: Path, form: str) -> N
 
 
 @pytest.mark.parametrize("form", ["nerfies", "llff", "camera_folders"])
-def test_a_folder_given_relative_to_where_we_are(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_given_relative_to_where_we_are(
+    tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = tmp_path / "deep" / "capture"
     root.mkdir(parents=True)
     if form == "nerfies":
@@ -387,7 +433,9 @@ def test_far_world_is_rebased(nerfstudio_root: Path) -> None:
         ("stage", "blender", (192, 0, 24), False, 24),
     ],
 )
-def test_real_captures(shared: Path, name: str, form: str, counts: tuple, alpha: bool, times: int) -> None:
+def test_real_captures(
+    shared: Path, name: str, form: str, counts: tuple, alpha: bool, times: int
+) -> None:
     capture = read(shared / name)
     found = tuple(len(capture.splits[split]) for split in ("train", "val", "test"))
     assert (capture.format, found, capture.has_alpha, capture.warnings) == (form, counts, alpha, ())
@@ -399,15 +447,23 @@ def test_real_captures(shared: Path, name: str, form: str, counts: tuple, alpha:
 
 def test_part_of_a_real_sequence(shared: Path) -> None:
     capture = read(shared / "stage", frames="6:12")
-    assert (len(capture.splits["train"]), len(capture.splits["test"]), capture.warnings) == (48, 6, ())
-    assert sorted({view.time for view in capture.splits["test"]}) == pytest.approx([i / 5 for i in range(6)], abs=1e-4)
+    assert (len(capture.splits["train"]), len(capture.splits["test"]), capture.warnings) == (
+        48,
+        6,
+        (),
+    )
+    assert sorted({view.time for view in capture.splits["test"]}) == pytest.approx(
+        [i / 5 for i in range(6)], abs=1e-4
+    )
 
 
 def test_new_poses_keep_times_and_frames_of_their_own(shared: Path) -> None:
     """They are another clip: choosing frames of the first one leaves them alone."""
     if not (shared / "human" / "casual_m").is_dir():
         pytest.skip("the captures of people are not here")
-    capture = read_capture(DataConfig.model_validate({"root": shared / "human" / "casual_m", "frames": "0:5"}))
+    capture = read_capture(
+        DataConfig.model_validate({"root": shared / "human" / "casual_m", "frames": "0:5"})
+    )
     assert (capture.format, capture.warnings, capture.has_alpha) == ("body_json", (), True)
     assert {name: len(views) for name, views in capture.splits.items()} == {
         "train": 40,
@@ -416,7 +472,9 @@ def test_new_poses_keep_times_and_frames_of_their_own(shared: Path) -> None:
         "pose": 32,
     }
     assert {view.time for view in capture.splits["train"]} == {0.0, 0.25, 0.5, 0.75, 1.0}
-    assert sorted({view.time for view in capture.splits["pose"]}) == pytest.approx([i / 7 for i in range(8)])
+    assert sorted({view.time for view in capture.splits["pose"]}) == pytest.approx(
+        [i / 7 for i in range(8)]
+    )
     assert capture.body is not None
     assert {name: len(body.frames) for name, body in capture.body.items()} == {
         "train": 20,
@@ -427,21 +485,30 @@ def test_new_poses_keep_times_and_frames_of_their_own(shared: Path) -> None:
 
 
 def test_a_fisheye_is_undistorted_to_the_pinhole_that_is_asked_for(tmp_path: Path) -> None:
-    """A wide one shows more of what the lens saw, and leaves out of the loss what it did not see."""
-    root = write_still_capture(tmp_path / "still", StillOptions(size=16, num_train=3, num_test=1, samples=1))
+    """A wide one shows more of what the lens saw, and leaves out of the loss what it did not
+    see."""
+    root = write_still_capture(
+        tmp_path / "still", StillOptions(size=16, num_train=3, num_test=1, samples=1)
+    )
     for split in ("train", "test"):
         edit_json(
-            root / f"transforms_{split}.json", lambda content: content.update(is_fisheye=True, camera_angle_x=1.5)
+            root / f"transforms_{split}.json",
+            lambda content: content.update(is_fisheye=True, camera_angle_x=1.5),
         )
     same, wide = (read(root, undistort=how) for how in ("same_focal", "wide"))
     for view, before in zip(wide.splits["train"], same.splits["train"], strict=True):
         assert before.lens.focal_ratio == 1
         assert view.lens.focal_ratio > 1.1
-        np.testing.assert_allclose(view.intrinsics[0, 0] * view.lens.focal_ratio, before.intrinsics[0, 0])
+        np.testing.assert_allclose(
+            view.intrinsics[0, 0] * view.lens.focal_ratio, before.intrinsics[0, 0]
+        )
     said = [dict(report_on(capture).facts)["lens"] for capture in (same, wide)]
     assert "data.undistort=wide keeps more" in said[0]
     assert "of the focal length, which keeps 9" in said[1]
-    masks = [ImageLoader(capture.splits["train"], DataConfig(root=root))[0].mask for capture in (same, wide)]
+    masks = [
+        ImageLoader(capture.splits["train"], DataConfig(root=root))[0].mask
+        for capture in (same, wide)
+    ]
     assert masks[0] is None
     assert masks[1] is not None
     assert 0.5 < float(masks[1].mean()) < 1
@@ -453,16 +520,22 @@ def loaded(root: Path, **options: object) -> ImageLoader:
 
 
 def test_maps_come_with_the_image(tmp_path: Path) -> None:
-    """Flow in the pixels of the smaller image; depth of its own size; the next view is that of the next time."""
+    """Flow in the pixels of the smaller image; depth of its own size; the next view is that of the
+    next time."""
     images = loaded(with_priors(tmp_path), downscale=2)
     assert [view.flow_to for view in images.views] == [None, "a", "b"]
-    first, second = images[0], images[1]
+    first = images[0]
+    second = images[1]
     assert first.moves is not None
     assert first.depth is not None
     assert second.moves is not None
     assert second.flow is not None
     assert first.moves.shape == first.depth.shape == (4, 6)
-    assert (float(first.moves.max()), float(second.moves.min()), float(first.depth.max())) == (0, 1, 2)
+    assert (float(first.moves.max()), float(second.moves.min()), float(first.depth.max())) == (
+        0,
+        1,
+        2,
+    )
     torch.testing.assert_close(second.flow, torch.full((4, 6, 2), 2.0))
     small = second.shrunk(2)
     assert small.flow is not None
@@ -491,7 +564,9 @@ def test_missing_priors_are_done_without(tmp_path: Path) -> None:
     assert any("tracks.npz are missing" in line for line in capture.warnings)
 
 
-@pytest.mark.parametrize("key", ["depth_file_path", "flow_file_path", "motion_mask_path", "instance_mask_path"])
+@pytest.mark.parametrize(
+    "key", ["depth_file_path", "flow_file_path", "motion_mask_path", "instance_mask_path"]
+)
 def test_priors_outside_the_capture_are_refused(tmp_path: Path, key: str) -> None:
     root = tmp_path / "capture"
     root.mkdir()
@@ -499,7 +574,10 @@ def test_priors_outside_the_capture_are_refused(tmp_path: Path, key: str) -> Non
     np.save(tmp_path / "other.npy", np.zeros(3))
     edit_json(
         root / "transforms_train.json",
-        lambda c: [f.pop("motion_mask_path") for f in c["frames"]] and c["frames"][1].update({key: "../other.npy"}),
+        lambda c: (
+            [f.pop("motion_mask_path") for f in c["frames"]]
+            and c["frames"][1].update({key: "../other.npy"})
+        ),
     )
     with pytest.raises(DyngsError, match="outside the capture"):
         read_capture(root)
@@ -507,7 +585,9 @@ def test_priors_outside_the_capture_are_refused(tmp_path: Path, key: str) -> Non
 
 def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
     np.save(with_priors(tmp_path) / "b_flow.npy", np.zeros((4, 6, 2)))
-    with pytest.raises(DyngsError, match=r"b_flow\.npy: the flow field is 6x4 but its image is 12x8"):
+    with pytest.raises(
+        DyngsError, match=r"b_flow\.npy: the flow field is 6x4 but its image is 12x8"
+    ):
         loaded(tmp_path)[1]
 
 
@@ -516,7 +596,10 @@ def test_instance_masks_mean_that_everything_labelled_moves(tmp_path: Path) -> N
     write_image(tmp_path / "labels.png", np.arange(96, dtype=np.uint16).reshape(8, 12, 1))
     edit_json(
         tmp_path / "transforms_train.json",
-        lambda c: c["frames"][0].pop("motion_mask_path") and c["frames"][0].update(instance_mask_path="labels.png"),
+        lambda c: (
+            c["frames"][0].pop("motion_mask_path")
+            and c["frames"][0].update(instance_mask_path="labels.png")
+        ),
     )
     moves = loaded(tmp_path)[0].moves
     assert moves is not None

@@ -34,7 +34,9 @@ from dyngs.data.scene_space import (
 from dyngs.errors import DyngsError
 
 
-def circle(offset: tuple[float, float, float] = (0.0, 0.0, 0.0), scale: float = 1.0, count: int = 12) -> list[View]:
+def circle(
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0), scale: float = 1.0, count: int = 12
+) -> list[View]:
     """Cameras on a circle of radius 4 that look at ``offset``."""
     views = []
     for i in range(count):
@@ -49,7 +51,9 @@ def test_the_cube_is_seen_or_not() -> None:
     assert outside_of_cube(circle(), 1.3) is None
     assert "look at (7, -3, 11)" in (outside_of_cube(circle((7.0, -3.0, 11.0)), 1.3) or "")
     # Far too near: only a few points of the cube are in two images.
-    assert "of the cube of half side 1.3" in (outside_of_cube(circle(scale=0.2, count=2), 1.3) or "")
+    assert "of the cube of half side 1.3" in (
+        outside_of_cube(circle(scale=0.2, count=2), 1.3) or ""
+    )
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
@@ -75,7 +79,9 @@ def test_candidates_lie_in_their_view_between_the_bounds() -> None:
     xyz, seen = points_in_frusta(views, np.random.default_rng(0).random((500, 4)))
     assert seen.min() >= 1
     np.testing.assert_array_equal(seen, times_seen(xyz, views))
-    depths = np.stack([xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3] for view in views])
+    depths = np.stack(
+        [xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3] for view in views]
+    )
     shown = np.stack([projected(xyz, view)[1] for view in views])
     fits = shown & (depths > near * 0.999) & (depths < far * 1.001)
     assert fits.any(axis=0).all()
@@ -93,7 +99,8 @@ def capture_at(offset: np.ndarray, radius: float = 4.0, count: int = 6) -> Captu
     for pose in poses:
         pose[:3, 3] += offset
     views = tuple(
-        View(str(i), Path(f"{i}.png"), cam_from_opengl(pose), np.eye(3), 1, 1) for i, pose in enumerate(poses)
+        View(str(i), Path(f"{i}.png"), cam_from_opengl(pose), np.eye(3), 1, 1)
+        for i, pose in enumerate(poses)
     )
     points = PointCloud(offset + np.arange(6.0).reshape(2, 3), np.zeros((2, 3), np.uint8))
     return Capture(Path(), "colmap", {"train": views[:-1], "test": views[-1:]}, points)
@@ -112,9 +119,14 @@ def file_centers(capture: Capture) -> np.ndarray:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.floats(-5e6, 5e6), min_size=3, max_size=3).filter(lambda xs: np.linalg.norm(xs) > 2e5))
+@given(
+    st.lists(st.floats(-5e6, 5e6), min_size=3, max_size=3).filter(
+        lambda xs: np.linalg.norm(xs) > 2e5
+    )
+)
 def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
-    """The scene keeps its shape to 1e-8 units (float64 at 1e6 has 1e-10), and the offset restores it."""
+    """The scene keeps its shape to 1e-8 units (float64 at 1e6 has 1e-10), and the offset restores
+    it."""
     before = capture_at(np.array(offset))
     after = normalise_capture(before)
     assert np.linalg.norm(after.world_offset - offset) < 10
@@ -143,7 +155,8 @@ def test_projection_does_not_change(scale: float) -> None:
 @pytest.mark.parametrize("offset", [0.0, 5e7])
 def test_power_of_two_scale_gives_the_same_scene_coordinates(scale: float, offset: float) -> None:
     before = capture_at(np.array([offset, 0.0, 0.0]))
-    one, other = normalise_capture(before), normalise_capture(scaled(before, scale))
+    one = normalise_capture(before)
+    other = normalise_capture(scaled(before, scale))
     assert other.world_scale == scale * one.world_scale
     np.testing.assert_array_equal(other.world_offset, scale * one.world_offset)
     for a, b in zip(all_views(one.splits), all_views(other.splits), strict=True):
@@ -160,7 +173,9 @@ def test_extent_of_a_normalised_scene(scale: float) -> None:
     assert SMALLEST_EXTENT <= extent_of(centers) < 2 * SMALLEST_EXTENT
 
 
-@pytest.mark.parametrize(("distance", "radius", "moves"), [(5.0, 4.0, False), (350, 4.0, False), (900, 4.0, True)])
+@pytest.mark.parametrize(
+    ("distance", "radius", "moves"), [(5.0, 4.0, False), (350, 4.0, False), (900, 4.0, True)]
+)
 def test_only_far_scenes_move(distance: float, radius: float, moves: bool) -> None:
     capture = capture_at(np.array([distance, 0, 0]), radius)
     assert normalise_capture(capture).world_offset.any() == moves
@@ -177,10 +192,13 @@ def test_small_capture_at_utm_coordinates_without_points() -> None:
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-9])
 def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
-    """All centres coincide, so nothing tells a length; random points around the origin must stay in its view."""
+    """All centres coincide, so nothing tells a length; random points around the origin must stay in
+    its view."""
     view = capture_at(np.zeros(3)).splits["train"][0]
     moved = [view.cam_from_world + np.diag([jitter * i, 0, 0], 1) for i in range(5)]
-    views = tuple(View(str(i), view.image_path, pose, np.eye(3), 1, 1) for i, pose in enumerate(moved))
+    views = tuple(
+        View(str(i), view.image_path, pose, np.eye(3), 1, 1) for i, pose in enumerate(moved)
+    )
     capture = Capture(Path(), "blender", {"train": views})
     assert normalise_capture(capture) is capture
 
@@ -190,7 +208,11 @@ def test_fixed_camera_gets_its_unit_from_the_points() -> None:
     view = before.splits["train"][0]
     capture = normalise_capture(before.replace(splits={"train": (view,)}))
     assert capture.points is not None
-    depth = np.median(np.linalg.norm(capture.points.xyz - camera_center(capture.splits["train"][0].cam_from_world)))
+    depth = np.median(
+        np.linalg.norm(
+            capture.points.xyz - camera_center(capture.splits["train"][0].cam_from_world)
+        )
+    )
     assert 1 < depth < 20
 
 
@@ -226,7 +248,9 @@ def test_infinite_position_is_an_error() -> None:
 
 
 def test_bodies_move_and_scale_with_the_cameras() -> None:
-    body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[1e6, 2.0, 3.0]], np.zeros(10), scale=0.5)
+    body = body_frames(
+        Path("b"), [0], np.zeros((1, 72)), [[1e6, 2.0, 3.0]], np.zeros(10), scale=0.5
+    )
     capture = Capture(Path("x"), "blender", {}).replace(body=of_one_clip(body))
     moved = change_coordinates(capture, 0.5, np.array([1e6, 0.0, 0.0]))
     assert moved.body is not None
@@ -235,7 +259,9 @@ def test_bodies_move_and_scale_with_the_cameras() -> None:
 
 
 def test_unit_of_people_is_the_metre() -> None:
-    body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[0.1, 2.0, 3.0]], np.zeros(10), scale=1e-3)
+    body = body_frames(
+        Path("b"), [0], np.zeros((1, 72)), [[0.1, 2.0, 3.0]], np.zeros(10), scale=1e-3
+    )
     capture = normalise_capture(capture_at(np.zeros(3)).replace(body=of_one_clip(body)))
     assert capture.world_scale == 2.0**-10
     assert capture.body is not None

@@ -1,4 +1,5 @@
-"""Copies of images in ``images_2``, ``images_4``: when they are read, and that scenes stay the same."""
+"""Copies of images in ``images_2``, ``images_4``: when they are read, and that scenes stay the
+same."""
 
 from __future__ import annotations
 
@@ -51,7 +52,9 @@ def read(root: Path, **options: object) -> tuple[Capture, DataConfig]:
         ({"longest_side": 24, "downscale": 4}, 4, (16, 12)),
     ],
 )
-def test_smallest_copy_that_is_large_enough(root: Path, options: dict, factor: int, size: tuple[int, int]) -> None:
+def test_smallest_copy_that_is_large_enough(
+    root: Path, options: dict, factor: int, size: tuple[int, int]
+) -> None:
     capture, config = read(root, **options)
     loader = ImageLoader(capture.splits["train"], config)
     assert loader.sizes == [size] * COUNT
@@ -59,18 +62,27 @@ def test_smallest_copy_that_is_large_enough(root: Path, options: dict, factor: i
     assert (image.cameras.width, image.cameras.height) == size
     np.testing.assert_allclose(image.rgb_premultiplied, GREY[factor] / 255, atol=1e-6)
     scale = size[0] / WIDTH
-    expected = [[50 * scale, 0, 30 * scale], [0, 50 * size[1] / HEIGHT, 26 * size[1] / HEIGHT], [0, 0, 1]]
+    expected = [
+        [50 * scale, 0, 30 * scale],
+        [0, 50 * size[1] / HEIGHT, 26 * size[1] / HEIGHT],
+        [0, 0, 1],
+    ]
     np.testing.assert_allclose(image.cameras.intrinsics[0], expected, rtol=1e-6)
     names = [view.name for view in capture.splits["train"]]
     assert names == [f"images/{i}" for i in range(COUNT)]
     (line,) = capture.warnings
-    wanted = "data.downscale=2 reads images_2" if factor == 1 else f"images_{factor} is read in place of images"
+    wanted = (
+        "data.downscale=2 reads images_2"
+        if factor == 1
+        else f"images_{factor} is read in place of images"
+    )
     assert wanted in line
 
 
 def test_copies_that_are_incomplete_are_not_read(root: Path) -> None:
     (root / "images_2/1.png").unlink()
-    write_image(root / "images_2/2.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))  # another photo of that name
+    # another photo of that name
+    write_image(root / "images_2/2.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     write_image(root / "images_2/3.png", np.zeros((WIDTH // 2, WIDTH // 2, 3), np.uint8))
     capture, _ = read(root, downscale=2)
     (line,) = capture.warnings

@@ -1,4 +1,5 @@
-"""Times: from files, names and frame numbers, one fault at a time; selection; time steps of several videos."""
+"""Times: from files, names and frame numbers, one fault at a time; selection; time steps of several
+videos."""
 
 from __future__ import annotations
 
@@ -62,14 +63,18 @@ def test_missing_in_some() -> None:
         unit_times(ROOT, train(view("a", 0.0), view("b", None)))
 
 
-@given(st.lists(st.integers(-50, 50).map(float), min_size=2, max_size=8, unique=True), st.integers(0, 6))
+@given(
+    st.lists(st.integers(-50, 50).map(float), min_size=2, max_size=8, unique=True),
+    st.integers(0, 6),
+)
 def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
     """Whatever the order: one affine map for all splits, onto [0, 1]."""
     views = [view(f"v{i}", time) for i, time in enumerate(times)]
     cut = min(cut, len(views) - 1)
     splits, notes = unit_times(ROOT, {"train": tuple(views[cut:]), "test": tuple(views[:cut])})
     found = times_of(splits, "test") + times_of(splits)
-    low, high = min(times), max(times)
+    low = min(times)
+    high = max(times)
     if (low, high) == (0, 1):
         assert (found, notes) == (times, [])
     else:
@@ -96,7 +101,9 @@ def test_stretched_to_the_span_of_the_clip(times: list[float], mentioned: bool |
     else:
         span = max(times) - min(times)
         assert times_of(scaled) == pytest.approx([(time - min(times)) / span for time in times])
-        assert [f"times run from {min(times):g} to {max(times):g}" in note for note in notes] == [True] * mentioned
+        assert [f"times run from {min(times):g} to {max(times):g}" in note for note in notes] == [
+            True
+        ] * mentioned
     assert unit_times(ROOT, splits, stretch=False) == (splits, [])
 
 
@@ -139,22 +146,35 @@ def test_a_single_image_is_fine(time: float, kept: float) -> None:
 def test_images_that_differ_by_chance() -> None:
     views = [view("a", 0.0), view("b", 0.5), view("c", 0.5), view("d", 1.0)]
     (warning,) = sequence_warnings({"train": tuple(views[:2]), "test": tuple(views[2:])})
-    assert "2 images share camera, pose and time with another one, first b and c at time 0.5" in warning
+    assert (
+        "2 images share camera, pose and time with another one, first b and c at time 0.5"
+        in warning
+    )
 
 
 def test_images_that_may_share_a_time() -> None:
-    """Other cameras, other poses of one camera, and the same file listed twice are no repetitions."""
+    """Other cameras, other poses of one camera, and the same file listed twice are no
+    repetitions."""
     poses = [opengl_pose(angle) for angle in (0.0, 1.0)]
-    moving = [view("a", 0.0, pose=poses[0]), view("b", 0.0, pose=poses[1]), view("c", 1.0, pose=poses[1])]
+    moving = [
+        view("a", 0.0, pose=poses[0]),
+        view("b", 0.0, pose=poses[1]),
+        view("c", 1.0, pose=poses[1]),
+    ]
     assert sequence_warnings(train(*moving)) == []
-    several = [view(f"{camera}/{time}", time, camera, poses[0]) for camera in (0, 1) for time in (0.0, 1.0)]
+    several = [
+        view(f"{camera}/{time}", time, camera, poses[0]) for camera in (0, 1) for time in (0.0, 1.0)
+    ]
     assert sequence_warnings({"train": tuple(several), "test": (several[0],)}) == []
 
 
 def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View, ...]]:
     """Cameras with so many frames each; the first one is for testing."""
     views = [
-        tuple(view(f"{folder.format(camera)}{camera}_{frame}", frame / 30, camera) for frame in range(count))
+        tuple(
+            view(f"{folder.format(camera)}{camera}_{frame}", frame / 30, camera)
+            for frame in range(count)
+        )
         for camera, count in enumerate(counts)
     ]
     return {"train": tuple(v for kept in views[1:] for v in kept), "test": views[0]}
@@ -165,7 +185,12 @@ def sharing_one_number(splits: Splits, noise: float = 0.0) -> Splits:
     draw = np.random.default_rng(0)
 
     def changed(view: View) -> View:
-        pose = np.linalg.inv(view.cam_from_world) + noise * draw.uniform(-1, 1, (4, 4)) * ([1], [1], [1], [0])
+        pose = np.linalg.inv(view.cam_from_world) + noise * draw.uniform(-1, 1, (4, 4)) * (
+            [1],
+            [1],
+            [1],
+            [0],
+        )
         return replace(view, camera_id=0, cam_from_world=pose)
 
     return {name: tuple(map(changed, views)) for name, views in splits.items()}
@@ -176,14 +201,18 @@ def sharing_one_number(splits: Splits, noise: float = 0.0) -> Splits:
 def test_poses_that_repeat_at_the_same_times_are_cameras(noise: float, counts: list[int]) -> None:
     numbered = number_cameras(sharing_one_number(rig(counts), noise))
     views = all_views(numbered)
-    assert [(v.name, v.camera_id) for v in views] == [(v.name, v.camera_id) for v in all_views(rig(counts))]
+    assert [(v.name, v.camera_id) for v in views] == [
+        (v.name, v.camera_id) for v in all_views(rig(counts))
+    ]
     assert len({v.cam_from_world.tobytes() for v in views}) == len(counts)
     assert [len(x) for x in videos(views)] == [counts[v.camera_id] for v in views if v.time == 0.0]
     trained = split_by_camera(ROOT, numbered, (1,))["train"]
     assert len(trained) == counts[1]
 
 
-@pytest.mark.parametrize("case", ["one_walk", "resting", "scattered", "numbered", "untimed", "one_fixed", "beside"])
+@pytest.mark.parametrize(
+    "case", ["one_walk", "resting", "scattered", "numbered", "untimed", "one_fixed", "beside"]
+)
 def test_cameras_that_keep_their_numbers(case: str) -> None:
     walk = [view(f"{i}", i / 10, pose=opengl_pose(0.3 * i)) for i in range(10)]
     others = [view(f"test{i}", i / 10, pose=opengl_pose(0.3 * i + 0.1)) for i in range(10)]
@@ -191,11 +220,17 @@ def test_cameras_that_keep_their_numbers(case: str) -> None:
     splits = {
         "one_walk": train(*walk),
         "resting": train(*walk, *still),  # all one after the other
-        "scattered": {"train": tuple(walk), "test": (*others, replace(walk[3], name="again", time=0.5))},
+        "scattered": {
+            "train": tuple(walk),
+            "test": (*others, replace(walk[3], name="again", time=0.5)),
+        },
         "numbered": rig([4, 4]),
-        "untimed": {"train": tuple(replace(v, camera_id=0, time=None) for v in all_views(rig([4, 4])))},
+        "untimed": {
+            "train": tuple(replace(v, camera_id=0, time=None) for v in all_views(rig([4, 4])))
+        },
         "one_fixed": sharing_one_number(rig([5])),
-        "beside": {"train": tuple(walk), "test": rig([9])["test"]},  # a moving camera and a fixed one
+        # a moving camera and a fixed one
+        "beside": {"train": tuple(walk), "test": rig([9])["test"]},
     }[case]
     assert number_cameras(splits) is splits
 
@@ -212,11 +247,18 @@ def test_different_numbers_of_frames() -> None:
 
 
 def test_videos_are_those_of_fixed_cameras_or_of_the_one_that_moves() -> None:
-    standing = [view(f"{camera}{time}", time, camera) for time in (1.0, 0.0, 0.5) for camera in (0, 1)]
+    standing = [
+        view(f"{camera}{time}", time, camera) for time in (1.0, 0.0, 0.5) for camera in (0, 1)
+    ]
     assert videos(standing) == [[2, 4, 0], [3, 5, 1]]
-    walk = [view(f"{i}", (7 * i % 10) / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)]
+    walk = [
+        view(f"{i}", (7 * i % 10) / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10))))
+        for i in range(10)
+    ]
     assert videos(walk) == [sorted(range(10), key=lambda i: 7 * i % 10)]
-    jumps = [view(f"{i}", i / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)]
+    jumps = [
+        view(f"{i}", i / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)
+    ]
     assert videos(jumps) == []
     assert videos([view(f"{i}", None, i) for i in range(5)]) == []
 
@@ -227,7 +269,9 @@ def test_round_trip(tmp_path: Path) -> None:
     assert read_seconds(tmp_path) == {"a.png": 0.0, "b/c.png": 1.25}
 
 
-@pytest.mark.parametrize("text", ["[1]", "{}", '{"seconds": [1]}', '{"seconds": {"a.png": "soon"}}', "{"])
+@pytest.mark.parametrize(
+    "text", ["[1]", "{}", '{"seconds": [1]}', '{"seconds": {"a.png": "soon"}}', "{"]
+)
 def test_a_damaged_file_is_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / SECONDS_FILE).write_text(text)
     with pytest.raises(DyngsError, match=SECONDS_FILE) as caught:
@@ -250,7 +294,9 @@ limits = st.none() | st.integers(-12, 12)
 
 
 @given(limits, limits, limits.filter(lambda step: step != 0), st.integers(1, 10))
-def test_as_python_slices(start: int | None, stop: int | None, step: int | None, count: int) -> None:
+def test_as_python_slices(
+    start: int | None, stop: int | None, step: int | None, count: int
+) -> None:
     text = ":".join("" if x is None else str(x) for x in (start, stop, step))
     assert parse_frames(text) == slice(start, stop, step)
     expected = sorted(range(count)[start:stop:step])
@@ -263,13 +309,14 @@ def test_as_python_slices(start: int | None, stop: int | None, step: int | None,
     assert [int(v.name.split("/")[1]) for v in kept["train"]] == expected
     assert len(kept["test"]) == (0 in expected)
     new = [v.time for v in kept["train"]]
-    assert new == pytest.approx([(i - expected[0]) / max(expected[-1] - expected[0], 1) for i in expected]), (
-        "the first is 0, the last 1, the others in proportion"
-    )
+    assert new == pytest.approx(
+        [(i - expected[0]) / max(expected[-1] - expected[0], 1) for i in expected]
+    ), "the first is 0, the last 1, the others in proportion"
 
 
 @pytest.mark.parametrize(
-    "text", ["", "5", "a:b", "1:2:3:4", "0.5:1", "0:1_0", "1-2", "0:10:2 x", "[0:2]", "1:2,4", "1:\u0665"]
+    "text",
+    ["", "5", "a:b", "1:2:3:4", "0.5:1", "0:1_0", "1-2", "0:10:2 x", "[0:2]", "1:2,4", "1:\u0665"],
 )
 def test_bad_slices(text: str) -> None:
     with pytest.raises(DyngsError, match=r"data\.frames=.*start:stop:step") as caught:
@@ -283,7 +330,8 @@ def test_step_zero() -> None:
 
 
 def test_times_are_counted_over_all_splits() -> None:
-    """Uneven times keep their proportions; files rounded differently agree; order in the files does not matter."""
+    """Uneven times keep their proportions; files rounded differently agree; order in the files does
+    not matter."""
     kept = select_frames(ROOT, splits([0.9, 0.0, 0.30000001, 0.1], [0.3, 1.0, 0.6]), "1:5")
     assert [(v.name, v.time) for v in kept["train"]] == [
         ("train/0", 1.0),
@@ -300,7 +348,14 @@ def test_times_are_counted_over_all_splits() -> None:
 def test_a_hair_apart_is_one_time() -> None:
     """Also where rounding to decimals would part them; the distance to the neighbour counts."""
     times = [0.0, 0.5, 0.5000004, 0.5000008, 0.500003, 1.0]
-    assert list(distinct_times(splits(times, [])["train"]).values()) == [0.0, 0.5, 0.5, 0.5, 0.500003, 1.0]
+    assert list(distinct_times(splits(times, [])["train"]).values()) == [
+        0.0,
+        0.5,
+        0.5,
+        0.5,
+        0.500003,
+        1.0,
+    ]
     assert len(select_frames(ROOT, splits(times, []), "1:2")["train"]) == 3
 
 
@@ -336,7 +391,10 @@ def test_held_out_frames_are_seen_from_the_test_cameras_if_there_are_any() -> No
     assert [v.name for v in held] == ["c1/1", "c1/3"]
     assert [v.name for v in kept["train"]] == ["c0/0", "c0/2", "c0/4"]
     assert [v.name for v in kept["test"]] == ["c1/0", "c1/2", "c1/4"]
-    mixed: dict[Split, tuple[View, ...]] = {"train": splits["train"][:4], "test": splits["train"][4:]}
+    mixed: dict[Split, tuple[View, ...]] = {
+        "train": splits["train"][:4],
+        "test": splits["train"][4:],
+    }
     assert [v.name for v in hold_out_frames(ROOT, mixed, "3:")[1]] == ["c0/3", "c0/4"], "one camera"
 
 
@@ -357,8 +415,13 @@ def test_cameras_that_are_trained_on() -> None:
     splits: dict[Split, tuple[View, ...]] = {"train": (), "test": filmed(0, "test")["test"]}
     splits["train"] = tuple(view for camera in (1, 2) for view in filmed(camera, "train")["train"])
     found = split_by_camera(ROOT, splits, (0, 2))
-    assert {name: {view.camera_id for view in views} for name, views in found.items()} == {"train": {0, 2}, "test": {1}}
-    with pytest.raises(DyngsError, match=r"train_cameras=\[3\]: no camera 3; there are 3, from 0 to 2"):
+    assert {name: {view.camera_id for view in views} for name, views in found.items()} == {
+        "train": {0, 2},
+        "test": {1},
+    }
+    with pytest.raises(
+        DyngsError, match=r"train_cameras=\[3\]: no camera 3; there are 3, from 0 to 2"
+    ):
         split_by_camera(ROOT, splits, (3,))
     with pytest.raises(DyngsError, match="are all cameras of the capture; leave one for testing"):
         split_by_camera(ROOT, splits, (0, 1, 2))
@@ -409,7 +472,8 @@ def test_what_has_no_order_is_one_line(names: tuple[str, ...]) -> None:
 
 
 def _taken(*clips: tuple[float, float, int], most: int | None = None) -> tuple[list[Taken], str]:
-    """The frames taken of videos, each with its start in seconds, frames per second, and number of frames."""
+    """The frames taken of videos, each with its start in seconds, frames per second, and number of
+    frames."""
     clocks = [start + np.arange(count) / rate for start, rate, count in clips]
     return taken_frames(Path("rig"), clocks, [rate for _, rate, _ in clips], most)
 

@@ -1,4 +1,5 @@
-"""Tracks, 2D and true ones: read back as written, refused in one line where arrays do not fit together."""
+"""Tracks, 2D and true ones: read back as written, refused in one line where arrays do not fit
+together."""
 
 from __future__ import annotations
 
@@ -10,7 +11,13 @@ import numpy as np
 import pytest
 
 from dyngs.data.capture import Capture, View
-from dyngs.data.tracks import TRACKS_FILE, TrueTracks, read_tracks, read_true_tracks, write_true_tracks
+from dyngs.data.tracks import (
+    TRACKS_FILE,
+    TrueTracks,
+    read_tracks,
+    read_true_tracks,
+    write_true_tracks,
+)
 from dyngs.errors import DyngsError
 
 
@@ -33,7 +40,8 @@ def test_rows_are_found_by_the_names_of_views(tmp_path: Path) -> None:
 
 def test_positions_that_are_no_numbers_are_not_visible(tmp_path: Path) -> None:
     xy = np.zeros((3, 2, 2))
-    xy[1, 0, 1], xy[2, 1, 0] = np.nan, 1e30
+    xy[1, 0, 1] = np.nan
+    xy[2, 1, 0] = 1e30
     tracks = read_tracks(write(tmp_path / "a.npz", xy=xy))
     assert tracks.visible.tolist() == [[True, True], [False, True], [True, False]]
     assert np.isfinite(tracks.xy).all()
@@ -63,12 +71,15 @@ def some_tracks() -> TrueTracks:
     random = np.random.default_rng(0)
     points = random.normal(size=(3, 4, 3)).astype(np.float32)
     points[0, 1] = np.nan
-    times, views = np.array([0.0, 0.5, 1.0]), np.array(["a", "b"])
+    times = np.array([0.0, 0.5, 1.0])
+    views = np.array(["a", "b"])
     return TrueTracks(points, times, views, np.array([2, 0]), random.random((2, 4)) < 0.5)
 
 
 def test_tracks_are_read_as_written_in_scene_coordinates(tmp_path: Path) -> None:
-    capture = Capture(tmp_path, "blender", {}, world_scale=0.5, world_offset=np.array([1.0, 2.0, 3.0]))
+    capture = Capture(
+        tmp_path, "blender", {}, world_scale=0.5, world_offset=np.array([1.0, 2.0, 3.0])
+    )
     assert read_true_tracks(capture) is None
     tracks = some_tracks()
     write_true_tracks(tmp_path, tracks)

@@ -41,10 +41,13 @@ def opengl_pose(angle: float, radius: float = 4.0) -> np.ndarray:
     return pose
 
 
-def write_frames(path: Path, files: Sequence[str], fields: dict[str, object], pose_of: Callable = opengl_pose) -> None:
+def write_frames(
+    path: Path, files: Sequence[str], fields: dict[str, object], pose_of: Callable = opengl_pose
+) -> None:
     """A transforms file with one frame per name, on a circle."""
     frames = [
-        {"file_path": name, "transform_matrix": np.asarray(pose_of(0.3 * i)).tolist()} for i, name in enumerate(files)
+        {"file_path": name, "transform_matrix": np.asarray(pose_of(0.3 * i)).tolist()}
+        for i, name in enumerate(files)
     ]
     path.write_text(json.dumps({**fields, "frames": frames}))
 
@@ -57,16 +60,23 @@ def edit_json(path: Path, change: Callable[[dict], object]) -> None:
 
 
 def write_colmap(
-    root: Path, extension: str = "bin", model: str = "PINHOLE", params: Sequence[float] = (10, 11, 6, 4), count: int = 9
+    root: Path,
+    extension: str = "bin",
+    model: str = "PINHOLE",
+    params: Sequence[float] = (10, 11, 6, 4),
+    count: int = 9,
 ) -> Path:
-    """A COLMAP model with ``count`` images of 12x8 in two subfolders and five points that all of them see."""
+    """A COLMAP model with ``count`` images of 12x8 in two subfolders and five points that all of
+    them see."""
     import pycolmap
 
     scene = pycolmap.Reconstruction()
     for camera in (1, 2):
         camera_model = getattr(pycolmap.CameraModelId, model)
         scene.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=camera, model=camera_model, width=12, height=8, params=list(params))
+            pycolmap.Camera(
+                camera_id=camera, model=camera_model, width=12, height=8, params=list(params)
+            )
         )
     for i in range(count):
         name = f"{'left' if i % 2 else 'right'}/{i:02d}.jpg"
@@ -78,7 +88,9 @@ def write_colmap(
         scene.add_image_with_trivial_frame(image, pose)
     for k in range(5):
         track = pycolmap.Track([pycolmap.TrackElement(i + 1, k) for i in range(count)])
-        scene.add_point3D(np.array([k, 2.0 * k, -1.0]), track, np.array([k, 100, 200], dtype=np.uint8))
+        scene.add_point3D(
+            np.array([k, 2.0 * k, -1.0]), track, np.array([k, 100, 200], dtype=np.uint8)
+        )
     folder = root / "sparse" / "0"
     folder.mkdir(parents=True)
     (scene.write_binary if extension == "bin" else scene.write_text)(str(folder))
@@ -87,9 +99,16 @@ def write_colmap(
 
 FOCAL, WIDTH, HEIGHT = 20.0, 16, 12
 SIDE_POSE = np.array([[0.0, 0, 1, 4], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""OpenGL camera-to-world: at (4, 0, 0), looking at the origin, z up. World y runs to the right in its image."""
-SIDE_PIXELS = (((0, 0, 0), (8.0, 6.0)), ((0, 1, 0), (13.0, 6.0)), ((0, 0, 1), (8.0, 1.0)), ((2, 0.4, 0), (12.0, 6.0)))
-"""World points and where they appear (x, y) in the 16x12 image of that camera with focal length 20 px."""
+"""OpenGL camera-to-world: at (4, 0, 0), looking at the origin, z up. World y runs to the right in
+its image."""
+SIDE_PIXELS = (
+    ((0, 0, 0), (8.0, 6.0)),
+    ((0, 1, 0), (13.0, 6.0)),
+    ((0, 0, 1), (8.0, 1.0)),
+    ((2, 0.4, 0), (12.0, 6.0)),
+)
+"""World points and where they appear (x, y) in the 16x12 image of that camera with focal length 20
+px."""
 
 
 def side_poses(count: int) -> list[np.ndarray]:
@@ -103,8 +122,11 @@ def pixel_of(view: View, point: Sequence[float]) -> list[float]:
     return [x / z, y / z]
 
 
-def write_video(path: Path, count: int, fps: int = 30, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    """An MP4 whose frame i is grey of level ``level_of(i)``; the index comes first, as in videos for the web."""
+def write_video(
+    path: Path, count: int, fps: int = 30, size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> None:
+    """An MP4 whose frame i is grey of level ``level_of(i)``; the index comes first, as in videos
+    for the web."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -124,17 +146,21 @@ def cached() -> list[Path]:
 
 
 def packet_places(video: Path) -> list[tuple[int, int]]:
-    """Where the data of each image lies in the file, in order of decoding: first byte and number of bytes."""
+    """Where the data of each image lies in the file, in order of decoding: first byte and number of
+    bytes."""
     import av
 
     with av.open(str(video)) as container:
         return [
-            (packet.pos, packet.size) for packet in container.demux(video=0) if packet.size and packet.pos is not None
+            (packet.pos, packet.size)
+            for packet in container.demux(video=0)
+            if packet.size and packet.pos is not None
         ]
 
 
 def truncate_video(video: Path, packet: int) -> None:
-    """Cuts the file off in the middle of an image; the index, which comes first, still promises all of them."""
+    """Cuts the file off in the middle of an image; the index, which comes first, still promises all
+    of them."""
     place, size = packet_places(video)[packet]
     video.write_bytes(video.read_bytes()[: place + size // 2])
 
@@ -143,17 +169,31 @@ def level_of(frame: int) -> int:
     return 30 + 20 * (frame % 10)
 
 
-def write_folder(folder: Path, numbers: Sequence[int], prefix: str = "frame_", suffix: str = ".png") -> None:
+def write_folder(
+    folder: Path, numbers: Sequence[int], prefix: str = "frame_", suffix: str = ".png"
+) -> None:
     """A folder of 16x12 images, one per frame number."""
     for number in numbers:
-        write_image(folder / f"{prefix}{number:04d}{suffix}", random_pixels(HEIGHT, WIDTH, 3, seed=number))
+        write_image(
+            folder / f"{prefix}{number:04d}{suffix}", random_pixels(HEIGHT, WIDTH, 3, seed=number)
+        )
 
 
 def write_cameras_json(root: Path, names: Sequence[str], **fields: object) -> None:
     """The calibration of cameras at ``side_poses``, OpenGL."""
-    lens = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
+    lens = {
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": WIDTH / 2,
+        "cy": HEIGHT / 2,
+        "w": WIDTH,
+        "h": HEIGHT,
+    }
     poses = side_poses(len(names))
-    cameras = {name: {**lens, "transform_matrix": pose.tolist()} for name, pose in zip(names, poses, strict=True)}
+    cameras = {
+        name: {**lens, "transform_matrix": pose.tolist()}
+        for name, pose in zip(names, poses, strict=True)
+    }
     root.mkdir(parents=True, exist_ok=True)
     (root / "cameras.json").write_text(json.dumps({"cameras": cameras, **fields}))
 
@@ -170,9 +210,11 @@ def write_poses_bounds(root: Path, count: int, size: tuple[int, int] = (WIDTH, H
 
 
 def write_nerfies(root: Path, count: int = 6, factor: int = 1) -> Path:
-    """A Nerfies capture at ``side_poses``: even ids train, images are ``factor`` times smaller than cameras say."""
+    """A Nerfies capture at ``side_poses``: even ids train, images are ``factor`` times smaller than
+    cameras say."""
     names = [f"{i:06d}" for i in range(count)]
-    center, scale = np.array([1.0, -2.0, 0.5]), 0.25
+    center = np.array([1.0, -2.0, 0.5])
+    scale = 0.25
     for i, (name, pose) in enumerate(zip(names, side_poses(count), strict=True)):
         right, up, back, position = pose[:3].T
         camera = {
@@ -189,9 +231,16 @@ def write_nerfies(root: Path, count: int = 6, factor: int = 1) -> Path:
         (root / "camera").mkdir(parents=True, exist_ok=True)
         (root / "camera" / f"{name}.json").write_text(json.dumps(camera))
         write_image(root / f"rgb/{factor}x/{name}.png", random_pixels(HEIGHT, WIDTH, 3, seed=i))
-    dataset = {"count": count, "num_exemplars": len(names[::2]), "ids": names, "train_ids": names[::2]}
+    dataset = {
+        "count": count,
+        "num_exemplars": len(names[::2]),
+        "ids": names,
+        "train_ids": names[::2],
+    }
     (root / "dataset.json").write_text(json.dumps({**dataset, "val_ids": names[1::2]}))
-    ids = {name: {"warp_id": i, "appearance_id": i, "camera_id": i % 2} for i, name in enumerate(names)}
+    ids = {
+        name: {"warp_id": i, "appearance_id": i, "camera_id": i % 2} for i, name in enumerate(names)
+    }
     (root / "metadata.json").write_text(json.dumps(ids))
     scene = {"scale": scale, "center": center.tolist(), "near": 0.1, "far": 2.0}
     (root / "scene.json").write_text(json.dumps(scene))

@@ -1,4 +1,5 @@
-"""Control nodes with poses at key times: where they are, how they move, and how they come and go."""
+"""Control nodes with poses at key times: where they are, how they move, and how they come and
+go."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ from dyngs.state import tensors_of
 MEANS_ONLY = dict.fromkeys(HEADS, False)
 
 
-def control_nodes(nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object) -> ControlNodes:
+def control_nodes(
+    nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object
+) -> ControlNodes:
     """An untrained one."""
     return ControlNodes(
         ControlNodesField(nodes=nodes, pieces=pieces, **options),  # type: ignore[arg-type]
@@ -53,7 +56,8 @@ def points_of(field: ControlNodes) -> Tensor:
 
 
 def hold(field: ControlNodes, name: str, values: Tensor) -> None:
-    """Let all nodes keep ``values`` (S, size) of one head at all times: all control points are equal."""
+    """Let all nodes keep ``values`` (S, size) of one head at all times: all control points are
+    equal."""
     field.parameters[name].data[:] = values[:, None]
 
 
@@ -62,7 +66,9 @@ def outputs(offsets: Offsets) -> Tensor:
     return torch.cat([x.reshape(len(x), -1) for x in parts], dim=1)
 
 
-@pytest.mark.parametrize(("num_times", "pieces"), [(2, 1), (5, 2), (10, 3), (100, 30), (10_000, 256)])
+@pytest.mark.parametrize(
+    ("num_times", "pieces"), [(2, 1), (5, 2), (10, 3), (100, 30), (10_000, 256)]
+)
 def test_pieces_follow_the_number_of_times(num_times: int, pieces: int) -> None:
     assert control_nodes(pieces=0, num_times=num_times).num_pieces == pieces
     assert control_nodes(pieces=7, num_times=num_times).num_pieces == 7
@@ -78,10 +84,12 @@ def test_motion_is_a_cubic_spline(time: float, pieces: int, seed: int) -> None:
     field.parameters["means"].data[0] = torch.from_numpy(values).float()
     expected = BSpline((np.arange(pieces + 7) - 3) / pieces, values, 3)(time)
     found = field.offsets(means, time).means.detach()
-    # Four values of up to 5 with weights that add up to 1: 8 roundings of those; the place among up to 6 pieces is off
-    # by 3 units of 6, and the slope there at most 10. Together 80 + 180 units.
+    # Four values of up to 5 with weights that add up to 1: 8 roundings of those; the place among up
+    # to 6 pieces is off by 3 units of 6, and the slope there at most 10. Together 80 + 180 units.
     allowed = 260 * 0.5 * torch.finfo(torch.float32).eps
-    torch.testing.assert_close(found, torch.from_numpy(expected).float().expand(9, 3), rtol=0, atol=allowed)
+    torch.testing.assert_close(
+        found, torch.from_numpy(expected).float().expand(9, 3), rtol=0, atol=allowed
+    )
 
 
 def test_a_rigid_motion_of_the_nodes_is_one_of_the_gaussians() -> None:
@@ -89,7 +97,8 @@ def test_a_rigid_motion_of_the_nodes_is_one_of_the_gaussians() -> None:
     field = placed(means, nodes=6, pieces=1)
     positions = field.buffers["positions"]
     turn = Rotation.from_rotvec([0.3, -0.5, 0.9])
-    matrix, shift = torch.from_numpy(turn.as_matrix()).float(), torch.tensor([0.1, 0.2, -0.3])
+    matrix = torch.from_numpy(turn.as_matrix()).float()
+    shift = torch.tensor([0.1, 0.2, -0.3])
     hold(field, "means", positions @ matrix.T + shift - positions)
     quat = torch.from_numpy(turn.as_quat()).float().roll(1)
     hold(field, "quats", (quat - torch.tensor([1.0, 0, 0, 0])).expand(6, 4))
@@ -98,18 +107,26 @@ def test_a_rigid_motion_of_the_nodes_is_one_of_the_gaussians() -> None:
     assert float(field.penalties(1.0)["node rigidity"].detach()) < 1e-10
 
 
-# --- nodes come and go ------------------------------------------------------------------------------------------------
+# --- nodes come and go
+# ------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(1, 12), st.lists(st.lists(st.integers(0, 11), max_size=15), min_size=1, max_size=4))
-def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, sets: list[list[int]]) -> None:
-    """Never more than asked for, none twice; with as many as places every Gaussian has one of its own."""
+@given(
+    st.integers(1, 12), st.lists(st.lists(st.integers(0, 11), max_size=15), min_size=1, max_size=4)
+)
+def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(
+    nodes: int, sets: list[list[int]]
+) -> None:
+    """Never more than asked for, none twice; with as many as places every Gaussian has one of its
+    own."""
     everything = cloud(12).means
     field = placed(everything, nodes=nodes)
     index = torch.arange(12)
     for chosen in sets:
-        rows = torch.tensor([i % len(index) for i in chosen] if len(index) else [], dtype=torch.long)
+        rows = torch.tensor(
+            [i % len(index) for i in chosen] if len(index) else [], dtype=torch.long
+        )
         field = changed(field, rows, torch.zeros(len(rows), dtype=torch.bool))
         index = index[rows]
         means = everything[index]
@@ -117,7 +134,8 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, 
         assert offsets.means.shape == (len(index), 3)
         if len(index) == 0:
             continue
-        positions, followed = field.buffers["positions"], field.buffers["followed"]
+        positions = field.buffers["positions"]
+        followed = field.buffers["followed"]
         assert 1 <= len(positions) <= nodes
         assert len(positions.unique(dim=0)) == len(positions) == len(field.parameters["means"])
         assert followed.max() < len(positions)
@@ -128,7 +146,8 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, 
 
 def test_an_edited_field_leaves_the_other_as_it_was() -> None:
     """Also when nodes are placed anew: a scene and its parts may be drawn in turns."""
-    means, rows = cloud().means, torch.tensor([2, 5, 5, 7])
+    means = cloud().means
+    rows = torch.tensor([2, 5, 5, 7])
     field = stirred_field("control_nodes")
     before = outputs(field.offsets(means, 0.3))
     part = field.edited(TopologyEdit.select(rows))
@@ -144,7 +163,8 @@ def test_new_nodes_start_with_the_motion_found_there() -> None:
     field = placed(means[:10], nodes=20, pieces=2)
     assert len(field.buffers["positions"]) == 10
     turn = Rotation.from_rotvec([0.0, 0.0, 0.8])
-    matrix, positions = torch.from_numpy(turn.as_matrix()).float(), field.buffers["positions"]
+    matrix = torch.from_numpy(turn.as_matrix()).float()
+    positions = field.buffers["positions"]
     hold(field, "means", positions @ matrix.T - positions)
     quat = torch.from_numpy(turn.as_quat()).float().roll(1)
     hold(field, "quats", (quat - torch.tensor([1.0, 0, 0, 0])).expand(10, 4))
@@ -166,7 +186,9 @@ def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
     field = changed(field, torch.tensor([0]), torch.tensor([False]))
     field.offsets(means[:1], 0.5)
     assert field.buffers["positions"].tolist() == [[-1.0, 0.0, 0.0]]
-    assert all(torch.equal(x, old[name][None]) for name, x in tensors_of(field.parameters.state()).items())
+    assert all(
+        torch.equal(x, old[name][None]) for name, x in tensors_of(field.parameters.state()).items()
+    )
     field = changed(field, torch.tensor([0, 0]), torch.tensor([False, True]))
     field.offsets(means[[0, 2]], 0.5)
     state = tensors_of(field.parameters.state())
@@ -195,17 +217,21 @@ def test_nodes_stay_while_the_set_does() -> None:
     assert all(torch.equal(x, before[name]) for name, x in field.buffers.items())
 
 
-# --- times not seen yet -----------------------------------------------------------------------------------------------
+# --- times not seen yet
+# -----------------------------------------------------------------------------------------------
 
 
 def test_motion_goes_on_at_constant_velocity() -> None:
-    """That of the last two intervals on either side; the outermost points of what was seen do not count."""
+    """That of the last two intervals on either side; the outermost points of what was seen do not
+    count."""
     field = placed(cloud().means, pieces=10)
     field.parameters["means"].data[0, :, 0] = torch.tensor([-7.0] * 5 + [3, 4, 6, 7] + [-7] * 4)
     field.extend((0.4, 0.6), (0.2, 0.8))
     assert points_of(field).tolist() == [-4.5, -3, -1.5, 0, 1.5, 3, 4, 6, 7.5, 9, 10.5, 12, 13.5]
     field.extend((0.0, 1.0), (0.0, 1.0))
-    assert points_of(field)[[0, -1]].tolist() == [-4.5, 13.5], "with all times seen the ends are free"
+    assert points_of(field)[[0, -1]].tolist() == [-4.5, 13.5], (
+        "with all times seen the ends are free"
+    )
 
 
 def test_of_a_single_moment_there_is_no_velocity() -> None:
@@ -237,7 +263,8 @@ def test_uniform_motion_goes_on(pieces: int, strays: list[float]) -> None:
         torch.testing.assert_close(points_of(field), uniform)
 
 
-# --- penalties --------------------------------------------------------------------------------------------------------
+# --- penalties
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_uniform_motion_has_no_acceleration_and_a_shift_no_strain() -> None:
@@ -250,7 +277,8 @@ def test_uniform_motion_has_no_acceleration_and_a_shift_no_strain() -> None:
 
 
 def test_known_penalties() -> None:
-    """Two nodes 2 apart; one control point is 6 farther away: in the middle of the piece 1/6 of that counts."""
+    """Two nodes 2 apart; one control point is 6 farther away: in the middle of the piece 1/6 of
+    that counts."""
     means = torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
     field = placed(means, nodes=2, pieces=1, rigidity=1.0)
     right = int(field.buffers["positions"][:, 0].argmax())
@@ -258,7 +286,9 @@ def test_known_penalties() -> None:
     assert float(field.penalties(0.0)["node rigidity"].detach()) == pytest.approx(0.25)
     assert float(field.penalties(1.0)["node rigidity"].detach()) == 0.0
     acceleration = 3**2 / 12  # second differences 6 / 2 and 0 along one of 2 x 3 coordinates
-    assert float(field.penalties(0.5)["node acceleration"].detach()) == pytest.approx(SMOOTHNESS * acceleration)
+    assert float(field.penalties(0.5)["node acceleration"].detach()) == pytest.approx(
+        SMOOTHNESS * acceleration
+    )
     field.penalties(0.0)["node rigidity"].backward()
     grad = field.parameters["means"].grad
     assert grad is not None
@@ -280,4 +310,5 @@ def test_the_place_of_a_gaussian_matters() -> None:
     assert not torch.allclose(found, outputs(field.offsets(cloud().means, 0.1)))
 
 
-# --- rigid groups -----------------------------------------------------------------------------------------------------
+# --- rigid groups
+# -----------------------------------------------------------------------------------------------------

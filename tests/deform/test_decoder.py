@@ -33,7 +33,8 @@ def test_heads_by_name(chosen: tuple[bool, ...]) -> None:
     sizes = {name: size for name, size in SIZES.items() if is_on[name]}
     assert dict(head_sizes(options)) == sizes
     outputs = torch.arange(2.0 * sum(sizes.values())).reshape(2, -1)
-    found, column = vars(split_heads(outputs, options)), 0
+    found = vars(split_heads(outputs, options))
+    column = 0
     for name, size in SIZES.items():
         if not is_on[name]:
             assert found[name] is None
@@ -43,7 +44,9 @@ def test_heads_by_name(chosen: tuple[bool, ...]) -> None:
         column += size
 
 
-@pytest.mark.parametrize(("hidden", "skip"), [([7], None), ([6, 4, 9], None), ([6, 4, 9], 2), ([4, 4], 1)])
+@pytest.mark.parametrize(
+    ("hidden", "skip"), [([7], None), ([6, 4, 9], None), ([6, 4, 9], 2), ([4, 4], 1)]
+)
 def test_it_is_a_plain_perceptron(hidden: list[int], skip: int | None) -> None:
     decoder, learned = decoder_with(hidden, skip=skip)
     features = torch.randn((11, 5), generator=torch.Generator().manual_seed(2))
@@ -66,13 +69,16 @@ def test_it_starts_at_zero_with_weights_of_glorot(skip: int | None) -> None:
         assert weight.shape[1] == fan_in
         bound = math.sqrt(6 / sum(weight.shape))
         assert 0.9 * bound < weight.abs().max() <= bound
-        assert float(weight.var()) == pytest.approx(bound**2 / 3, rel=0.15)  # of some thousand numbers
+        # of some thousand numbers
+        assert float(weight.var()) == pytest.approx(bound**2 / 3, rel=0.15)
     learned = Parameters(values, dict.fromkeys(values, 1.0))
     assert not decoder(torch.randn(4, 20), learned).any()
 
 
 def test_the_generator_decides_the_weights() -> None:
     decoder = Decoder(3, [4], FieldSection())
-    first, second, other = (decoder.start_values(torch.Generator().manual_seed(seed)) for seed in (5, 5, 6))
+    first, second, other = (
+        decoder.start_values(torch.Generator().manual_seed(seed)) for seed in (5, 5, 6)
+    )
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert not torch.equal(first["weight0"], other["weight0"])

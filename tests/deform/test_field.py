@@ -22,7 +22,10 @@ ATTRIBUTES = ["quats", "log_scales", "logit_opacities", "colors"]
 
 def some_offsets(count: int, dtype: torch.dtype = torch.float32, seed: int = 1) -> Offsets:
     generator = torch.Generator().manual_seed(seed)
-    values = {k: 0.3 * torch.randn((count, *s), generator=generator, dtype=dtype) for k, s in SHAPES.items()}
+    values = {
+        k: 0.3 * torch.randn((count, *s), generator=generator, dtype=dtype)
+        for k, s in SHAPES.items()
+    }
     return Offsets(**values)
 
 
@@ -34,7 +37,8 @@ def rotations(quats: Tensor) -> Rotation:
 @pytest.mark.parametrize("everything", [True, False])
 def test_every_field_starts_as_the_identity(kind: str, everything: bool) -> None:
     """Bitwise, at any time, whatever it may move."""
-    gaussians, field = cloud(), tiny_field(kind, everything=everything)
+    gaussians = cloud()
+    field = tiny_field(kind, everything=everything)
     for time in TIMES:
         moved = deformed(gaussians, field.offsets(gaussians.means, time))
         for name, x in gaussians.tensors().items():
@@ -47,20 +51,29 @@ def test_a_field_moves_just_the_attributes_it_may(kind: str) -> None:
     for everything in (True, False):
         field = stirred_field(kind, everything=everything)
         moved = deformed(gaussians, field.offsets(gaussians.means, 0.37))
-        changed = {name for name, x in gaussians.tensors().items() if not torch.equal(getattr(moved, name), x)}
-        assert changed == ({"means", "quats", "log_scales", "logit_opacities", "sh"} if everything else {"means"})
+        changed = {
+            name
+            for name, x in gaussians.tensors().items()
+            if not torch.equal(getattr(moved, name), x)
+        }
+        assert changed == (
+            {"means", "quats", "log_scales", "logit_opacities", "sh"} if everything else {"means"}
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_reach_all_that_is_learned(kind: str) -> None:
-    """After some training; before it the last layer is zero, and it alone learns in the first step."""
+    """After some training; before it the last layer is zero, and it alone learns in the first
+    step."""
     gaussians = cloud()
     for field, trained in ((stirred_field(kind), True), (tiny_field(kind), False)):
         outputs = [x for x in vars(field.offsets(gaussians.means, 0.37)).values() if x is not None]
         torch.stack([(x * weights(x)).sum() for x in outputs]).sum().backward()
         names = list(field.parameters.values())
         reached = {
-            name for name in names if field.parameters[name].grad is not None and field.parameters[name].grad.any()
+            name
+            for name in names
+            if field.parameters[name].grad is not None and field.parameters[name].grad.any()
         }
         first = set(names[-2:]) if kind in ("hexplane", "mlp") else set(names)
         assert reached == (set(names) if trained else first)
@@ -80,8 +93,11 @@ def test_gradients_reach_the_canonical_gaussians(kind: str) -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.sets(st.integers(0, 8)), st.sets(st.sampled_from(ATTRIBUTES)))
 def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: set[str]) -> None:
-    gaussians, rows = cloud(), torch.tensor(sorted(chosen), dtype=torch.long)
-    offsets = Offsets(**{k: None if k in absent else x for k, x in vars(some_offsets(len(rows))).items()})
+    gaussians = cloud()
+    rows = torch.tensor(sorted(chosen), dtype=torch.long)
+    offsets = Offsets(
+        **{k: None if k in absent else x for k, x in vars(some_offsets(len(rows))).items()}
+    )
     moved = deformed(gaussians, offsets, rows)
     alone = deformed(gaussians.select(rows), offsets)
     others = torch.tensor([i for i in range(9) if i not in chosen], dtype=torch.long)
@@ -103,8 +119,12 @@ def test_values_and_gradients_are_those_of_plain_torch(
     given = vars(some_offsets(9 if rows is None else len(rows), dtype)).items()
     found: list[list[Tensor]] = []
     for move in (deformed, slowly_deformed):
-        leaves = {name: x.to(dtype).clone().requires_grad_() for name, x in cloud().tensors().items()}
-        offsets = {name: None if name in absent else x.clone().requires_grad_() for name, x in given}
+        leaves = {
+            name: x.to(dtype).clone().requires_grad_() for name, x in cloud().tensors().items()
+        }
+        offsets = {
+            name: None if name in absent else x.clone().requires_grad_() for name, x in given
+        }
         moved = move(Gaussians(**leaves), Offsets(**offsets), rows).tensors().values()
         weighted = torch.stack([(x * weights(x)).sum() for x in moved]).sum()
         weighted.backward()
@@ -118,14 +138,17 @@ def test_values_and_gradients_are_those_of_plain_torch(
 
 
 def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
-    """Return (M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
+    """Return (M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product,
+    not normalised."""
     return quat_product(offsets + identity_quat(offsets), quats)
 
 
 def slowly_deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None) -> Gaussians:
     """``deformed`` by torch's own operators."""
     rows = torch.arange(len(gaussians)) if rows is None else rows
-    sh, quats, changes = gaussians.sh, gaussians.quats, dict[str, Tensor]()
+    sh = gaussians.sh
+    quats = gaussians.quats
+    changes = dict[str, Tensor]()
     for name in ("means", "log_scales", "logit_opacities"):
         offset = getattr(offsets, name)
         if offset is not None:
@@ -133,7 +156,9 @@ def slowly_deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None)
     if offsets.quats is not None:
         changes["quats"] = quats.index_copy(0, rows, turned_quats(quats[rows], offsets.quats))
     if offsets.colors is not None:
-        changes["sh"] = torch.cat([sh[:, 0].index_add(0, rows, offsets.colors)[:, None], sh[:, 1:]], dim=1)
+        changes["sh"] = torch.cat(
+            [sh[:, 0].index_add(0, rows, offsets.colors)[:, None], sh[:, 1:]], dim=1
+        )
     return gaussians.replace(**changes)
 
 
@@ -144,7 +169,8 @@ def test_a_row_that_does_not_exist_is_refused(row: int) -> None:
 
 
 def test_each_offset_is_added_to_its_own_attribute() -> None:
-    gaussians, offsets = cloud(), some_offsets(9)
+    gaussians = cloud()
+    offsets = some_offsets(9)
     moved = deformed(gaussians, offsets)
     assert offsets.log_scales is not None
     assert offsets.logit_opacities is not None
@@ -172,15 +198,22 @@ def test_gradcheck_of_deformed(rows: tuple[int, ...] | None) -> None:
     gaussians = Gaussians(**{k: x.double() for k, x in cloud(4).tensors().items()})
     index = None if rows is None else torch.tensor(rows)
     offsets = some_offsets(4 if rows is None else len(rows), torch.float64)
-    leaves = [x.detach().requires_grad_() for x in (*gaussians.tensors().values(), *vars(offsets).values())]
+    leaves = [
+        x.detach().requires_grad_()
+        for x in (*gaussians.tensors().values(), *vars(offsets).values())
+    ]
 
     def moved(*tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(deformed(Gaussians(*tensors[:5]), Offsets(*tensors[5:]), index).tensors().values())
+        return tuple(
+            deformed(Gaussians(*tensors[:5]), Offsets(*tensors[5:]), index).tensors().values()
+        )
 
     assert torch.autograd.gradcheck(moved, leaves)
 
 
 def test_the_box_is_minus_one_to_one() -> None:
     setup = tiny_setup()
-    corners = torch.stack([setup.center - setup.half_size, setup.center, setup.center + setup.half_size])
+    corners = torch.stack(
+        [setup.center - setup.half_size, setup.center, setup.center + setup.half_size]
+    )
     assert torch.equal(setup.normalized(corners), torch.tensor([[-1.0], [0.0], [1.0]]).expand(3, 3))

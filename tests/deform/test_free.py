@@ -20,8 +20,12 @@ from dyngs.gaussians import TopologyEdit
 GAP = 1 / 9  # ``tiny_setup`` has ten times
 
 
-def field_of(centers: list[float], spans: list[float], velocities: list[list[float]]) -> FreePrimitives:
-    start = FreeStart(torch.zeros(0), (), torch.tensor(centers), torch.tensor(spans), torch.tensor(velocities))
+def field_of(
+    centers: list[float], spans: list[float], velocities: list[list[float]]
+) -> FreePrimitives:
+    start = FreeStart(
+        torch.zeros(0), (), torch.tensor(centers), torch.tensor(spans), torch.tensor(velocities)
+    )
     return FreePrimitives(FreeField(), tiny_setup(len(centers)), torch.Generator()).started(start)
 
 
@@ -32,7 +36,8 @@ def opacity(field: FreePrimitives, logit: float, time: float) -> float:
 
 
 def test_what_is_opaque_is_so_for_most_of_its_window() -> None:
-    """Of opacity 0.98 it is above 0.9 up to 1.8 spans, below 1/255 from 4.4 on; a faint one fades like a Gaussian."""
+    """Of opacity 0.98 it is above 0.9 up to 1.8 spans, below 1/255 from 4.4 on; a faint one fades
+    like a Gaussian."""
     field = field_of([0.5], [0.1], [[0.0, 0.0, 0.0]])
     assert opacity(field, 4.0, 0.5) == pytest.approx(0.982, abs=1e-3)
     assert opacity(field, 4.0, 0.5 + 0.18) > 0.9
@@ -65,20 +70,26 @@ def test_paths_are_straight_and_windows_follow_their_definition() -> None:
 
 
 def test_new_gaussians_are_earlier_and_later_on_the_same_path() -> None:
-    """Two of one source get both signs, all stay within the clip, and those that were there before keep theirs."""
+    """Two of one source get both signs, all stay within the clip, and those that were there before
+    keep theirs."""
     field = field_of([0.5, 0.0], [0.1, 0.1], [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
-    edit = TopologyEdit(torch.tensor([1, 0, 0, 1, 1]), torch.tensor([False, True, True, True, True]))
+    edit = TopologyEdit(
+        torch.tensor([1, 0, 0, 1, 1]), torch.tensor([False, True, True, True, True])
+    )
     children = field.edited(edit)
     centers = children.parameters["centers"].detach()[:, 0]
     assert sorted(centers[1:3].tolist()) == pytest.approx([0.45, 0.55])
     assert centers[0] == 0
     assert sorted(centers[3:].tolist()) == pytest.approx([0.0, 0.05])
-    moved, before = (x.offsets(torch.zeros(5, 3)[: len(x.parameters["centers"])], 0.7) for x in (children, field))
+    moved, before = (
+        x.offsets(torch.zeros(5, 3)[: len(x.parameters["centers"])], 0.7) for x in (children, field)
+    )
     torch.testing.assert_close(moved.means[1:3], before.means[:1].expand(2, 3))
 
 
 def test_what_a_step_does_not_show_rests() -> None:
-    """Not even Adam's momentum moves it: of two Gaussians only the one with a gradient is updated."""
+    """Not even Adam's momentum moves it: of two Gaussians only the one with a gradient is
+    updated."""
     field = field_of([0.2, 0.8], [0.1, 0.1], [[0.0, 0.0, 0.0]] * 2)
     for step in range(1, 4):
         shown = slice(0, 2) if step == 1 else slice(0, 1)
@@ -93,7 +104,9 @@ def test_what_a_step_does_not_show_rests() -> None:
 
 
 def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times() -> None:
-    still, thing, others = cloud(3), cloud(5), cloud(4)
+    still = cloud(3)
+    thing = cloud(5)
+    others = cloud(4)
     velocity = torch.tensor([1.0, 0.0, 2.0])
     start = free_start(still, [Moment(0.25, thing, velocity)], others, num_times=10)
     assert [len(x) for x in start.added] == [3] * 9 + [5, 4]
@@ -107,12 +120,25 @@ def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times(
 
 
 def test_a_rolling_ball_before_fixed_cameras_is_learned(tmp_path: Path) -> None:
-    """What moves, from views between the cameras: 14.8 dB, and 11.3 with control nodes, after as many steps."""
-    options = DynamicOptions(size=56, num_times=6, num_cameras=8, num_test=6, samples=1, style="fixed")
+    """What moves, from views between the cameras: 14.8 dB, and 11.3 with control nodes, after as
+    many steps."""
+    options = DynamicOptions(
+        size=56, num_times=6, num_cameras=8, num_test=6, samples=1, style="fixed"
+    )
     capture = write_dynamic_capture("roll", tmp_path / "capture", options)
-    keys = ["train.steps=360", "train.initial_downscale=1", "train.alpha_weight=0.1", "model.choose=false"]
+    keys = [
+        "train.steps=360",
+        "train.initial_downscale=1",
+        "train.alpha_weight=0.1",
+        "model.choose=false",
+    ]
     keys += ["model.deform.kind=free", "model.num_random_moving=400", "strategy.max_gaussians=3000"]
-    places = [f"data.root={capture}", f"run.dir={tmp_path / 'run'}", "run.threads=1", "init.num_random=1000"]
+    places = [
+        f"data.root={capture}",
+        f"run.dir={tmp_path / 'run'}",
+        "run.threads=1",
+        "init.num_random=1000",
+    ]
     train(load_config("dynamic", [*places, *keys]))
     found = evaluate_run(tmp_path / "run").psnr_moving
     assert found is not None

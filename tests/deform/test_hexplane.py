@@ -1,4 +1,5 @@
-"""Planes: what they start from, what lies outside them, and how they continue to times not seen yet."""
+"""Planes: what they start from, what lies outside them, and how they continue to times not seen
+yet."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ def rows_of(field: Hexplane) -> list[float]:
     """The number in each row, which must be the same in all its places."""
     found = torch.stack([level.time.detach()[:, :, 0, 0] for level in field.levels])
     for level in field.levels:
-        assert torch.equal(level.time.detach(), level.time.detach()[:, :, :1, :1].expand_as(level.time))
+        assert torch.equal(
+            level.time.detach(), level.time.detach()[:, :, :1, :1].expand_as(level.time)
+        )
     assert (found == found[:1, :1]).all()
     return found[0, 0].tolist()
 
@@ -41,7 +44,9 @@ def outputs_at(field: Hexplane, means: Tensor, time: float) -> Tensor:
     return torch.cat([x.detach().reshape(len(means), -1) for x in offsets if x is not None], dim=1)
 
 
-@pytest.mark.parametrize(("num_times", "rows"), [(2, 2), (3, 2), (4, 2), (5, 3), (48, 24), (300, 150)])
+@pytest.mark.parametrize(
+    ("num_times", "rows"), [(2, 2), (3, 2), (4, 2), (5, 3), (48, 24), (300, 150)]
+)
 def test_half_as_many_rows_as_times_and_at_least_two(num_times: int, rows: int) -> None:
     assert time_rows(HexplaneField(), num_times) == rows
     assert time_rows(HexplaneField(time_resolution=25), num_times) == 25
@@ -69,9 +74,11 @@ def test_outside_the_box_the_field_is_that_of_its_border() -> None:
 
 
 def test_the_field_depends_on_place_and_time_smoothly() -> None:
-    field, means = stirred_field("hexplane"), cloud().means
+    field = stirred_field("hexplane")
+    means = cloud().means
     assert isinstance(field, Hexplane)
-    here, later = outputs_at(field, means, 0.4), outputs_at(field, means, 0.4001)
+    here = outputs_at(field, means, 0.4)
+    later = outputs_at(field, means, 0.4001)
     assert 0 < (later - here).abs().max() < 1e-2
     moved = outputs_at(field, means + 1e-4, 0.4)
     assert 0 < (moved - here).abs().max() < 1e-2
@@ -86,7 +93,8 @@ def test_the_last_time_is_the_last_row() -> None:
     for level in field.levels:
         level.time.data[:, 1:-1] += 1.0
     for x, time in zip(ends, (0.0, 1.0), strict=True):
-        torch.testing.assert_close(outputs_at(field, means, time), x)  # x0 + (x1 - x0) is not x1 to the last bit
+        # x0 + (x1 - x0) is not x1 to the last bit
+        torch.testing.assert_close(outputs_at(field, means, time), x)
     for level in field.levels:
         level.time.data[:, 0] += 1.0
     torch.testing.assert_close(outputs_at(field, means, 1.0), ends[1])
@@ -108,9 +116,12 @@ def test_extend_copies_the_outermost_trained_rows_to_the_next() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(2, 40), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
-def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(rows: int, strays: list[float]) -> None:
+def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(
+    rows: int, strays: list[float]
+) -> None:
     """For any sequence of growing windows around the middle, up to the whole clip."""
-    field, last = field_with_rows(rows), rows - 1
+    field = field_with_rows(rows)
+    last = rows - 1
     windows = [(0.5 - x, 0.5 + x) for x in (*sorted(strays), 0.5)]
     for seen, soon in pairwise(windows):
         before = rows_of(field)
@@ -138,7 +149,8 @@ def test_extend_makes_the_motion_stand_still_beyond_what_was_seen() -> None:
 
 
 def test_penalties_vanish_on_smooth_planes_only() -> None:
-    """Second differences of planes that are linear in each axis, and the distance of the planes with time from 1."""
+    """Second differences of planes that are linear in each axis, and the distance of the planes
+    with time from 1."""
     field = tiny_field("hexplane")
     assert isinstance(field, Hexplane)
     for level in field.levels:
@@ -160,11 +172,16 @@ def test_select_changes_nothing() -> None:
     field = stirred_field("hexplane")
     before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
     field = field.edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
-    assert all(torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items())
+    assert all(
+        torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items()
+    )
 
 
 @pytest.mark.parametrize(
-    ("num_times", "keys"), [(0, 2), (1, 2), (2, 2), (5, 3), (48, 24), (511, 256), (513, 256), (10**6, 256)]
+    ("num_times", "keys"),
+    [(0, 2), (1, 2), (2, 2), (5, 3), (48, 24), (511, 256), (513, 256), (10**6, 256)],
 )
-def test_time_is_divided_half_as_finely_but_into_no_more_than_256(num_times: int, keys: int) -> None:
+def test_time_is_divided_half_as_finely_but_into_no_more_than_256(
+    num_times: int, keys: int
+) -> None:
     assert time_rows(HexplaneField(), num_times) == keys

@@ -13,13 +13,20 @@ from dyngs.kinds import assemble
 
 
 @pytest.mark.parametrize(
-    ("steps", "minutes", "count"), [(49, "null", None), (400, "null", 8), (3000, "null", 16), (3000, "0.2", 4)]
+    ("steps", "minutes", "count"),
+    [(49, "null", None), (400, "null", 8), (3000, "null", 16), (3000, "0.2", 4)],
 )
 def test_bodies_are_sought_in_as_many_images_as_the_run_is_long(
     moving: Path, steps: int, minutes: str, count: int | None
 ) -> None:
-    """The search is to take at most a tenth of the run: of the capture's 16 images a short run looks at fewer."""
-    keys = (f"data.root={moving}", f"train.steps={steps}", f"train.minutes={minutes}", "init.num_random=20")
+    """The search is to take at most a tenth of the run: of the capture's 16 images a short run
+    looks at fewer."""
+    keys = (
+        f"data.root={moving}",
+        f"train.steps={steps}",
+        f"train.minutes={minutes}",
+        "init.num_random=20",
+    )
     model = assemble(dyngs.load_config("dynamic", keys)).model
     assert isinstance(model, GaussianModel)
     assert isinstance(model.training, DynamicTraining)

@@ -29,7 +29,9 @@ def test_the_encoding_has_known_values() -> None:
     assert torch.equal(encoded(x, 0), x)
 
 
-@pytest.mark.parametrize(("depth", "skips"), [(2, False), (SKIP_LAYER, False), (SKIP_LAYER + 1, True), (8, True)])
+@pytest.mark.parametrize(
+    ("depth", "skips"), [(2, False), (SKIP_LAYER, False), (SKIP_LAYER + 1, True), (8, True)]
+)
 def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
     field = Mlp(MlpField(depth=depth, width=6), tiny_setup(), torch.Generator())
     num_inputs = 3 * (1 + 2 * 10) + 1 + 2 * 6
@@ -42,8 +44,12 @@ def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
 
 
 def test_it_depends_on_place_and_time() -> None:
-    field, means = stirred_field("mlp"), cloud().means
-    at_times = [torch.cat([x.reshape(9, -1) for x in outputs(field.offsets(means, t))], dim=1) for t in TIMES]
+    field = stirred_field("mlp")
+    means = cloud().means
+    at_times = [
+        torch.cat([x.reshape(9, -1) for x in outputs(field.offsets(means, t))], dim=1)
+        for t in TIMES
+    ]
     assert not torch.allclose(at_times[0], at_times[1])
     assert not torch.allclose(at_times[1], at_times[2])
     assert not torch.allclose(at_times[1][0], at_times[1][1])
@@ -61,5 +67,7 @@ def test_extend_and_select_change_no_weight() -> None:
     before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
     field.extend((0.4, 0.6), (0.0, 1.0))
     field = field.edited(TopologyEdit(torch.tensor([1, 1]), torch.tensor([False, True])))
-    assert all(torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items())
+    assert all(
+        torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items()
+    )
     assert field.penalties(0.3) == {}

@@ -1,4 +1,5 @@
-"""Motion in pixels: known displacements give known scores, and what does not move is frozen where it is."""
+"""Motion in pixels: known displacements give known scores, and what does not move is frozen where
+it is."""
 
 from __future__ import annotations
 
@@ -64,14 +65,19 @@ def test_a_constant_offset_is_no_motion() -> None:
     def constant(means: Tensor, t: float) -> Offsets:
         n = len(means)
         return Offsets(
-            filled(n, 5.0, -3, 1), filled(n, 0.1, 0.2, 0.3, 0.4), filled(n, 1.0, 1, 1), torch.ones(n), still(means)
+            filled(n, 5.0, -3, 1),
+            filled(n, 0.1, 0.2, 0.3, 0.4),
+            filled(n, 1.0, 1, 1),
+            torch.ones(n),
+            still(means),
         )
 
     assert score(constant).abs().max() < 1e-5
 
 
 def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
-    """A turn by 0.02 rad moves the end of the longest axis by 0.02 of its length; q there is (0, 0, 0, 0.01)."""
+    """A turn by 0.02 rad moves the end of the longest axis by 0.02 of its length; q there is (0, 0,
+    0, 0.01)."""
     longest = cloud(4).scales.amax(1)
 
     def turn(means: Tensor, t: float) -> Offsets:
@@ -95,7 +101,9 @@ def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
 
     px_size = torch.tensor([0.01, 0.1, 1.0, 0.3])
     logits = gaussians.logit_opacities
-    change = torch.maximum((logits + 1).sigmoid() - logits.sigmoid(), logits.sigmoid() - (logits - 1).sigmoid())
+    change = torch.maximum(
+        (logits + 1).sigmoid() - logits.sigmoid(), logits.sigmoid() - (logits - 1).sigmoid()
+    )
     torch.testing.assert_close(score(fade, px_size), PX_PER_OPACITY * change)
     torch.testing.assert_close(score(blush, px_size), torch.full((4,), 0.1 * PX_PER_OPACITY))
 
@@ -123,7 +131,9 @@ def test_baking_freezes_at_the_mean(everything: bool) -> None:
     torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))
     rows = torch.tensor([1, 4, 8])
     expected = deformed(gaussians, mean.select(rows), rows)
-    baked = gaussians.replace(**{k: x.clone().requires_grad_() for k, x in gaussians.tensors().items()})
+    baked = gaussians.replace(
+        **{k: x.clone().requires_grad_() for k, x in gaussians.tensors().items()}
+    )
     bake_(baked, rows, mean.select(rows))
     for name, x in expected.tensors().items():
         assert torch.equal(getattr(baked, name).detach(), x), name
@@ -136,7 +146,10 @@ def test_baking_freezes_at_the_mean(everything: bool) -> None:
 
 def test_an_empty_set_has_no_motion() -> None:
     motion = measure_motion(
-        Scripted(lambda means, t: Offsets(still(means))), cloud().select(torch.zeros(0).long()), TIMES, torch.zeros(0)
+        Scripted(lambda means, t: Offsets(still(means))),
+        cloud().select(torch.zeros(0).long()),
+        TIMES,
+        torch.zeros(0),
     )
     assert motion.pixels.shape == (0,)
     assert motion.mean.means.shape == (0, 3)

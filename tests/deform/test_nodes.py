@@ -15,7 +15,9 @@ from dyngs.deform.nodes import FOLLOWED, Nodes, nodes_at, spread_out, turned
 
 
 def points(count: int, seed: int = 0) -> Tensor:
-    return torch.randn((count, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.randn(
+        (count, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
 
 
 def rigid(seed: int) -> tuple[Rotation, Tensor, Tensor]:
@@ -41,14 +43,18 @@ IDENTITY = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 12), st.integers(0, 10_000))
-def test_a_rigid_motion_of_the_nodes_moves_all_followers_rigidly(count: int, num_nodes: int, seed: int) -> None:
+def test_a_rigid_motion_of_the_nodes_moves_all_followers_rigidly(
+    count: int, num_nodes: int, seed: int
+) -> None:
     means = points(count, seed)
     nodes = place_nodes(means, num_nodes)
     rotation, quat, shift = rigid(seed)
     target = nodes.positions @ matrix(rotation).T + shift
     at_nodes = Offsets(target - nodes.positions, (quat - IDENTITY).expand(len(target), 4))
     moved = followed(nodes, means, at_nodes)
-    torch.testing.assert_close(means + moved.means, means @ matrix(rotation).T + shift, rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        means + moved.means, means @ matrix(rotation).T + shift, rtol=0, atol=1e-9
+    )
     assert moved.quats is not None
     torch.testing.assert_close(moved.quats, (quat - IDENTITY).expand(count, 4), rtol=0, atol=1e-12)
 
@@ -87,7 +93,11 @@ def test_all_other_offsets_are_blended() -> None:
     nodes = place_nodes(means, 5)
     values = torch.arange(5.0, dtype=torch.float64)
     at_nodes = Offsets(
-        torch.zeros(5, 3).double(), None, values[:, None].expand(5, 3), values, -values[:, None].expand(5, 3)
+        torch.zeros(5, 3).double(),
+        None,
+        values[:, None].expand(5, 3),
+        values,
+        -values[:, None].expand(5, 3),
     )
     moved = followed(nodes, means, at_nodes)
     expected = (nodes.weights(means) * values[nodes.followed]).sum(1)
@@ -99,7 +109,9 @@ def test_all_other_offsets_are_blended() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), min_size=1, max_size=20), st.integers(1, 25))
-def test_points_spread_out_are_distinct_and_the_same_each_time(places: list[tuple[int, ...]], count: int) -> None:
+def test_points_spread_out_are_distinct_and_the_same_each_time(
+    places: list[tuple[int, ...]], count: int
+) -> None:
     """Also where many points coincide: there are as many as asked for, or as there are places."""
     x = torch.tensor(places, dtype=torch.float64)
     chosen = spread_out(x, count, NONE)
@@ -131,7 +143,9 @@ def test_few_nodes(means: Tensor, num_nodes: int, dtype: torch.dtype) -> None:
     assert nodes.positions.dtype == nodes.radii.dtype == dtype
     assert nodes.followed.shape == (len(means), min(count, FOLLOWED))
     assert (nodes.radii > 0).all()
-    moved = followed(nodes, means, Offsets(torch.ones(count, 3, dtype=dtype), torch.zeros(count, 4, dtype=dtype)))
+    moved = followed(
+        nodes, means, Offsets(torch.ones(count, 3, dtype=dtype), torch.zeros(count, 4, dtype=dtype))
+    )
     torch.testing.assert_close(moved.means, torch.ones(len(means), 3, dtype=dtype))
 
 
@@ -141,13 +155,18 @@ def test_turned_is_a_rotation(seed: int) -> None:
     rotation, quat, _ = rigid(seed)
     vectors = points(4, seed + 1)
     offsets = (quat - IDENTITY).expand(4, 4)
-    torch.testing.assert_close(turned(offsets, vectors), vectors @ matrix(rotation).T, rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        turned(offsets, vectors), vectors @ matrix(rotation).T, rtol=0, atol=1e-12
+    )
     assert torch.equal(turned(torch.zeros_like(offsets), vectors), vectors)
-    assert torch.equal(turned(-IDENTITY.expand(4, 4), vectors), vectors), "a zero quaternion turns nothing"
+    assert torch.equal(turned(-IDENTITY.expand(4, 4), vectors), vectors), (
+        "a zero quaternion turns nothing"
+    )
 
 
 def test_new_points_keep_away_from_those_taken() -> None:
-    """On a line of eleven with both ends taken: the middle, then the quarters; never a place that is taken."""
+    """On a line of eleven with both ends taken: the middle, then the quarters; never a place that
+    is taken."""
     x = torch.zeros(11, 3, dtype=torch.float64)
     x[:, 0] = torch.arange(11)
     chosen = spread_out(x, 3, x[[0, 10]]).tolist()
@@ -159,12 +178,16 @@ def test_new_points_keep_away_from_those_taken() -> None:
 
 
 def test_gradients_of_follow() -> None:
-    """By the nodes' offsets in double; by the place with constant weights: in a rigid motion the rotation."""
+    """By the nodes' offsets in double; by the place with constant weights: in a rigid motion the
+    rotation."""
     means = points(4)
     nodes = place_nodes(means, 3)
     generator = torch.Generator().manual_seed(1)
     shapes = ((3, 3), (3, 4), (3, 3), (3,), (3, 3))
-    leaves = [(0.3 * torch.randn(s, generator=generator, dtype=torch.float64)).requires_grad_() for s in shapes]
+    leaves = [
+        (0.3 * torch.randn(s, generator=generator, dtype=torch.float64)).requires_grad_()
+        for s in shapes
+    ]
 
     def moved(*at_nodes: Tensor) -> tuple[Tensor, ...]:
         return tuple(vars(followed(nodes, means, Offsets(*at_nodes))).values())
@@ -173,6 +196,9 @@ def test_gradients_of_follow() -> None:
     rotation, quat, shift = rigid(5)
     target = nodes.positions @ matrix(rotation).T + shift
     at_nodes = Offsets(target - nodes.positions, (quat - IDENTITY).expand(3, 4))
-    x, direction = means.clone().requires_grad_(), points(4, seed=2)
-    (slope,) = torch.autograd.grad(((x + followed(nodes, x, at_nodes).means) * direction).sum(), [x])
+    x = means.clone().requires_grad_()
+    direction = points(4, seed=2)
+    (slope,) = torch.autograd.grad(
+        ((x + followed(nodes, x, at_nodes).means) * direction).sum(), [x]
+    )
     torch.testing.assert_close(slope, direction @ matrix(rotation), rtol=0, atol=1e-12)

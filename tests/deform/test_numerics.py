@@ -84,14 +84,16 @@ def timed(capture: Path, times: list[float]) -> Path:
     return capture
 
 
-# --- times ------------------------------------------------------------------------------------------------------------
+# --- times
+# ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("time", [0.0, 1.0])
 def test_the_ends_of_the_clip_are_ordinary_times(kind: str, time: float) -> None:
     """Continuous up to them, and gradients reach all that takes part."""
-    field, means = stirred_field(kind), cloud().means
+    field = stirred_field(kind)
+    means = cloud().means
     inside = abs(time - 1e-6)
     torch.testing.assert_close(
         values(field.offsets(means, time)), values(field.offsets(means, inside)), atol=1e-3, rtol=0
@@ -118,11 +120,14 @@ def test_a_single_training_time_is_a_static_scene(tmp_path: Path, kind: str) -> 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_two_training_times(tmp_path: Path, kind: str) -> None:
-    """Trained on together from the first step on; planes and keys have the least that there can be, two."""
+    """Trained on together from the first step on; planes and keys have the least that there can be,
+    two."""
     config = busy_config(timed(tmp_path / "capture", [0.0, 1.0, 0.0, 1.0, 1.0]), tmp_path, kind)
     assert isinstance(config.model, DynamicModel)
     automatic = {"hexplane": {"time_resolution": 0}, "control_nodes": {"pieces": 0}}.get(kind, {})
-    model = config.model.model_copy(update={"deform": config.model.deform.model_copy(update=automatic)})
+    model = config.model.model_copy(
+        update={"deform": config.model.deform.model_copy(update=automatic)}
+    )
     trainer = assemble(config.model_copy(update={"model": model}))
     seen = {trainer.step().image.time for _ in range(12)}
     assert seen == {0.0, 1.0}
@@ -135,7 +140,8 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
 
 
 def test_10000_training_times() -> None:
-    """No more than 256 rows or keys; the window and the measure of motion stay cheap, and neighbours are told apart."""
+    """No more than 256 rows or keys; the window and the measure of motion stay cheap, and
+    neighbours are told apart."""
     assert time_rows(HexplaneField(), LONG) == MAX_KEY_TIMES
     assert time_rows(HexplaneField(time_resolution=LONG // 2), LONG) == LONG // 2
     setup = FieldSetup(torch.zeros(3), torch.ones(3), LONG, 3, 1.0)
@@ -161,13 +167,15 @@ def test_10000_training_times() -> None:
     )
 
 
-# --- sets -------------------------------------------------------------------------------------------------------------
+# --- sets
+# -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_moving_gaussians(kind: str) -> None:
     """Of the right shapes, and their gradient is zero."""
-    field, gaussians = tiny_field(kind, 0), cloud()
+    field = tiny_field(kind, 0)
+    gaussians = cloud()
     offsets = field.offsets(gaussians.means[:0], 0.3)
     assert {name: tuple(x.shape) for name, x in vars(offsets).items()} == {
         "means": (0, 3), "quats": (0, 4), "log_scales": (0, 3), "logit_opacities": (0,), "colors": (0, 3)
@@ -185,7 +193,8 @@ def test_no_moving_gaussians(kind: str) -> None:
 def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: str) -> None:
     """The run goes on with what is left, and its checkpoint can be loaded."""
     trainer = fine_trainer(capture, kind)
-    scene, two = trainer.model.scene, TopologyEdit.select(torch.tensor([0, 3]))
+    scene = trainer.model.scene
+    two = TopologyEdit.select(torch.tensor([0, 3]))
     assert isinstance(scene, DynamicScene)
     assert scene.field is not None
     field = scene.field.edited(two)
@@ -207,7 +216,8 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_one_gaussian(kind: str) -> None:
-    field, gaussian = stirred_field(kind, 1), cloud(1)
+    field = stirred_field(kind, 1)
+    gaussian = cloud(1)
     moved = deformed(gaussian, field.offsets(gaussian.means, 0.8))
     assert all(x.isfinite().all() for x in moved.tensors().values())
     assert not torch.equal(moved.means, gaussian.means)
@@ -216,13 +226,18 @@ def test_one_gaussian(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("flat", ["point", "line", "plane"])
 def test_boxes_without_volume(kind: str, flat: str) -> None:
-    """All means in one point, on a line, in a plane: the box has at least a thousandth of the extent to each side."""
+    """All means in one point, on a line, in a plane: the box has at least a thousandth of the
+    extent to each side."""
     means = cloud().means.clone()
     means[:, {"point": 0, "line": 1, "plane": 2}[flat] :] = 0.7
     gaussians = cloud().replace(means=means, logit_opacities=torch.full((9,), 3.0))
     center, half_size = box_of(gaussians, 2.0)
     assert half_size.min() == pytest.approx(2e-3)
-    field = new_field(tiny_options(kind), FieldSetup(center, half_size, 10, 9, 2.0), torch.Generator().manual_seed(0))
+    field = new_field(
+        tiny_options(kind),
+        FieldSetup(center, half_size, 10, 9, 2.0),
+        torch.Generator().manual_seed(0),
+    )
     field.offsets(means, 0.3)
     stir(field)
     found = values(field.offsets(means, 0.3))
@@ -238,7 +253,9 @@ def test_boxes_without_volume(kind: str, flat: str) -> None:
 def test_a_box_of_nothing_or_of_one_point_has_a_size(count: int) -> None:
     for logit in (5.0, -20.0):
         gaussians = cloud(max(count, 1)).select(torch.zeros(count, dtype=torch.long))
-        center, half_size = box_of(gaussians.replace(logit_opacities=torch.full((count,), logit)), 2.0)
+        center, half_size = box_of(
+            gaussians.replace(logit_opacities=torch.full((count,), logit)), 2.0
+        )
         assert center.isfinite().all()
         assert (half_size >= 2e-3).all()
         if count:
@@ -248,7 +265,8 @@ def test_a_box_of_nothing_or_of_one_point_has_a_size(count: int) -> None:
 def test_means_that_are_not_finite_do_not_spoil_the_box() -> None:
     gaussians = cloud(50).replace(logit_opacities=torch.full((50,), 2.0))
     means = gaussians.means.clone()
-    means[0], means[1] = math.nan, math.inf
+    means[0] = math.nan
+    means[1] = math.inf
     center, half_size = box_of(gaussians.replace(means=means), 1.0)
     assert center.isfinite().all()
     assert half_size.isfinite().all()
@@ -256,12 +274,15 @@ def test_means_that_are_not_finite_do_not_spoil_the_box() -> None:
 
 @pytest.mark.parametrize("distance", [1e3, 1e6, 1e30])
 def test_gaussians_far_outside_the_box(distance: float) -> None:
-    """Planes: the offsets of the border. Nodes: those of the nearest, carried along by its turn. All finite to 1e6."""
+    """Planes: the offsets of the border. Nodes: those of the nearest, carried along by its turn.
+    All finite to 1e6."""
     means = cloud().means.clone()
     means[3] = distance
     planes = stirred_field("hexplane")
     border = means.clamp(-2, 2)
-    torch.testing.assert_close(values(planes.offsets(means, 0.4)), values(planes.offsets(border, 0.4)))
+    torch.testing.assert_close(
+        values(planes.offsets(means, 0.4)), values(planes.offsets(border, 0.4))
+    )
     if distance > 1e6:
         return
     for kind in ("mlp", "control_nodes"):
@@ -270,7 +291,8 @@ def test_gaussians_far_outside_the_box(distance: float) -> None:
         assert values(field.offsets(means, 0.4)).isfinite().all()
 
 
-# --- rotations --------------------------------------------------------------------------------------------------------
+# --- rotations
+# --------------------------------------------------------------------------------------------------------
 
 
 def image_of(gaussians: Gaussians) -> Tensor:
@@ -297,13 +319,15 @@ def test_an_offset_that_cancels_the_identity_is_no_rotation() -> None:
     assert slope.isfinite().all()
 
 
-# --- fields that explode ----------------------------------------------------------------------------------------------
+# --- fields that explode
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
     """Row by row, counted in the log as ``bad_gradients``; what is learned stays finite."""
-    field, means = stirred_field(kind), cloud().means
+    field = stirred_field(kind)
+    means = cloud().means
     values(field.offsets(means, 0.4)).sum().backward()
     for name in field.parameters.values():
         grad = field.parameters[name].grad
@@ -325,13 +349,15 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
         x.fill_(bad)
     before = trainer.model.scene.gaussians.means.detach().clone()
     with pytest.raises(
-        DyngsError, match=r"^step 11, view '.*': the field makes means.* at [0-9.]+ not finite; .*deform$"
+        DyngsError,
+        match=r"^step 11, view '.*': the field makes means.* at [0-9.]+ not finite; .*deform$",
     ):
         trainer.step()
     assert torch.equal(trainer.model.scene.gaussians.means, before)
 
 
-# --- where motion begins ----------------------------------------------------------------------------------------------
+# --- where motion begins
+# ----------------------------------------------------------------------------------------------
 
 
 def test_a_image_that_a_still_model_explains(capture: Path) -> None:
@@ -345,7 +371,8 @@ def test_a_image_that_a_still_model_explains(capture: Path) -> None:
 
 def test_no_random_gaussians(capture: Path) -> None:
     """Just the Gaussians that were there move."""
-    sizes, moving = [], []
+    sizes = []
+    moving = []
     for added in (12, 0):
         trainer = assemble(busy_config(capture, capture, "control_nodes", num_random_moving=added))
         for _ in range(8):
@@ -368,7 +395,8 @@ def reference_set(capture: Path) -> Gaussians:
 
 @pytest.mark.parametrize("filtered", [False, True])
 def test_a_run_of_one_step(capture: Path, filtered: bool) -> None:
-    """It ends as motion begins: with a field that is the identity, for the random Gaussians too, and filtered."""
+    """It ends as motion begins: with a field that is the identity, for the random Gaussians too,
+    and filtered."""
     config = busy_config(capture, capture, "hexplane", filter_3d=filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = assemble(config)

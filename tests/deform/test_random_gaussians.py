@@ -20,7 +20,9 @@ def drawn(gaussians: Gaussians, count: int, extent: float, seed: int) -> Gaussia
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 30), st.integers(0, 40), st.integers(0, 3), st.integers(0, 2**32))
-def test_they_are_faint_and_lie_in_the_box(count: int, num_added: int, degree: int, seed: int) -> None:
+def test_they_are_faint_and_lie_in_the_box(
+    count: int, num_added: int, degree: int, seed: int
+) -> None:
     """So many, after all others, which stay as they are; new rows without moments."""
     gaussians = cloud(count).replace(sh=torch.randn(count, (degree + 1) ** 2, 3))
     result = with_gaussians(gaussians, [drawn(gaussians, num_added, 2.0, seed)])
@@ -31,7 +33,8 @@ def test_they_are_faint_and_lie_in_the_box(count: int, num_added: int, degree: i
     for x in optimizer.parameters.tensors().values():
         x.grad = torch.ones_like(x)
     optimizer.step(1, 0.1, dense=True)
-    before, moments = optimizer.parameters.detach(), tensors_of(optimizer.state())
+    before = optimizer.parameters.detach()
+    moments = tensors_of(optimizer.state())
     optimizer.apply(with_gaussians(before, [drawn(before, num_added, 2.0, seed)]))
     after = optimizer.parameters.detach()
     added = after.select(torch.arange(count, count + num_added))
@@ -68,6 +71,7 @@ def test_the_box_holds_what_is_solid() -> None:
     far = gaussians.means.clone()
     far[:2] = 1e6
     logits = gaussians.logit_opacities.clone()
-    logits[2:40], far[2:40] = -10.0, -500.0
+    logits[2:40] = -10.0
+    far[2:40] = -500.0
     bounded = box_of(gaussians.replace(means=far, logit_opacities=logits), 1.0)
     assert (bounded[1] < 1.5 * half_size).all()

@@ -24,10 +24,14 @@ ROWS = torch.tensor([1, 4, 5, 8])
 NOTHING = torch.zeros(0, dtype=torch.long)
 
 
-def scene_of(rows: Tensor, field: DeformationField | None = None, filter_std: Tensor | None = None) -> DynamicScene:
+def scene_of(
+    rows: Tensor, field: DeformationField | None = None, filter_std: Tensor | None = None
+) -> DynamicScene:
     """The cloud, ``rows`` of which a field moves."""
     times = (0.0, 0.5, 1.0)
-    return DynamicScene(gaussians=cloud(), seen_at=times, field=field, moving=rows, filter_std=filter_std)
+    return DynamicScene(
+        gaussians=cloud(), seen_at=times, field=field, moving=rows, filter_std=filter_std
+    )
 
 
 def some_scene(kind: str = "hexplane", filter_std: Tensor | None = None) -> DynamicScene:
@@ -41,7 +45,8 @@ def same(a: Gaussians, b: Gaussians) -> bool:
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_only_the_rows_move(kind: str) -> None:
     scene = some_scene(kind)
-    early, late = scene.at(0.1), scene.at(0.9)
+    early = scene.at(0.1)
+    late = scene.at(0.9)
     changed = (early.means != late.means).any(1)
     assert torch.equal(torch.nonzero(changed)[:, 0], ROWS)
     others = torch.nonzero(~changed)[:, 0]
@@ -75,7 +80,8 @@ def test_a_time_that_is_no_number_is_refused(kind: str | None) -> None:
 def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) -> None:
     """Together, in their order, at each time."""
     scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if filtered else None)
-    moving, still = scene.part("moving"), scene.part("still")
+    moving = scene.part("moving")
+    still = scene.part("still")
     others = torch.tensor([0, 2, 3, 6, 7])
     assert (len(moving), len(still)) == (4, 5)
     assert (moving.is_static, still.is_static) == (False, True)
@@ -98,7 +104,8 @@ def test_parts_of_extreme_scenes() -> None:
 
 
 def test_what_a_scene_says_of_itself() -> None:
-    scene, field = some_scene("hexplane"), tiny_field("hexplane", 4)
+    scene = some_scene("hexplane")
+    field = tiny_field("hexplane", 4)
     assert len(scene) == 9
     assert scene.moving_fraction == pytest.approx(4 / 9)
     assert scene.num_motion_values == sum(x.numel() for x in field.parameters.values().values())
@@ -110,7 +117,8 @@ def test_what_a_scene_says_of_itself() -> None:
 
 def test_the_filter_acts_on_what_is_drawn() -> None:
     std = torch.full((9,), 0.3)
-    scene, plain = some_scene("control_nodes", std), some_scene("control_nodes")
+    scene = some_scene("control_nodes", std)
+    plain = some_scene("control_nodes")
     assert same(scene.at(0.6), fuse_filter(plain.at(0.6), std))
 
 
@@ -118,10 +126,14 @@ def test_the_filter_acts_on_what_is_drawn() -> None:
 @pytest.mark.parametrize("rows", [ROWS, None, NOTHING], ids=["some", "all", "none"])
 def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     """As the model stored it; without rows all Gaussians move."""
-    gaussians, num_moving = cloud(), 9 if rows is None else len(rows)
+    gaussians = cloud()
+    num_moving = 9 if rows is None else len(rows)
     field = stirred_field(kind, num_moving)
     state = {f"field.{name}": x for name, x in tensors_of(field_state(field)).items()}
-    state |= {"times": torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64), "filter_std": torch.ones(9)}
+    state |= {
+        "times": torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64),
+        "filter_std": torch.ones(9),
+    }
     if rows is not None:
         state["rows"] = rows
     scene = DynamicScene.restored(DynamicModel(deform=tiny_options(kind)), gaussians, state)
@@ -137,12 +149,20 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("filtered", [False, True])
 def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
-    """Before, between and after key times, in any order of times; parts and sizes are those of all Gaussians."""
+    """Before, between and after key times, in any order of times; parts and sizes are those of all
+    Gaussians."""
     scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if filtered else None)
     seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
     masked = replace(scene, masks=VisibilityMasks.pack((0.0, 0.5, 1.0), seen))
-    for time, active in ((0.1, seen[:2]), (0.9, seen[1:]), (0.3, seen[:2]), (1.0, seen[1:]), (None, seen[:2])):
-        found, whole = masked.at(time), scene.at(time).select(active.any(0))
+    for time, active in (
+        (0.1, seen[:2]),
+        (0.9, seen[1:]),
+        (0.3, seen[:2]),
+        (1.0, seen[1:]),
+        (None, seen[:2]),
+    ):
+        found = masked.at(time)
+        whole = scene.at(time).select(active.any(0))
         for name, x in found.tensors().items():
             torch.testing.assert_close(x, whole.tensors()[name], rtol=0, atol=1e-6)
     assert len(masked) == 9
@@ -151,7 +171,10 @@ def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
 
 
 def test_a_state_without_field_is_a_still_scene() -> None:
-    for scene in (StaticScene.restored(cloud(), {}), DynamicScene.restored(DynamicModel(), cloud(), {})):
+    for scene in (
+        StaticScene.restored(cloud(), {}),
+        DynamicScene.restored(DynamicModel(), cloud(), {}),
+    ):
         assert scene.is_static
         assert scene.times == ()
         assert same(scene.at(0.5), cloud())

@@ -16,7 +16,8 @@ PLACES = torch.linspace(0, 1, 41, dtype=torch.float64)
 def test_the_basis_is_that_of_the_nodes() -> None:
     basis = spline_basis(torch.tensor([0.0, 0.3, 1.0]), 5)
     assert torch.allclose(basis.sum(1), torch.ones(3, dtype=torch.float64))
-    assert torch.allclose(basis[1, 1:5], torch.tensor(cubic_fractions(0.5)).double(), atol=1e-6)  # float32 places
+    # float32 places
+    assert torch.allclose(basis[1, 1:5], torch.tensor(cubic_fractions(0.5)).double(), atol=1e-6)
     assert torch.allclose(basis[2, 4:], torch.tensor(cubic_fractions(1.0)).double())
 
 
@@ -25,13 +26,17 @@ def test_divided_pieces_lose_nothing(pieces: int) -> None:
     """And come back: the fit to three pieces of what has three pieces is exact."""
     points = torch.randn(4, 6, 3, generator=torch.Generator().manual_seed(0)).double()
     finer = refitted(points, pieces)
-    assert torch.allclose(spline_basis(PLACES, pieces) @ finer, spline_basis(PLACES, 3) @ points, atol=1e-9)
+    assert torch.allclose(
+        spline_basis(PLACES, pieces) @ finer, spline_basis(PLACES, 3) @ points, atol=1e-9
+    )
     assert torch.allclose(refitted(finer, 3), points, atol=1e-9)
 
 
 def test_polynomials_need_one_piece() -> None:
     cubic = refitted(torch.randn(2, 4, 1, generator=torch.Generator().manual_seed(1)).double(), 12)
-    assert torch.allclose(spline_basis(PLACES, 1) @ refitted(cubic, 1), spline_basis(PLACES, 12) @ cubic, atol=1e-8)
+    assert torch.allclose(
+        spline_basis(PLACES, 1) @ refitted(cubic, 1), spline_basis(PLACES, 12) @ cubic, atol=1e-8
+    )
 
 
 def test_no_other_fit_is_nearer() -> None:
@@ -46,14 +51,18 @@ def test_no_other_fit_is_nearer() -> None:
         return float((spline_basis(places, 3) @ x - wanted).square().mean())
 
     for _ in range(10):
-        assert error(fitted + 0.05 * torch.randn(fitted.shape, generator=generator).double()) > error(fitted)
+        assert error(
+            fitted + 0.05 * torch.randn(fitted.shape, generator=generator).double()
+        ) > error(fitted)
 
 
 def test_a_field_with_all_nodes_and_pieces_moves_as_before() -> None:
-    field, means = stirred_field("control_nodes"), cloud().means
+    field = stirred_field("control_nodes")
+    means = cloud().means
     match field:
         case ControlNodes():
-            same, fewer = field.reduced(5, 3, means), field.reduced(3, 2, means)
+            same = field.reduced(5, 3, means)
+            fewer = field.reduced(3, 2, means)
         case _:
             raise AssertionError
     for name, x in vars(field.offsets(means, 0.37)).items():

@@ -1,4 +1,5 @@
-"""How far images disagree with static Gaussians where they show, and the score that parts two groups of them."""
+"""How far images disagree with static Gaussians where they show, and the score that parts two
+groups of them."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ from dyngs.gaussians.rendering import RenderOptions, render
 
 SIZE = 24
 OPTIONS = RenderOptions(nonfinite="trust")
-BLACK, WHITE = torch.zeros(3), torch.ones(3)
+BLACK = torch.zeros(3)
+WHITE = torch.ones(3)
 SH_CONSTANT = 0.28209479177387814
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -45,22 +47,32 @@ def camera(view: int = 0) -> Cameras:
 
 def balls(*places: tuple[float, float, float]) -> Gaussians:
     """Grey, dense balls, far smaller than the image."""
-    means, count = torch.tensor(places), len(places)
+    means = torch.tensor(places)
+    count = len(places)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    return Gaussians(means, quats, torch.full((count, 3), -2.0), torch.full((count,), 4.0), torch.zeros(count, 1, 3))
+    return Gaussians(
+        means,
+        quats,
+        torch.full((count, 3), -2.0),
+        torch.full((count,), 4.0),
+        torch.zeros(count, 1, 3),
+    )
 
 
 def rendered(gaussians: Gaussians, background: Tensor = BLACK, view: int = 0) -> Tensor:
     return render(gaussians, camera(view), OPTIONS, background=background).rgb[0].detach()
 
 
-def image(rgb: Tensor, mask: Tensor | None = None, alpha: Tensor | None = None, view: int = 0) -> Image:
+def image(
+    rgb: Tensor, mask: Tensor | None = None, alpha: Tensor | None = None, view: int = 0
+) -> Image:
     return Image("view", camera(view), rgb, alpha, mask, 0.5)
 
 
 def sideways(x: float) -> tuple[float, float, float]:
     """A place in the first camera's image plane, ``x`` to the right of the middle."""
-    right, down = camera().cam_from_world[0, 0, :3], camera().cam_from_world[0, 1, :3]
+    right = camera().cam_from_world[0, 0, :3]
+    down = camera().cam_from_world[0, 1, :3]
     a, b, c = (x * right + 0.0 * down).tolist()
     return a, b, c
 
@@ -86,8 +98,12 @@ def test_colours_of_a_shader_are_expected() -> None:
         return torch.tensor([1.0, 0.0, 0.0]).expand(len(cameras), len(gaussians), 3)
 
     shown = image(render(gaussians, camera(), OPTIONS, background=BLACK, shader=red).rgb[0])
-    assert (still_errors(lambda _: gaussians, [shown], OPTIONS, BLACK, lambda _: red).most < 1e-6).all()
-    assert (scores_of(gaussians, [shown], BLACK) > 0.2).all(), "half of each channel, times the mean alpha"
+    assert (
+        still_errors(lambda _: gaussians, [shown], OPTIONS, BLACK, lambda _: red).most < 1e-6
+    ).all()
+    assert (scores_of(gaussians, [shown], BLACK) > 0.2).all(), (
+        "half of each channel, times the mean alpha"
+    )
 
 
 def test_what_the_images_show_has_no_error() -> None:
@@ -99,15 +115,21 @@ def test_what_the_images_show_has_no_error() -> None:
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=3))
 def test_a_known_colour_is_the_error(colour: list[float]) -> None:
-    """Images that differ by a colour all over: its mean over the channels, for all that shows, however little."""
+    """Images that differ by a colour all over: its mean over the channels, for all that shows,
+    however little."""
     ball = balls(sideways(0.0), sideways(0.5)).replace(logit_opacities=torch.tensor([4.0, -4.0]))
-    images = [image(rendered(ball, view=view) + torch.tensor(colour), view=view) for view in range(3)]
+    images = [
+        image(rendered(ball, view=view) + torch.tensor(colour), view=view) for view in range(3)
+    ]
     expected = sum(abs(x) for x in colour) / 3
-    assert scores_of(ball, images, BLACK).tolist() == pytest.approx([expected] * 2, rel=1e-3, abs=1e-6)
+    assert scores_of(ball, images, BLACK).tolist() == pytest.approx(
+        [expected] * 2, rel=1e-3, abs=1e-6
+    )
 
 
 def test_errors_count_where_a_gaussian_shows() -> None:
-    """The left half is wrong by 0.3: one ball is in it, one in the other half, one on the border."""
+    """The left half is wrong by 0.3: one ball is in it, one in the other half, one on the
+    border."""
     scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
     wrong = image(rendered(scene) + 0.3 * left_half()[..., None])
     left, right, border = scores_of(scene, [wrong], BLACK).tolist()
@@ -130,8 +152,11 @@ def test_what_shows_nowhere_has_no_error() -> None:
     places = [sideways(0.0), behind, sideways(40.0), tuple((-0.5 * center).tolist()), sideways(0.5)]
     walls = [tuple((fraction * center).tolist()) for fraction in (0.4, 0.3, 0.2)]
     scene = balls(*places, *walls)  # type: ignore[arg-type]
-    logits, scales = scene.logit_opacities.clone(), scene.log_scales.clone()
-    logits[4], logits[5:], scales[5:] = -20.0, 20.0, 3.0
+    logits = scene.logit_opacities.clone()
+    scales = scene.log_scales.clone()
+    logits[4] = -20.0
+    logits[5:] = 20.0
+    scales[5:] = 3.0
     scene = scene.replace(logit_opacities=logits, log_scales=scales)
     scores = scores_of(scene, [image(torch.ones(SIZE, SIZE, 3))], BLACK)
     assert scores[:5].tolist() == [0.0] * 5
@@ -140,33 +165,44 @@ def test_what_shows_nowhere_has_no_error() -> None:
 
 def test_the_background_lies_behind_both() -> None:
     """Where an image is transparent, the truth is the background."""
-    scene, clear = balls(sideways(0.0)), torch.zeros(SIZE, SIZE)
+    scene = balls(sideways(0.0))
+    clear = torch.zeros(SIZE, SIZE)
     empty = image(torch.zeros(SIZE, SIZE, 3), alpha=clear)
     errors = [float(scores_of(scene, [empty], colour)) for colour in (BLACK, WHITE)]
-    assert errors[0] == pytest.approx(errors[1], rel=1e-3)  # grey is as far from black as from white
+    # grey is as far from black as from white
+    assert errors[0] == pytest.approx(errors[1], rel=1e-3)
     assert 0.2 < errors[0] < 0.5
     grey = torch.full((3,), 0.5)
     assert float(scores_of(scene, [empty], grey)) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_detail_cancels_in_a_view_but_not_between_views() -> None:
-    """Stripes that a ball cannot resolve are no error; a ball too bright in one view and too dark in the next is."""
+    """Stripes that a ball cannot resolve are no error; a ball too bright in one view and too dark
+    in the next is."""
     ball = balls(sideways(0.0)).replace(log_scales=torch.full((1, 3), -0.7))
     signs = torch.ones(SIZE)
     signs[1::2] = -1.0
     stripes = image(rendered(ball) + 0.3 * signs[None, :, None])
     assert float(scores_of(ball, [stripes], BLACK)) < 0.02
-    changes = [image(rendered(ball, view=view) + 0.3 * (-1) ** view, view=view) for view in range(2)]
+    changes = [
+        image(rendered(ball, view=view) + 0.3 * (-1) ** view, view=view) for view in range(2)
+    ]
     assert float(scores_of(ball, changes, BLACK)) == pytest.approx(0.3, rel=1e-3)
 
 
 def test_it_is_the_weighted_mean() -> None:
-    """The weights, one Gaussian at a time: what is seen of it if it alone is white and all others are black."""
-    count, random = 12, torch.Generator().manual_seed(0)
+    """The weights, one Gaussian at a time: what is seen of it if it alone is white and all others
+    are black."""
+    count = 12
+    random = torch.Generator().manual_seed(0)
     gaussians = cloud(count)
     masks = [None, (torch.rand(SIZE, SIZE, generator=random) > 0.3).float(), None]
-    images = [image(torch.rand(SIZE, SIZE, 3, generator=random), masks[view], view=view) for view in range(3)]
-    error, weight = torch.zeros(count), torch.zeros(count)
+    images = [
+        image(torch.rand(SIZE, SIZE, 3, generator=random), masks[view], view=view)
+        for view in range(3)
+    ]
+    error = torch.zeros(count)
+    weight = torch.zeros(count)
     for view, one in enumerate(images):
         wrong = rendered(gaussians, WHITE, view) - one.rgb_premultiplied
         counts = torch.ones(SIZE, SIZE) if one.mask is None else one.mask
@@ -183,7 +219,9 @@ def test_it_is_the_weighted_mean() -> None:
 
 def test_nothing_is_left_behind() -> None:
     """Neither gradients nor changes; leaf tensors are taken too."""
-    gaussians = Gaussians(**{name: x.clone().requires_grad_() for name, x in cloud(5).tensors().items()})
+    gaussians = Gaussians(
+        **{name: x.clone().requires_grad_() for name, x in cloud(5).tensors().items()}
+    )
     scores = scores_of(gaussians, [image(torch.rand(SIZE, SIZE, 3))], BLACK)
     assert not scores.requires_grad
     for name, x in gaussians.tensors().items():
@@ -198,11 +236,13 @@ def test_no_gaussians() -> None:
     assert two_group_threshold(scores) == float("inf")
 
 
-# --- cameras that stay in place ---------------------------------------------------------------------------------------
+# --- cameras that stay in place
+# ---------------------------------------------------------------------------------------
 
 
 def in_place(*errors: float, view: int = 0) -> list[Image]:
-    """What one camera shows while all of the image is brighter by ``errors``, one after the other."""
+    """What one camera shows while all of the image is brighter by ``errors``, one after the
+    other."""
     ball = balls(sideways(0.0))
     return [image(rendered(ball, view=view) + error, view=view) for error in errors]
 
@@ -218,12 +258,16 @@ def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
 
 def test_what_is_hidden_at_times_does_not_move() -> None:
     """Something passes in front in two of ten images: seen by ``most``, not by ``usual``."""
-    found = still_errors(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK)
+    found = still_errors(
+        lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK
+    )
     assert (float(found.most), float(found.usual)) == pytest.approx((0.3, 0.0), rel=1e-3, abs=1e-6)
 
 
 def test_what_changes_again_and_again_moves() -> None:
-    found = still_errors(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK)
+    found = still_errors(
+        lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK
+    )
     assert float(found.most) == pytest.approx(0.4, rel=1e-3)
     assert float(found.usual) == pytest.approx(0.1, rel=1e-3)
 
@@ -244,7 +288,8 @@ def test_a_camera_that_stays_is_preferred_to_one_that_does_not() -> None:
 
 def views(*cameras: int) -> list[View]:
     """From one of three places each."""
-    poses, intrinsics = look_around(3, torch.float64).numpy(), camera().intrinsics[0].double().numpy()
+    poses = look_around(3, torch.float64).numpy()
+    intrinsics = camera().intrinsics[0].double().numpy()
     place = partial(View, image_path=Path("x.png"), intrinsics=intrinsics, width=SIZE, height=SIZE)
     return [place(str(i), cam_from_world=poses[at], time=i / 1000) for i, at in enumerate(cameras)]
 
@@ -263,7 +308,8 @@ def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
     assert cameras_in_place(views(0, 1, 2, 0, 1, 2)) == []
 
 
-# --- two groups -------------------------------------------------------------------------------------------------------
+# --- two groups
+# -------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=80, deadline=None)
@@ -273,7 +319,8 @@ def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
     st.floats(1e-3, 10),
 )
 def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale: float) -> None:
-    """At any scale, in any order, if neither is tiny; to a 256th of the range, which is counted in so many bins."""
+    """At any scale, in any order, if neither is tiny; to a 256th of the range, which is counted in
+    so many bins."""
     scores = scale * torch.tensor(low + high)
     order = torch.randperm(len(scores), generator=torch.Generator().manual_seed(len(scores)))
     threshold = two_group_threshold(scores[order])
@@ -291,10 +338,13 @@ def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
     assert differing_fraction([[room, room + 0.2, room + 0.4]]) == 0
     come = room.clone()
     come[:4, :4] += 0.3
-    assert differing_fraction([[room, room, come]]) == 4 / 48, "of 16 blocks of 2x2 pixels in each image"
+    assert differing_fraction([[room, room, come]]) == 4 / 48, (
+        "of 16 blocks of 2x2 pixels in each image"
+    )
 
 
-# --- motion masks -----------------------------------------------------------------------------------------------------
+# --- motion masks
+# -----------------------------------------------------------------------------------------------------
 
 
 def masked_image(moves: torch.Tensor | None, mask: torch.Tensor | None = None) -> Image:
@@ -308,19 +358,26 @@ def left() -> torch.Tensor:
 
 
 def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
-    """The left ball lies in the mask, the right one does not; a fraction of one half counts as ``sure``."""
+    """The left ball lies in the mask, the right one does not; a fraction of one half counts as
+    ``sure``."""
     found = moving_fractions(lambda _: two_balls(), [masked_image(left())], RenderOptions(), 0.06)
     torch.testing.assert_close(found.most, torch.tensor([0.12, 0.0]), rtol=0, atol=2e-3)
     torch.testing.assert_close(found.usual, found.most)
 
 
 def test_what_is_covered_at_times_only_is_not_usual() -> None:
-    images = [masked_image(left())] + [masked_image(torch.zeros(18, 24)) for _ in range(4)] + [masked_image(None)]
+    images = (
+        [masked_image(left())]
+        + [masked_image(torch.zeros(18, 24)) for _ in range(4)]
+        + [masked_image(None)]
+    )
     found = moving_fractions(lambda _: two_balls(), images, RenderOptions(), 0.06)
     assert float(found.most[0]) > 0.1
     assert float(found.usual.max()) == 0
 
 
 def test_masked_pixels_are_in_no_motion_mask() -> None:
-    found = moving_fractions(lambda _: two_balls(), [masked_image(left(), torch.zeros(18, 24))], RenderOptions(), 0.06)
+    found = moving_fractions(
+        lambda _: two_balls(), [masked_image(left(), torch.zeros(18, 24))], RenderOptions(), 0.06
+    )
     assert found.most.tolist() == [0, 0]

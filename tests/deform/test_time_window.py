@@ -1,4 +1,5 @@
-"""All times before motion begins, then a window that grows from the middle to the whole clip; the newest come often."""
+"""All times before motion begins, then a window that grows from the middle to the whole clip; the
+newest come often."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ def held(window: TimeWindow, times: list[float], step: int) -> list[float]:
 @settings(max_examples=150, deadline=None)
 @given(clips, st.floats(0, 1))
 def test_it_grows_to_everything_and_is_never_too_small(times: list[float], first: float) -> None:
-    """For any times: unsorted, repeated, constant, at one end. Looked at in the steps that train on all of it."""
+    """For any times: unsorted, repeated, constant, at one end. Looked at in the steps that train on
+    all of it."""
     window = TimeWindow.around_middle(times, first, OPENS, OPENS, FULL)
     before: list[float] = []
     for step in (*ODD_STEPS, FULL, FULL + 1, 10**6):
@@ -47,10 +49,13 @@ def test_all_is_seen_before_motion_begins(times: list[float], first: float, step
 @settings(max_examples=150, deadline=None)
 @given(clips, st.floats(0, 1), st.sampled_from(EVEN_STEPS))
 def test_every_other_step_is_for_the_newest(times: list[float], first: float, step: int) -> None:
-    """The outermost so many views of the window (all of it, if it has no more), and those of the very same moments."""
+    """The outermost so many views of the window (all of it, if it has no more), and those of the
+    very same moments."""
     window = TimeWindow.around_middle(times, first, OPENS, OPENS, FULL)
     newest = held(window, times, step)
-    inside = sorted((t for t in times if abs(t - 0.5) <= window.reach(step)), key=lambda t: abs(t - 0.5))
+    inside = sorted(
+        (t for t in times if abs(t - 0.5) <= window.reach(step)), key=lambda t: abs(t - 0.5)
+    )
     strays = [abs(time - 0.5) for time in inside]
     assert window.tracks(step) == (window.num_views(step) < len(times))
     assert not window.tracks(step + 1)
@@ -69,10 +74,13 @@ def test_the_newest_of_an_even_clip() -> None:
     times = [i / 100 for i in range(101)]
     window = TimeWindow.around_middle(times, 0.2, OPENS, OPENS, FULL)
     newest = held(window, times, 30)
-    low, high = min(held(window, times, 31)), max(held(window, times, 31))
+    low = min(held(window, times, 31))
+    high = max(held(window, times, 31))
     assert FRONTIER_VIEWS <= len(newest) <= FRONTIER_VIEWS + 1
     assert all(min(time - low, high - time) < 0.035 for time in newest)
-    assert held(window, times, FULL) == times, "once all is seen all is trained on, in even steps too"
+    assert held(window, times, FULL) == times, (
+        "once all is seen all is trained on, in even steps too"
+    )
 
 
 @settings(max_examples=100, deadline=None)

@@ -1,4 +1,5 @@
-"""Training of a dynamic scene: its phases, where motion begins, what is frozen, how it follows changes of the set."""
+"""Training of a dynamic scene: its phases, where motion begins, what is frozen, how it follows
+changes of the set."""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.schedule import Rates
 
-# --- phases -----------------------------------------------------------------------------------------------------------
+# --- phases
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_before_the_fine_phase_it_is_the_static_model() -> None:
@@ -68,7 +70,8 @@ def test_on_the_newest_views_only_the_motion_learns(step: int, tracks: bool) -> 
     assert (gaussians.means.grad is None) == tracks
 
 
-# --- where motion begins ----------------------------------------------------------------------------------------------
+# --- where motion begins
+# ----------------------------------------------------------------------------------------------
 
 ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
 """Of a static model; 1, 3 and 6 stand out."""
@@ -93,8 +96,10 @@ def test_what_a_still_model_cannot_explain_moves() -> None:
     ("errors", "motion_threshold", "rows"),
     [
         (ERRORS, 0.5, []),
-        ((0.0, 0.0, 0.0, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4), 0.1, [4, 5, 6, 7, 8]),  # the groups part at 0.06
-        ((0.0, 0.0, 0.3, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0), 0.1, [*range(2, 9)]),  # at 0.3, but that is surely motion
+        # the groups part at 0.06
+        ((0.0, 0.0, 0.0, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4), 0.1, [4, 5, 6, 7, 8]),
+        # at 0.3, but that is surely motion
+        ((0.0, 0.0, 0.3, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0), 0.1, [*range(2, 9)]),
         ((0.05,) * 9, 0.04, []),  # not well explained, but all alike
         ((0.12,) * 9, 0.04, [*range(9)]),
         ((0.0,) * 999 + (0.5,), 0.04, []),  # one in a thousand is noise
@@ -102,8 +107,11 @@ def test_what_a_still_model_cannot_explain_moves() -> None:
         ((0.0,) * 8 + (0.01,), 0.0, [8]),
     ],
 )
-def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold: float, rows: list[int]) -> None:
-    """Where nothing stands out the model stays static: the same Gaussians, nothing added, no field."""
+def test_small_errors_are_no_motion(
+    errors: tuple[float, ...], motion_threshold: float, rows: list[int]
+) -> None:
+    """Where nothing stands out the model stays static: the same Gaussians, nothing added, no
+    field."""
     gaussians = flat_cloud()
     run = new_run(
         gaussians,
@@ -115,7 +123,12 @@ def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold:
     if rows:
         assert run.scene.rows.tolist() == [*rows, *range(9, 14)]
     else:
-        assert (result, run.scene.field, run.scene.rows.tolist(), run.scene.num_moving) == (None, None, [], 0)
+        assert (result, run.scene.field, run.scene.rows.tolist(), run.scene.num_moving) == (
+            None,
+            None,
+            [],
+            0,
+        )
         assert run.model_state.keys() == {"times"}
         assert run.time_step(0.2, FINE + 1).gaussians is gaussians
 
@@ -124,7 +137,10 @@ def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold:
 def test_random_gaussians_move_too(kind: str) -> None:
     gaussians = flat_cloud()
     run = new_run(
-        gaussians, still_errors=lambda _: alike(torch.tensor(ERRORS)), num_random_moving=4, deform=tiny_options(kind)
+        gaussians,
+        still_errors=lambda _: alike(torch.tensor(ERRORS)),
+        num_random_moving=4,
+        deform=tiny_options(kind),
     )
     result = run.grow(FINE)
     assert result is not None
@@ -143,7 +159,8 @@ def test_random_gaussians_move_too(kind: str) -> None:
 
 def test_the_filter_of_a_still_model_counts_the_random_gaussians() -> None:
     """A checkpoint of that very step has as many values as Gaussians."""
-    update, errors = FilterUpdate([camera()]), alike(torch.tensor(ERRORS))
+    update = FilterUpdate([camera()])
+    errors = alike(torch.tensor(ERRORS))
     run = new_run(flat_cloud(), still_errors=lambda _: errors, update=update, num_random_moving=4)
     run.time_step(0.3, FINE)
     assert len(run.model_state["filter_std"]) == 9
@@ -151,17 +168,21 @@ def test_the_filter_of_a_still_model_counts_the_random_gaussians() -> None:
     assert len(run.model_state["filter_std"]) == 13
 
 
-# --- the field learns -------------------------------------------------------------------------------------------------
+# --- the field learns
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_field_learns_after_the_fine_phase(kind: str) -> None:
-    """Gradients of what is drawn reach field and canonical Gaussians; ``after_step`` changes the field alone."""
+    """Gradients of what is drawn reach field and canonical Gaussians; ``after_step`` changes the
+    field alone."""
     gaussians = flat_cloud()
     run = begun(gaussians, deform=tiny_options(kind), motion_sparsity=0.1)
     for step in (FINE + 1, FINE + 2):
         drawn = run.time_step(0.7, step)
-        (drawn.gaussians.means[:, 1].sum() + sum(drawn.penalties.values(), torch.zeros(()))).backward()
+        (
+            drawn.gaussians.means[:, 1].sum() + sum(drawn.penalties.values(), torch.zeros(()))
+        ).backward()
         canonical = gaussians.means.detach().clone()
         assert run.after_step(step) == 0
         assert torch.equal(gaussians.means, canonical)
@@ -172,18 +193,26 @@ def test_the_field_learns_after_the_fine_phase(kind: str) -> None:
     }.get(kind, set())
     assert gaussians.means.grad is not None
     tolerance = 0.01 if kind == "control_nodes" else 1e-6  # nodes turn what follows them
-    torch.testing.assert_close(gaussians.means.grad, torch.tensor([0.0, 2, 0]).expand(9, 3), rtol=0, atol=tolerance)
+    torch.testing.assert_close(
+        gaussians.means.grad, torch.tensor([0.0, 2, 0]).expand(9, 3), rtol=0, atol=tolerance
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_motion_is_learned_from_images(kind: str) -> None:
-    """Balls before one camera go 0.3 units (10 px) to the right: the field finds out, by the gradients of rendering."""
+    """Balls before one camera go 0.3 units (10 px) to the right: the field finds out, by the
+    gradients of rendering."""
     gaussians = flat_cloud()
     blobs = {"log_scales": torch.full((9, 3), -2.5), "logit_opacities": torch.full((9,), 2.0)}
     gaussians = gaussians.replace(**{name: x.requires_grad_() for name, x in blobs.items()})
     planes = {"resolution": 3, "levels": (1,), "time_resolution": 4, "channels": 16, "width": 64}
-    rates = {"hexplane": {**planes, "lr_planes": 0.05, "lr_decoder": 0.01}, "mlp": {"lr": 0.01, "width": 32}}
-    options = tiny_options(kind, everything=False).model_copy(update=rates.get(kind, {"lr_means": 0.01}))
+    rates = {
+        "hexplane": {**planes, "lr_planes": 0.05, "lr_decoder": 0.01},
+        "mlp": {"lr": 0.01, "width": 32},
+    }
+    options = tiny_options(kind, everything=False).model_copy(
+        update=rates.get(kind, {"lr_means": 0.01})
+    )
     steps = 150
     run = begun(gaussians, deform=options, motion_sparsity=0.0)
     run.training.schedule = DeformSchedule(0, 0, 0, 0, (), Rates(steps))
@@ -197,7 +226,8 @@ def test_motion_is_learned_from_images(kind: str) -> None:
         run.after_step(step)
     for time in (0.1, 0.5, 0.9):
         found = run.drawn_at(time).means - gaussians.means.detach()
-        assert (found.mean(0) - (time - 0.5) * shift)[:2].norm() < 0.2 * 0.3  # one camera sees no depth
+        # one camera sees no depth
+        assert (found.mean(0) - (time - 0.5) * shift)[:2].norm() < 0.2 * 0.3
 
 
 def test_bad_gradients_of_the_field_are_counted() -> None:
@@ -214,7 +244,11 @@ def test_bad_gradients_of_the_field_are_counted() -> None:
 def test_it_trains_on_the_window() -> None:
     """Which opens where motion begins: before, all views are trained on."""
     run = new_run(flat_cloud(), times=tuple(i / 100 for i in range(101)), time_window=0.1)
-    assert all(run.training.trains_on(time, step) for time in (0.0, 0.5, 1.0, None) for step in (1, FINE, FULL))
+    assert all(
+        run.training.trains_on(time, step)
+        for time in (0.0, 0.5, 1.0, None)
+        for step in (1, FINE, FULL)
+    )
     assert run.training.trains_on(0.5, FINE + 1)
     assert not run.training.trains_on(0.0, FINE + 1)
     assert not run.training.trains_on(None, FINE + 1), "no time is time 0"
@@ -229,13 +263,17 @@ def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
     assert begun(gaussians).time_step(1.0, FINE + 1).penalties == {}
 
 
-# --- freezing ---------------------------------------------------------------------------------------------------------
+# --- freezing
+# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("in_place", "kept"), [(True, [2, 3]), (False, [0, 2, 3])])
-def test_where_cameras_stay_nothing_moves_that_images_show_still(in_place: bool, kept: list[int]) -> None:
+def test_where_cameras_stay_nothing_moves_that_images_show_still(
+    in_place: bool, kept: list[int]
+) -> None:
     """Four move by far, the fourth least; the images say of two that they are like the median."""
-    still, moving = 0.2 * DynamicModel().motion_threshold, 0.3 * DynamicModel().motion_threshold
+    still = 0.2 * DynamicModel().motion_threshold
+    moving = 0.3 * DynamicModel().motion_threshold
     errors = alike(torch.tensor([still, moving, moving, moving]))
     gaussians = flat_cloud(4)
     run = begun(gaussians, still_errors=lambda _: errors, cameras_stay=in_place)
@@ -299,7 +337,8 @@ def test_freezing_goes_on_at_the_next_split() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_can_be_frozen(kind: str) -> None:
-    """Also where a network moves everything: what is left moves as before, except that nodes come and go."""
+    """Also where a network moves everything: what is left moves as before, except that nodes come
+    and go."""
     gaussians = flat_cloud()
     run = begun(gaussians, deform=tiny_options(kind), freeze_below_px=1.0)
     assert run.scene.field is not None
@@ -309,11 +348,14 @@ def test_every_kind_can_be_frozen(kind: str) -> None:
     run.after_step(SPLIT)
     if kind != "control_nodes":
         new = run.drawn_at(0.4)
-        torch.testing.assert_close(new.means[run.scene.rows], old.means[run.scene.rows], rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            new.means[run.scene.rows], old.means[run.scene.rows], rtol=0, atol=1e-5
+        )
     assert run.drawn_at(0.4).means.isfinite().all()
 
 
-# --- following --------------------------------------------------------------------------------------------------------
+# --- following
+# --------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
@@ -330,20 +372,30 @@ def test_descendants_of_what_moves_move(data: st.DataObject) -> None:
         run.after_step(SPLIT)
     ancestor = torch.arange(9)
     for _ in range(data.draw(st.integers(1, 3))):
-        source = torch.tensor(data.draw(st.lists(st.integers(0, len(ancestor) - 1), max_size=14)), dtype=torch.long)
-        is_new = torch.tensor(data.draw(st.lists(st.booleans(), min_size=len(source), max_size=len(source))))
+        source = torch.tensor(
+            data.draw(st.lists(st.integers(0, len(ancestor) - 1), max_size=14)), dtype=torch.long
+        )
+        is_new = torch.tensor(
+            data.draw(st.lists(st.booleans(), min_size=len(source), max_size=len(source)))
+        )
         edit = TopologyEdit(source, is_new.bool())
-        gaussians = Gaussians(**{name: edit.apply(x.detach()).clone() for name, x in gaussians.tensors().items()})
+        gaussians = Gaussians(
+            **{name: edit.apply(x.detach()).clone() for name, x in gaussians.tensors().items()}
+        )
         run.after_step(FINE + 1, EditResult(edit))
         ancestor = ancestor[source]
         if len(ancestor) == 0:
             break
     shift = (run.drawn_at(1.0).means - gaussians.means)[:, 0]
-    torch.testing.assert_close(shift, torch.where(moves, identity, 0.0)[ancestor], rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        shift, torch.where(moves, identity, 0.0)[ancestor], rtol=0, atol=1e-5
+    )
     followed = moves[ancestor] if frozen else torch.ones(len(ancestor), dtype=torch.bool)
     assert torch.equal(run.scene.rows, torch.nonzero(followed)[:, 0])
     if run.scene.field is not None:
-        assert torch.equal(speeds_of(run), torch.where(moves, identity, 0.0)[ancestor[run.scene.rows]])
+        assert torch.equal(
+            speeds_of(run), torch.where(moves, identity, 0.0)[ancestor[run.scene.rows]]
+        )
     assert run.scene.num_moving == (0 if run.scene.field is None else len(speeds_of(run)))
 
 
@@ -354,7 +406,9 @@ def test_moments_of_new_rows_start_at_zero() -> None:
     run.after_step(SPLIT)
     assert run.scene.field is not None
     run.scene.field.parameters["means"].grad = torch.ones(3, 1, 3)
-    edit = TopologyEdit(torch.tensor([0, 1, 1, 2, 8, 3]), torch.tensor([False, False, True, False, True, True]))
+    edit = TopologyEdit(
+        torch.tensor([0, 1, 1, 2, 8, 3]), torch.tensor([False, False, True, False, True, True])
+    )
     run.after_step(SPLIT + 1, EditResult(edit))
     assert run.scene.rows.tolist() == [1, 2, 3, 5]
     moments = run.scene.field.parameters.state()["exp_avg.means"].tensor
@@ -369,14 +423,18 @@ def test_a_reset_of_opacities_moves_no_rows() -> None:
     assert torch.equal(speeds_of(run), torch.ones(9))
 
 
-# --- state ------------------------------------------------------------------------------------------------------------
+# --- state
+# ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("phase", ["coarse", "fine", "split"])
 def test_state_goes_round(kind: str, phase: str) -> None:
-    gaussians, deform = flat_cloud(), tiny_options(kind)
-    run = new_run(gaussians, deform=deform) if phase == "coarse" else begun(gaussians, deform=deform)
+    gaussians = flat_cloud()
+    deform = tiny_options(kind)
+    run = (
+        new_run(gaussians, deform=deform) if phase == "coarse" else begun(gaussians, deform=deform)
+    )
     if phase != "coarse":
         assert run.scene.field is not None
         run.drawn_at(0.4)
@@ -395,15 +453,19 @@ def test_state_goes_round(kind: str, phase: str) -> None:
     assert other.training.restored(gaussians, {}).field is None
 
 
-# --- fixed cameras -------------------------------------------------------------------------------------------------
+# --- fixed cameras
+# -------------------------------------------------------------------------------------------------
 
 
 def test_motion_begins_where_fixed_cameras_see_changes() -> None:
-    """Free primitives: no random Gaussians, all times from the start, and the ball of each time in its place then."""
+    """Free primitives: no random Gaussians, all times from the start, and the ball of each time in
+    its place then."""
     times = tuple(i / 7 for i in range(8))
     footage = filmed(lambda t: [Ball((0.0, 0.1, 1.6 * t - 0.8))], times)
     errors = alike(torch.tensor(ERRORS))
-    begin = partial(new_run, flat_cloud(), times, deform=FreeField(), num_random_moving=800, full=FINE + 20)
+    begin = partial(
+        new_run, flat_cloud(), times, deform=FreeField(), num_random_moving=800, full=FINE + 20
+    )
     run = begin(still_errors=lambda _: errors, motion_threshold=0.1, time_window=0.2)
     run.training.capture = replace(run.training.capture, standing=lambda: footage)
     result = run.grow(FINE)
@@ -448,7 +510,9 @@ def test_where_nothing_changes_random_gaussians_are_added() -> None:
     errors = alike(torch.tensor(ERRORS))
     nothing = filmed(lambda _: [], TIMES[:4])
     for deform, footage in ((FreeField(), nothing), (ControlNodesField(nodes=4), None)):
-        run = new_run(flat_cloud(), still_errors=lambda _: errors, deform=deform, num_random_moving=4)
+        run = new_run(
+            flat_cloud(), still_errors=lambda _: errors, deform=deform, num_random_moving=4
+        )
         run.training.capture = replace(run.training.capture, standing=lambda shown=footage: shown)
         result = run.grow(FINE)
         assert result is not None

@@ -1,4 +1,5 @@
-"""Windows in time: nothing changes while they are open, closed ones hide, and nothing is lost when they are stored."""
+"""Windows in time: nothing changes while they are open, closed ones hide, and nothing is lost when
+they are stored."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ def windowed(kind: str = "control_nodes", *, everything: bool = True) -> Windowe
 @pytest.mark.parametrize("everything", [True, False])
 def test_an_open_window_changes_nothing(everything: bool) -> None:
     others = stirred_field("control_nodes", everything=everything)
-    field, gaussians = WindowedField(others, COUNT), cloud()
+    field = WindowedField(others, COUNT)
+    gaussians = cloud()
     for time in TIMES:
         before = deformed(gaussians, others.offsets(gaussians.means, time))
         after = deformed(gaussians, field.offsets(gaussians.means, time))
@@ -45,7 +47,8 @@ def test_windows_are_flat_inside_and_fall_off_outside() -> None:
     def window(a: float, b: float, time: float) -> float:
         return -math.log1p(math.exp((a - time) / EDGE)) - math.log1p(math.exp((time - b) / EDGE))
 
-    field, means = windowed(everything=False), cloud().means
+    field = windowed(everything=False)
+    means = cloud().means
     for time in (0.0, 0.2, 0.5, 0.9, 1.0):
         found = field.offsets(means, time).logit_opacities
         assert found is not None
@@ -54,8 +57,10 @@ def test_windows_are_flat_inside_and_fall_off_outside() -> None:
 
 
 def test_windows_add_to_opacities_that_change() -> None:
-    field, means = windowed("hexplane"), cloud().means
-    found, alone = field.offsets(means, 0.37), field.others.offsets(means, 0.37)
+    field = windowed("hexplane")
+    means = cloud().means
+    found = field.offsets(means, 0.37)
+    alone = field.others.offsets(means, 0.37)
     plain = windowed("hexplane", everything=False).offsets(means, 0.37)
     assert found.logit_opacities is not None
     assert alone.logit_opacities is not None
@@ -64,14 +69,18 @@ def test_windows_add_to_opacities_that_change() -> None:
 
 
 def test_rows_alone_are_computed_alike() -> None:
-    field, means, rows = windowed(), cloud().means, torch.tensor([8, 0, 3])
-    some, every = field.offsets(means, 0.37, rows), field.offsets(means, 0.37).select(rows)
+    field = windowed()
+    means = cloud().means
+    rows = torch.tensor([8, 0, 3])
+    some = field.offsets(means, 0.37, rows)
+    every = field.offsets(means, 0.37).select(rows)
     for name, x in vars(some).items():
         torch.testing.assert_close(x, getattr(every, name), rtol=0, atol=1e-6)
 
 
 def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they_began() -> None:
-    field, means = WindowedField(stirred_field("control_nodes"), COUNT), cloud().means
+    field = WindowedField(stirred_field("control_nodes"), COUNT)
+    means = cloud().means
     began = field.edges.detach().clone()
     for step in range(1, 200):
         for time, sign in ((0.0, 1.0), (1.0, -1.0)):  # unwanted at first, wanted at last
@@ -92,7 +101,8 @@ def test_what_is_born_has_its_parents_window() -> None:
 
 
 def test_the_field_within_can_be_exchanged() -> None:
-    field, other = windowed(), stirred_field("mlp")
+    field = windowed()
+    other = stirred_field("mlp")
     assert innermost(field) is field.others
     exchanged = with_innermost(field, other)
     assert isinstance(exchanged, WindowedField)
@@ -106,7 +116,8 @@ def stored(field: WindowedField) -> dict[str, Tensor]:
 
 
 def test_a_stored_field_is_the_same_field() -> None:
-    field, means = windowed(), cloud().means
+    field = windowed()
+    means = cloud().means
     again = restored_field(tiny_options("control_nodes"), stored(field), COUNT)
     assert isinstance(again, WindowedField)
     assert stored(again).keys() == stored(field).keys()
@@ -118,7 +129,14 @@ def test_a_stored_field_is_the_same_field() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [lambda x: x[1:], lambda x: x[:, :1], lambda x: x * float("nan"), lambda x: x.double(), lambda _: None]
+    "change",
+    [
+        lambda x: x[1:],
+        lambda x: x[:, :1],
+        lambda x: x * float("nan"),
+        lambda x: x.double(),
+        lambda _: None,
+    ],
 )
 def test_a_forged_state_is_refused(change: Callable[[Tensor], Tensor | None]) -> None:
     tensors = stored(windowed())

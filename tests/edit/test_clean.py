@@ -1,4 +1,5 @@
-"""What is told apart by shape and by contribution, and that it costs no more than allowed on views held out."""
+"""What is told apart by shape and by contribution, and that it costs no more than allowed on views
+held out."""
 
 from __future__ import annotations
 
@@ -23,17 +24,28 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def run_dir(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of few steps, in which much that is random has stayed."""
-    keys = ("train.steps=30", "init.kind=random", "init.num_random=300", "strategy.prune_pixels=0", "run.threads=1")
+    keys = (
+        "train.steps=30",
+        "init.kind=random",
+        "init.num_random=300",
+        "strategy.prune_pixels=0",
+        "run.threads=1",
+    )
     out = tmp_path_factory.mktemp("runs") / "run"
-    return train(load_config(packaged_preset("static"), [f"data.root={still}", f"run.dir={out}", *keys]))
+    return train(
+        load_config(packaged_preset("static"), [f"data.root={still}", f"run.dir={out}", *keys])
+    )
 
 
 def spoiled() -> Gaussians:
     """200 good Gaussians, then a needle, a veil, a faint one and one far away."""
     good = cloud(204, 0)
-    log_scales, logits, means = torch.full((204, 3), -3.0), torch.full((204,), 2.0), good.means.clone()
+    log_scales = torch.full((204, 3), -3.0)
+    logits = torch.full((204,), 2.0)
+    means = good.means.clone()
     log_scales[200, 0] = 2.0
-    log_scales[201], logits[201] = 0.0, -3.0
+    log_scales[201] = 0.0
+    logits[201] = -3.0
     logits[202] = -7.0
     means[203] = torch.tensor([0.0, 300.0, 0.0])
     return good.replace(means=means, log_scales=log_scales, logit_opacities=logits)
@@ -62,7 +74,9 @@ def test_the_same_goes_in_any_unit(factor: float) -> None:
 
 
 def test_what_contributes_least_goes_first() -> None:
-    found = Suspects.of("faint", torch.tensor([True, False, True, True]), torch.tensor([3.0, 0.0, 1.0, 3.0]))
+    found = Suspects.of(
+        "faint", torch.tensor([True, False, True, True]), torch.tensor([3.0, 0.0, 1.0, 3.0])
+    )
     assert found.rows.tolist() == [2, 0, 3]
 
 

@@ -1,4 +1,5 @@
-"""What words mean as frames, and control points; each word that means nothing is told in one line."""
+"""What words mean as frames, and control points; each word that means nothing is told in one
+line."""
 
 from __future__ import annotations
 
@@ -24,12 +25,15 @@ def table(path: Path, world: np.ndarray, scene: np.ndarray = SCENE, start: str =
 
 def test_a_frame_is_one_similarity() -> None:
     """The origin goes to zero, up goes up, and two points are as far apart as told."""
-    start, end = (1.0, 2.0, 3.0), (1.0, 2.0, 5.0)
+    start = (1.0, 2.0, 3.0)
+    end = (1.0, 2.0, 5.0)
     frame = Frame(origin=(0.0, 1.0, 0.0), scale=Distance(start, end, 1.25))
     found = frame.similarity((0.0, 0.6, 0.8), (0.0, -1.0, 0.0))
     np.testing.assert_allclose(found.points(np.array([0.0, 1, 0])), 0, atol=1e-12)
     np.testing.assert_allclose(found.rotation @ [0.0, 0.6, 0.8], [0, -1, 0], atol=1e-12)
-    assert np.linalg.norm(found.points(np.array(start)) - found.points(np.array(end))) == pytest.approx(1.25)
+    assert np.linalg.norm(
+        found.points(np.array(start)) - found.points(np.array(end))
+    ) == pytest.approx(1.25)
     assert Frame().similarity(None, (0.0, 1.0, 0.0)) == Similarity()
 
 
@@ -54,7 +58,10 @@ def test_words() -> None:
         (lambda: Frame(scale=0.0).similarity(None, ()), "--scale: 0 is no factor"),
         (lambda: Frame(scale=-2.0).similarity(None, ()), "--scale: -2 is no factor"),
         (lambda: Frame(scale=1e300).similarity(None, ()), "is no factor from 1e-09 to 1e"),
-        (lambda: Frame(scale=scale_of("1,1,1 1,1,1 2m")).similarity(None, ()), "the two points are one"),
+        (
+            lambda: Frame(scale=scale_of("1,1,1 1,1,1 2m")).similarity(None, ()),
+            "the two points are one",
+        ),
     ],
 )
 def test_words_that_mean_nothing(call: Callable[[], object], said: str) -> None:
@@ -64,14 +71,18 @@ def test_words_that_mean_nothing(call: Callable[[], object], said: str) -> None:
 
 
 def test_control_points(tmp_path: Path) -> None:
-    found = geo_frame(table(tmp_path / "a.csv", WORLD.points(SCENE), start="x,y,z,X,Y,Z\n# measured in May\n\n"))
+    found = geo_frame(
+        table(tmp_path / "a.csv", WORLD.points(SCENE), start="x,y,z,X,Y,Z\n# measured in May\n\n")
+    )
     np.testing.assert_allclose(found.similarity.points(SCENE), WORLD.points(SCENE), atol=1e-9)
     assert found.offset == (0.0, 0.0, 0.0)
     assert len(found.lines) == 1
     assert "4 control points: scale 20; residuals" in found.lines[0]
     bent = WORLD.points(SCENE) + np.array([[0.3, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
     found = geo_frame(table(tmp_path / "b.csv", bent))
-    np.testing.assert_allclose(found.residuals, np.linalg.norm(found.similarity.points(SCENE) - bent, axis=1))
+    np.testing.assert_allclose(
+        found.residuals, np.linalg.norm(found.similarity.points(SCENE) - bent, axis=1)
+    )
     assert 0.01 < found.residuals.max() < 0.3
 
 

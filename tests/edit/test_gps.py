@@ -16,7 +16,8 @@ from dyngs.errors import DyngsError
 from dyngs.runs.opened import open_run
 from dyngs.splats.similarity import Similarity
 
-WORLD = Similarity((0.5, 0.5, -0.5, 0.5), 3.0, (40.0, -20.0, 7.0))  # from the scene to metres east, north and up
+# from the scene to metres east, north and up
+WORLD = Similarity((0.5, 0.5, -0.5, 0.5), 3.0, (40.0, -20.0, 7.0))
 ORIGIN = (48.1371, -11.5754, 519.0)
 METRES = 6_371_000 * np.pi / 180  # of a degree of latitude, nearly
 
@@ -24,9 +25,13 @@ METRES = 6_371_000 * np.pi / 180  # of a degree of latitude, nearly
 def stamp(path: Path, latitude: float, longitude: float, altitude: float | None) -> None:
     """Write a position into a photo."""
     with Image.open(path) as image:
-        exif, pixels = Image.Exif(), image.copy()
+        exif = Image.Exif()
+        pixels = image.copy()
     told = {1: "S" if latitude < 0 else "N", 2: (int(abs(latitude)), 0.0, abs(latitude) % 1 * 3600)}
-    told |= {3: "W" if longitude < 0 else "E", 4: (int(abs(longitude)), abs(longitude) % 1 * 60, 0.0)}
+    told |= {
+        3: "W" if longitude < 0 else "E",
+        4: (int(abs(longitude)), abs(longitude) % 1 * 60, 0.0),
+    }
     if altitude is not None:
         told |= {5: b"\1" if altitude < 0 else b"\0", 6: abs(altitude)}
     exif[0x8825] = told
@@ -40,12 +45,13 @@ def centres_of(run: Path) -> dict[Path, np.ndarray]:
 
 
 def stamped(run: Path, *, noise: float = 0.0, count: int = 99, flat: bool = False) -> None:
-    """Write positions into ``count`` photos of a run; ``flat``: as if the cameras stood on a line."""
+    """Write positions into ``count`` photos of a run; ``flat``: as if the cameras stood on a
+    line."""
     random = np.random.default_rng(0)
     for i, (path, centre) in enumerate(list(centres_of(run).items())[:count]):
-        metres = (WORLD.points(centre) if not flat else np.array([3.0 * i, 2.0 * i, 0.0])) + noise * random.normal(
-            size=3
-        )
+        metres = (
+            WORLD.points(centre) if not flat else np.array([3.0 * i, 2.0 * i, 0.0])
+        ) + noise * random.normal(size=3)
         latitude = ORIGIN[0] + metres[1] / METRES
         longitude = ORIGIN[1] + metres[0] / METRES / np.cos(np.radians(ORIGIN[0]))
         stamp(path, latitude, longitude, ORIGIN[2] + metres[2])
@@ -81,7 +87,10 @@ def test_the_error_is_stated(run: Path) -> None:
 @pytest.mark.parametrize(
     ("how", "said"),
     [
-        ({"count": 3}, "3 of 8 photos have a position with altitude in EXIF, and --geo exif needs 4 or more"),
+        (
+            {"count": 3},
+            "3 of 8 photos have a position with altitude in EXIF, and --geo exif needs 4 or more",
+        ),
         ({"flat": True}, "stand (on|too near to) one line"),
         ({"noise": 30.0}, "too near to one line for positions that are off by"),
     ],
@@ -109,7 +118,8 @@ def test_what_states_no_position(tmp_path: Path) -> None:
 
 
 def test_the_tangent_plane() -> None:
-    """Known lengths of WGS84: a degree of latitude is 110.574 km at the equator, one of longitude 111.320 km."""
+    """Known lengths of WGS84: a degree of latitude is 110.574 km at the equator, one of longitude
+    111.320 km."""
     origin = np.zeros(3)
     near = east_north_up(np.array([[1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 5.0]]), origin)
     np.testing.assert_allclose(near, [[0, 110.574, 0], [111.320, 0, 0], [0, 0, 5]], atol=2e-3)
@@ -125,4 +135,7 @@ def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert opened.edited is not None
     assert opened.edited.fixed
     assert opened.scaled
-    assert main(["edit", str(run), "--geo", "exif", "--up", "z", "--out", str(tmp_path / "other")]) == 2
+    assert (
+        main(["edit", str(run), "--geo", "exif", "--up", "z", "--out", str(tmp_path / "other")])
+        == 2
+    )

@@ -22,7 +22,8 @@ from dyngs.splats.splat_file import SplatFile
 
 def test_files_and_runs_are_added(tmp_path: Path) -> None:
     """The degree is that of the richest one; a scene turned for a format is turned back."""
-    first, other = SplatFile(cloud(40, 1), up="-y"), SplatFile(cloud(30, 3, seed=1), up="-y")
+    first = SplatFile(cloud(40, 1), up="-y")
+    other = SplatFile(cloud(30, 3, seed=1), up="-y")
     path = write_splats(tmp_path / "a.ply", upright(other, "y", tmp_path / "a.ply")).path
     run = write_moving_run(tmp_path, moves=False)
     told: list[str] = []
@@ -40,10 +41,17 @@ def test_files_and_runs_are_added(tmp_path: Path) -> None:
 
 def test_scenes_far_from_the_origin_lie_as_in_the_world(tmp_path: Path) -> None:
     """Two files of one survey, less an offset of each, turned for viewers in different ways."""
-    first, other = cloud(20, 0), cloud(30, 0, seed=1)
-    splat = SplatFile(Similarity((0.0, 1.0, 0.0, 0.0)).gaussians(first), world_offset=FAR, turned=(0.0, 1.0, 0.0, 0.0))
+    first = cloud(20, 0)
+    other = cloud(30, 0, seed=1)
+    splat = SplatFile(
+        Similarity((0.0, 1.0, 0.0, 0.0)).gaussians(first),
+        world_offset=FAR,
+        turned=(0.0, 1.0, 0.0, 0.0),
+    )
     x, y, z = FAR
-    path = write_splats(tmp_path / "b.ply", SplatFile(other, world_offset=(x + 3, y - 2, z + 1), up="z")).path
+    path = write_splats(
+        tmp_path / "b.ply", SplatFile(other, world_offset=(x + 3, y - 2, z + 1), up="z")
+    ).path
     both = merged(splat, (0.0, -1.0, 0.0), (path,), lambda _: None)
     world = splat.frame.inverse().points(both.gaussians.means.numpy())
     np.testing.assert_allclose(world[:20], first.means.numpy(), atol=1e-6)
@@ -51,7 +59,9 @@ def test_scenes_far_from_the_origin_lie_as_in_the_world(tmp_path: Path) -> None:
 
 
 def test_other_low_pass_filters_are_told(tmp_path: Path) -> None:
-    path = write_splats(tmp_path / "a.ply", SplatFile(row_of_balls(), RasterizeMode.ANTIALIASED)).path
+    path = write_splats(
+        tmp_path / "a.ply", SplatFile(row_of_balls(), RasterizeMode.ANTIALIASED)
+    ).path
     told: list[str] = []
     found = merged(SplatFile(row_of_balls()), None, (path,), told.append)
     assert found.mode is RasterizeMode.CLASSIC
@@ -65,6 +75,8 @@ def test_what_cannot_be_added(tmp_path: Path) -> None:
 
     refused(write_moving_run(tmp_path), "moves, and --merge adds still scenes")
     refused(tmp_path / "none.ply", "no such file")
-    path = write_splats(tmp_path / "a.ply", SplatFile(Gaussians(**row_of_balls(100).tensors()))).path
+    path = write_splats(
+        tmp_path / "a.ply", SplatFile(Gaussians(**row_of_balls(100).tensors()))
+    ).path
     path.write_bytes(path.read_bytes()[:2000])
     refused(path, "is truncated|ends early|cut")

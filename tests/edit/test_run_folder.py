@@ -45,9 +45,11 @@ def expected(run: Path) -> Similarity:
 
 
 def test_files_of_gaussians_cameras_and_tracks_move_as_one(tmp_path: Path) -> None:
-    """What exported cameras see of exported Gaussians is what cameras of the capture see of the scene."""
+    """What exported cameras see of exported Gaussians is what cameras of the capture see of the
+    scene."""
     run = write_moving_run(tmp_path)
-    opened, how = open_run(edited(run)), expected(run)
+    opened = open_run(edited(run))
+    how = expected(run)
     times = (0.0, 0.75)
     wanted = [how.points(opened.scene.at(t).means.numpy()) for t in times]
     tracks = tracks_of(opened.scene, times, opened.world)
@@ -56,7 +58,12 @@ def test_files_of_gaussians_cameras_and_tracks_move_as_one(tmp_path: Path) -> No
     file = write_run_splats(opened, tmp_path / "a.ply", 0.75).path
     read = read_splats(file)
     np.testing.assert_allclose(read.gaussians.means.numpy(), wanted[1], atol=1e-5)
-    path = write_cameras(tmp_path / "cameras" / "transforms.json", opened.capture, opened.capture.splits, opened.world)
+    path = write_cameras(
+        tmp_path / "cameras" / "transforms.json",
+        opened.capture,
+        opened.capture.splits,
+        opened.world,
+    )
     frames = json.loads(path.read_text())["frames"]
     cameras = training_cameras(opened.capture.splits["train"][:1], opened.config.data)[0]
     pose = np.array(frames[0]["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
@@ -82,10 +89,15 @@ def test_files_have_the_up_of_their_format_and_can_be_undone(tmp_path: Path) -> 
 
 
 def test_paths_are_in_the_frame_that_people_see(tmp_path: Path) -> None:
-    """A path that the viewer saves has its cameras where they are in the frame, and comes back as it was recorded."""
+    """A path that the viewer saves has its cameras where they are in the frame, and comes back as
+    it was recorded."""
     opened = open_run(edited(write_moving_run(tmp_path)))
     (camera,) = training_cameras(opened.capture.splits["train"][:1], opened.config.data)
-    text = Recording((Keyframe(camera, 0.0),)).moved(opened.frame).document((16, 16), 30.0, opened.world_offset)
+    text = (
+        Recording((Keyframe(camera, 0.0),))
+        .moved(opened.frame)
+        .document((16, 16), 30.0, opened.world_offset)
+    )
     (tmp_path / "path.json").write_text(text)
     pose = np.array(json.loads(text)["keyframes"][0]["cam_from_world"])
     centre = -pose[:3, :3].T @ pose[:3, 3]
@@ -97,11 +109,15 @@ def test_paths_are_in_the_frame_that_people_see(tmp_path: Path) -> None:
 def test_edits_add_up_and_are_undone_to_the_bytes(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, offset=(100.0, 0.0, 0.0))
     once = edited(run, replace(EDITS, frame=replace(EDITS.frame, origin=(100.5, 0.25, 0.0))))
-    np.testing.assert_allclose(open_run(once).frame.points(np.array([0.5, 0.25, 0.0])), 0, atol=1e-9)
+    np.testing.assert_allclose(
+        open_run(once).frame.points(np.array([0.5, 0.25, 0.0])), 0, atol=1e-9
+    )
     twice = open_run(edited(once, Edits(frame=Frame(scale=0.5, origin=(1.0, 2.0, 3.0))), "twice"))
     assert twice.frame.scale == pytest.approx(1.5)
     np.testing.assert_allclose(
-        twice.world.points(open_run(once).frame.inverse().points(np.array([1.0, 2, 3]))), 0, atol=1e-12
+        twice.world.points(open_run(once).frame.inverse().points(np.array([1.0, 2, 3]))),
+        0,
+        atol=1e-12,
     )
     assert twice.stated_up == "z"
     back = edited(tmp_path / "twice", Edits(undo=True), "back")
@@ -119,7 +135,8 @@ def test_a_part_in_the_coordinates_of_the_frame(tmp_path: Path) -> None:
                  "init.kind=random", "init.num_random=40", "run.threads=1"]) == 0  # fmt: skip
     once = edited(tmp_path / "ran")
     centre = tuple(open_run(once).frame.points(np.array([0.5, 0.0, 0.0])).tolist())
-    part = edited(once, Edits(region=Sphere((centre[0], centre[1], centre[2]), 2.4)), "part")  # 0.8 in the scene
+    # 0.8 in the scene
+    part = edited(once, Edits(region=Sphere((centre[0], centre[1], centre[2]), 2.4)), "part")
     means = open_run(once).scene.gaussians.means
     kept = (means - torch.tensor([0.5, 0.0, 0.0])).norm(dim=1) <= 0.8
     assert 0 < int(kept.sum()) < len(means)
@@ -149,7 +166,9 @@ def test_control_points_keep_their_axes_and_their_offset(tmp_path: Path) -> None
     x = moved_x(MOVING_ROWS, 0.25).double().numpy()
     world = splat.gaussians.means[list(MOVING_ROWS)].double().numpy() + opened.world_offset
     np.testing.assert_allclose(world[:, 2], 500 + 2 * x, atol=1e-4)
-    np.testing.assert_allclose(opened.world.points(row_of_balls().means.numpy())[:, 2], 500 + np.linspace(-2, 2, 5))
+    np.testing.assert_allclose(
+        opened.world.points(row_of_balls().means.numpy())[:, 2], 500 + np.linspace(-2, 2, 5)
+    )
 
 
 def test_what_is_no_run(tmp_path: Path) -> None:

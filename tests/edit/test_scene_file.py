@@ -31,12 +31,15 @@ def silent(text: str) -> None:
 
 @pytest.fixture
 def plain(tmp_path: Path) -> Path:
-    return write_splats(tmp_path / "plain.ply", SplatFile(cloud(300, 2), up="-y", comments=("mine",))).path
+    return write_splats(
+        tmp_path / "plain.ply", SplatFile(cloud(300, 2), up="-y", comments=("mine",))
+    ).path
 
 
 @pytest.mark.parametrize("kind", readable(), ids=str)
 def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: Path) -> None:
-    before, path = plain.read_bytes(), tmp_path / f"a{kind.suffixes[0]}"
+    before = plain.read_bytes()
+    path = tmp_path / f"a{kind.suffixes[0]}"
     written = edit_scene(plain, path, HALF, tell=silent)
     assert written.redrawn.psnr > (99 if kind.name in ("ply", "usd", "glb") else 15)
     assert read_splats(path).up == kind.up
@@ -47,21 +50,31 @@ def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: P
         for name, x in read_splats(plain).gaussians.tensors().items():
             got = getattr(back.gaussians, name)
             torch.testing.assert_close(
-                got.abs() if name == "quats" else got, x.abs() if name == "quats" else x, rtol=0, atol=2e-5
+                got.abs() if name == "quats" else got,
+                x.abs() if name == "quats" else x,
+                rtol=0,
+                atol=2e-5,
             )
     assert not (tmp_path / "back.ply.edit.json").exists()
 
 
 def test_edits_add_up(plain: Path, tmp_path: Path) -> None:
-    """Distances are those that are asked for, also after another edit; what programs wrote in comments stays."""
+    """Distances are those that are asked for, also after another edit; what programs wrote in
+    comments stays."""
     means = read_splats(plain).gaussians.means.double().numpy()
     a, b = (tuple(x.tolist()) for x in means[:2])
-    edit_scene(plain, tmp_path / "a.ply", Edits(frame=Frame(scale=Distance(a, b, 1.25))), tell=silent)
+    edit_scene(
+        plain, tmp_path / "a.ply", Edits(frame=Frame(scale=Distance(a, b, 1.25))), tell=silent
+    )
     first = read_splats(tmp_path / "a.ply")
-    assert float((first.gaussians.means[0] - first.gaussians.means[1]).norm()) == pytest.approx(1.25, abs=1e-5)
+    assert float((first.gaussians.means[0] - first.gaussians.means[1]).norm()) == pytest.approx(
+        1.25, abs=1e-5
+    )
     edit_scene(tmp_path / "a.ply", tmp_path / "b.ply", HALF, tell=silent)
     second = read_splats(tmp_path / "b.ply")
-    np.testing.assert_allclose(second.edited.points(means), second.gaussians.means.numpy(), atol=1e-5)
+    np.testing.assert_allclose(
+        second.edited.points(means), second.gaussians.means.numpy(), atol=1e-5
+    )
     assert "mine" in second.comments
     opened = open_scene(tmp_path / "b.ply")
     assert (opened.turned, tuple(opened.world_offset)) == ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -73,14 +86,25 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
     rows = np.concatenate([points, world], axis=1)
     (tmp_path / "geo.txt").write_text("\n".join(" ".join(map(repr, row)) for row in rows.tolist()))
     told: list[str] = []
-    edit_scene(plain, tmp_path / "a.ply", Edits(geo=geo_frame(tmp_path / "geo.txt")), tell=told.append)
+    edit_scene(
+        plain, tmp_path / "a.ply", Edits(geo=geo_frame(tmp_path / "geo.txt")), tell=told.append
+    )
     found = read_splats(tmp_path / "a.ply")
     comment = next(text for text in found.comments if text.startswith("geo offset"))
     offset = np.array([float(x) for x in comment.split(": ")[1].split()])
-    wanted = 2 * read_splats(plain).gaussians.means.numpy()[:, [1, 2, 0]] + [691000.0, 5334000.0, 500.0]
+    wanted = 2 * read_splats(plain).gaussians.means.numpy()[:, [1, 2, 0]] + [
+        691000.0,
+        5334000.0,
+        500.0,
+    ]
     np.testing.assert_allclose(found.gaussians.means.double().numpy() + offset, wanted, atol=1e-4)
     assert "viewers of the format take -y for up" in told[-1]
-    edit_scene(tmp_path / "a.ply", tmp_path / "b.ply", Edits(region=Sphere((0.0, 0.0, 0.0), 1e3)), tell=silent)
+    edit_scene(
+        tmp_path / "a.ply",
+        tmp_path / "b.ply",
+        Edits(region=Sphere((0.0, 0.0, 0.0), 1e3)),
+        tell=silent,
+    )
     part = read_splats(tmp_path / "b.ply")
     assert (part.up, comment in part.comments) == ("z", True)
     torch.testing.assert_close(part.gaussians.means, found.gaussians.means, rtol=0, atol=0)
@@ -99,7 +123,8 @@ def test_a_run_with_an_offset_is_meant_in_the_coordinates_of_its_capture(tmp_pat
 
 
 def test_a_file_far_from_the_origin_is_edited_in_its_own_coordinates(tmp_path: Path) -> None:
-    source, whole = tmp_path / "far.ply", cloud(200, 0)
+    source = tmp_path / "far.ply"
+    whole = cloud(200, 0)
     positions = write_far_ply(source, SplatFile(whole))
     corner = np.array(FAR)
     edits = Edits(region=Box(corner, corner + 100), frame=Frame(origin=FAR, scale=2.0))
@@ -110,7 +135,8 @@ def test_a_file_far_from_the_origin_is_edited_in_its_own_coordinates(tmp_path: P
 
 
 def test_a_moving_run(tmp_path: Path) -> None:
-    run, told = write_moving_run(tmp_path), []
+    run = write_moving_run(tmp_path)
+    told = []
     frame = Edits(frame=Frame(scale=3.0, up=(0.0, -1.0, 0.0)))
     edit_scene(run, tmp_path / "a.ply", frame, tell=told.append)
     assert "this is time 0 of a moving scene" in told[0]
@@ -118,7 +144,10 @@ def test_a_moving_run(tmp_path: Path) -> None:
     rows = list(MOVING_ROWS)
     moved = read_splats(tmp_path / "a.ply").gaussians.means[rows, 0]
     torch.testing.assert_close(moved, 3 * moved_x(MOVING_ROWS, 0.75), rtol=0, atol=1e-5)
-    for edits, said in ((replace(frame, merge=(run,)), "this one moves"), (Edits(undo=True), "nothing says that this")):
+    for edits, said in (
+        (replace(frame, merge=(run,)), "this one moves"),
+        (Edits(undo=True), "nothing says that this"),
+    ):
         with pytest.raises(DyngsError, match=said):
             edit_scene(run, tmp_path / "b.ply", edits, tell=silent)
     assert not (tmp_path / "b.ply").exists()
@@ -126,11 +155,14 @@ def test_a_moving_run(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(find_spec("fourdgs") is None, reason="needs fourdgs")
 def test_all_times_of_a_moving_run(tmp_path: Path) -> None:
-    path, run = tmp_path / "a.4dgs", write_moving_run(tmp_path)
+    path = tmp_path / "a.4dgs"
+    run = write_moving_run(tmp_path)
     edits = Edits(region=Sphere((0.0, 0.0, 0.0), 0.2), frame=Frame(scale=3.0, up=(0.0, -1.0, 0.0)))
     assert edit_scene(run, path, edits, tell=silent).redrawn.psnr > 40
     assert len(read_moment(path, 2).gaussians) == 3
-    assert float(read_moment(path, 4).gaussians.means[0, 0]) == pytest.approx(3 * float(moved_x((1,), 1.0)), abs=0.01)
+    assert float(read_moment(path, 4).gaussians.means[0, 0]) == pytest.approx(
+        3 * float(moved_x((1,), 1.0)), abs=0.01
+    )
 
 
 def test_nothing_is_written_where_nothing_is_left(plain: Path, tmp_path: Path) -> None:
@@ -139,7 +171,10 @@ def test_nothing_is_written_where_nothing_is_left(plain: Path, tmp_path: Path) -
         edit_scene(plain, tmp_path / "a.ply", far, tell=silent)
     edit_scene(plain, tmp_path / "a.ply", replace(far, outside=True), tell=silent)
     assert len(read_splats(tmp_path / "a.ply").gaussians) == 300
-    for name, said in (("a.4dgs", "holds a scene that moves"), ("a.html", "edits end in a file of Gaussians or a run")):
+    for name, said in (
+        ("a.4dgs", "holds a scene that moves"),
+        ("a.html", "edits end in a file of Gaussians or a run"),
+    ):
         with pytest.raises(DyngsError, match=said):
             edit_scene(plain, tmp_path / name, HALF, tell=silent)
     with pytest.raises(DyngsError, match="--up auto needs the cameras"):

@@ -22,7 +22,8 @@ def test_a_run_and_its_file(moving: Path, tmp_path: Path) -> None:
     for folder, cost in zip((run, file.parent), costs, strict=True):
         report = evaluate_run(folder, "test", threads=1)
         assert cost.num_gaussians == report.num_gaussians
-        assert cost.psnr_test == pytest.approx(report.psnr, abs=0.5)  # eval does not clamp what it draws
+        # eval does not clamp what it draws
+        assert cost.psnr_test == pytest.approx(report.psnr, abs=0.5)
         assert cost.megabytes == report.model_mb
         assert cost.stored == report.stored_mb
         assert cost.fps > 0

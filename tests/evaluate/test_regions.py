@@ -1,4 +1,5 @@
-"""Regions of images against images whose moving pixels are known, and the PSNR inside them against closed forms."""
+"""Regions of images against images whose moving pixels are known, and the PSNR inside them against
+closed forms."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ WHITE = torch.ones(3)
 
 
 def images_of_a_walk(count: int = 5) -> list[Image]:
-    """A white square of 6x6 pixels walks over grey ground; a single pixel flashes in the third image."""
+    """A white square of 6x6 pixels walks over grey ground; a single pixel flashes in the third
+    image."""
     shown = []
     for k in range(count):
         rgb = torch.full((SIDE, SIDE, 3), 0.4)
@@ -66,7 +68,8 @@ def test_what_changes_before_a_fixed_camera_moves() -> None:
 
 def test_scores_are_those_of_the_pixels_of_each_region() -> None:
     images = images_of_a_walk()
-    regions, image = regions_of(images), images[1]
+    regions = regions_of(images)
+    image = images[1]
     rendered = image.rgb_premultiplied.clone()
     rendered[9:15, 3:9] -= 0.1
     rendered[0, :, :] += 0.01
@@ -79,7 +82,8 @@ def test_scores_are_those_of_the_pixels_of_each_region() -> None:
 
 
 def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
-    moves, alpha = torch.zeros(SIDE, SIDE), torch.zeros(SIDE, SIDE)
+    moves = torch.zeros(SIDE, SIDE)
+    alpha = torch.zeros(SIDE, SIDE)
     moves[:, :12], alpha[:12] = 1.0, 1.0
     black = torch.zeros(SIDE, SIDE, 3)
     image = replace(images_of_a_walk()[0], alpha=alpha, rgb_premultiplied=black, moves=moves)
@@ -104,7 +108,9 @@ def test_each_thing_of_labelled_masks_has_a_score_of_its_own() -> None:
     rendered[:6, :6] -= 0.1
     rendered[6:12, :6] -= 0.01
     scores = regions_of([image]).scores_of_things(image, rendered, truth)
-    assert scores == {1: pytest.approx(20.0, abs=1e-3), 7: pytest.approx(40.0, abs=1e-2)}, "a single pixel says nothing"
+    assert scores == {1: pytest.approx(20.0, abs=1e-3), 7: pytest.approx(40.0, abs=1e-2)}, (
+        "a single pixel says nothing"
+    )
 
 
 def test_a_mask_of_a_image_holds_in_its_regions() -> None:
@@ -114,9 +120,13 @@ def test_a_mask_of_a_image_holds_in_its_regions() -> None:
     image = replace(images[1], mask=mask)
     rendered = image.rgb_premultiplied.clone()
     rendered[12:] = 0
-    assert regions_of(images).scores(image, rendered, image.rgb_premultiplied)["psnr_static"] == 100.0
+    assert (
+        regions_of(images).scores(image, rendered, image.rgb_premultiplied)["psnr_static"] == 100.0
+    )
     hidden = replace(image, mask=torch.zeros(SIDE, SIDE))
-    assert regions_of(images).scores(hidden, rendered, image.rgb_premultiplied)["psnr_static"] is None
+    assert (
+        regions_of(images).scores(hidden, rendered, image.rgb_premultiplied)["psnr_static"] is None
+    )
 
 
 def test_reasons_say_why_there_is_no_score() -> None:

@@ -34,7 +34,13 @@ from dyngs.files.write import write_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
-from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, latest_checkpoint, load_run, save_checkpoint
+from dyngs.runs.checkpoint import (
+    Checkpoint,
+    CheckpointInfo,
+    latest_checkpoint,
+    load_run,
+    save_checkpoint,
+)
 from dyngs.static.scene import StaticScene
 
 
@@ -45,7 +51,9 @@ def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:
         return torch.rand(*shape, generator=random) * 2 - 1
 
     sh = uniform(count, (degree + 1) ** 2, 3)
-    return Gaussians(uniform(count, 3), uniform(count, 4), uniform(count, 3) * 0.3 - 1.5, uniform(count) + 1, sh)
+    return Gaussians(
+        uniform(count, 3), uniform(count, 4), uniform(count, 3) * 0.3 - 1.5, uniform(count) + 1, sh
+    )
 
 
 def as_scene(gaussians: Gaussians) -> StaticScene:
@@ -54,13 +62,19 @@ def as_scene(gaussians: Gaussians) -> StaticScene:
 
 def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> Path:
     """A run folder with a 16x16 capture of 2 train and 3 test images beside it."""
-    root = write_still_capture(folder / "capture", StillOptions(size=16, num_train=2, num_test=3, samples=1))
+    root = write_still_capture(
+        folder / "capture", StillOptions(size=16, num_train=2, num_test=3, samples=1)
+    )
     run_dir = folder / "run"
     data = DataConfig.model_validate({"root": root, "background": background})
     config = Config(data=data, train=TrainConfig(steps=7))
     save_config(config, run_dir / RESOLVED_NAME)
     tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
-    save_checkpoint(run_dir, Checkpoint(CheckpointInfo(7, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors), 12.5)
+    save_checkpoint(
+        run_dir,
+        Checkpoint(CheckpointInfo(7, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors),
+        12.5,
+    )
     return run_dir
 
 
@@ -75,9 +89,25 @@ def test_report_of_a_run(tmp_path) -> None:
     parts = "ssim_person psnr_foreground psnr_moving psnr_static moving_from track_error_px track_within_5px"
     parts += " psnr_things track_motion_px psnr_right psnr_right_fitted psnr_own_poses own_poses"
     parts += " silhouette_poses psnr_white psnr_black ssim_black lpips_black"
-    rest = {*parts.split(), "seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
+    rest = {
+        *parts.split(),
+        "seconds_train",
+        "step",
+        "reasons",
+        "notes",
+        "per_view",
+        "colour_floats",
+        "stored_mb",
+    }
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
-    facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
+    facts = {
+        "split": "test",
+        "num_views": 3,
+        "width": 16,
+        "height": 16,
+        "background": "white",
+        "lpips_net": "alex",
+    }
     facts |= {"num_gaussians": 12, "step": 7, "seconds_train": 12.5}
     assert {key: stored[key] for key in facts} == facts
     assert stored["model_mb"] == pytest.approx(12 * 4 * (3 + 4 + 3 + 1 + 12) / 1e6)
@@ -98,7 +128,10 @@ def test_report_of_a_run(tmp_path) -> None:
 
 def test_psnr_is_that_on_the_background_of_the_run(tmp_path) -> None:
     """And the same number as on that colour; the scene is drawn once for both."""
-    reports = {name: evaluate_run(write_run(tmp_path / name, some_gaussians(), name)) for name in ("white", "black")}
+    reports = {
+        name: evaluate_run(write_run(tmp_path / name, some_gaussians(), name))
+        for name in ("white", "black")
+    }
     assert reports["white"].psnr == reports["white"].psnr_white
     assert reports["black"].psnr == reports["black"].psnr_black
     for name in ("psnr_white", "psnr_black"):
@@ -120,7 +153,9 @@ def test_scenes_that_are_worse_on_one_background_are_warned_of(tmp_path) -> None
 def test_an_unfinished_run_says_so(tmp_path) -> None:
     run_dir = write_run(tmp_path, some_gaussians())
     config = load_resolved(run_dir)
-    save_config(config.model_copy(update={"train": TrainConfig(steps=7000)}), run_dir / RESOLVED_NAME)
+    save_config(
+        config.model_copy(update={"train": TrainConfig(steps=7000)}), run_dir / RESOLVED_NAME
+    )
     (note,) = evaluate_run(run_dir).notes
     assert "stands at step 7 of 7,000" in note
     assert json.loads((run_dir / "metrics.json").read_text())["notes"] == [note]
@@ -135,7 +170,10 @@ def test_other_splits_and_backgrounds(tmp_path) -> None:
     assert report.notes == ("trained on random backgrounds, evaluated on black",)
     assert report.lpips_net == "vgg"
     assert not (run_dir / "metrics.json").exists()
-    with pytest.raises(DyngsError, match=r"the split 'val' has no views; there is train \(2 views\), test \(3 views\)"):
+    with pytest.raises(
+        DyngsError,
+        match=r"the split 'val' has no views; there is train \(2 views\), test \(3 views\)",
+    ):
         evaluate_run(run_dir, "val")
     assert not (run_dir / "metrics_val.json").exists()
 
@@ -157,15 +195,21 @@ def test_options_are_those_of_training() -> None:
     assert (options.mode, options.eps2d, options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.05)
     assert options.depth == "none"
     assert render_options(StaticModel(), extent=5.0) == RenderOptions(near=0.05)
-    assert render_options(model, extent=5.0, world_scale=0.5).near == 0.1, "a number is in the unit of the capture"
+    assert render_options(model, extent=5.0, world_scale=0.5).near == 0.1, (
+        "a number is in the unit of the capture"
+    )
     cut = render_options(StaticModel(alpha_min=0.02, transmittance_min=0.01))
     assert (cut.alpha_min, cut.transmittance_min) == (0.02, 0.01)
 
 
 def test_cut_offs_are_the_runs_own_and_runs_from_before_have_the_usual(tmp_path) -> None:
     run_dir = write_run(tmp_path, some_gaussians())
-    file, config, usual = run_dir / RESOLVED_NAME, load_resolved(run_dir), evaluate_run(run_dir).psnr
-    file.write_text("\n".join(line for line in file.read_text().splitlines() if "_min:" not in line))
+    file = run_dir / RESOLVED_NAME
+    config = load_resolved(run_dir)
+    usual = evaluate_run(run_dir).psnr
+    file.write_text(
+        "\n".join(line for line in file.read_text().splitlines() if "_min:" not in line)
+    )
     assert load_resolved(run_dir) == config
     save_config(load_resolved(run_dir, ["model.alpha_min=0.5"]), file)
     assert evaluate_run(run_dir).psnr != usual
@@ -189,8 +233,12 @@ def test_report_of_a_moving_run(tmp_path) -> None:
     assert report.field_mb == pytest.approx(4e-6 * values)
     assert report.model_mb == pytest.approx(4e-6 * (5 * 14 + values))
     assert [view.time for view in report.per_view] == list(TEST_TIMES)
-    assert [(at["time"], at["num_views"]) for at in stored["psnr_per_time"]] == [(t, 1) for t in TEST_TIMES]
-    assert [at["psnr"] for at in stored["psnr_per_time"]] == [view["psnr"] for view in stored["per_view"]]
+    assert [(at["time"], at["num_views"]) for at in stored["psnr_per_time"]] == [
+        (t, 1) for t in TEST_TIMES
+    ]
+    assert [at["psnr"] for at in stored["psnr_per_time"]] == [
+        view["psnr"] for view in stored["per_view"]
+    ]
     assert report.flicker is not None
     assert report.flicker_error is not None
     assert report.flicker_error > 0
@@ -212,7 +260,9 @@ def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
     start = row_of_balls().means[[1, 3]].numpy()
     points = np.stack([start + np.array([t - 0.5, 0, 0]) for t in TEST_TIMES])
     names = np.array([f"test/r_{i:03d}" for i in range(3)])
-    write_true_tracks(root, TrueTracks(points, np.array(TEST_TIMES), names, np.arange(3), np.ones((3, 2), bool)))
+    write_true_tracks(
+        root, TrueTracks(points, np.array(TEST_TIMES), names, np.arange(3), np.ones((3, 2), bool))
+    )
     report = evaluate_run(run_dir)
     assert report.psnr_foreground is not None
     assert report.psnr_foreground < report.psnr, "less white background"
@@ -247,15 +297,28 @@ def test_still_models_of_moving_captures(tmp_path) -> None:
 
 
 @pytest.fixture(scope="module", params=["always", "never"])
-def run(request: pytest.FixtureRequest, still: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def run(
+    request: pytest.FixtureRequest, still: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("runs") / request.param
-    keys = [f"data.root={still}", f"run.dir={folder}", "train.steps=30", "init.num_random=60", "run.threads=1"]
-    return dyngs.train(dyngs.load_config("static", [*keys, f"camera.refine={request.param}"])), request.param
+    keys = [
+        f"data.root={still}",
+        f"run.dir={folder}",
+        "train.steps=30",
+        "init.num_random=60",
+        "run.threads=1",
+    ]
+    return dyngs.train(
+        dyngs.load_config("static", [*keys, f"camera.refine={request.param}"])
+    ), request.param
 
 
-def test_the_second_figure_is_there_where_cameras_were_refined_or_it_is_asked_for(run: tuple[Path, str]) -> None:
+def test_the_second_figure_is_there_where_cameras_were_refined_or_it_is_asked_for(
+    run: tuple[Path, str],
+) -> None:
     folder, refine = run
-    report, asked = evaluate_run(folder), evaluate_run(folder, refine_poses=True)
+    report = evaluate_run(folder)
+    asked = evaluate_run(folder, refine_poses=True)
     assert (report.psnr_own_poses is not None) == (refine == "always")
     assert asked.psnr_own_poses is not None
     assert asked.psnr_own_poses > asked.psnr - 0.2  # its loss is not PSNR

@@ -46,14 +46,20 @@ def even(count: int) -> tuple[float, ...]:
 @pytest.fixture
 def split(tmp_path):
     """Loader and views of a test split whose camera stands."""
-    config = DataConfig.model_validate({"root": write_timed_capture(tmp_path / "capture", standing=True)})
+    config = DataConfig.model_validate(
+        {"root": write_timed_capture(tmp_path / "capture", standing=True)}
+    )
     views = read_capture(config).splits["test"]
     return ImageLoader(views, config), views
 
 
 def test_psnr_per_time_is_the_mean_of_the_views_of_each_time() -> None:
     scores = [(0.5, 30.0), (0.0, 10.0), (0.5, 20.0), (None, 99.0), (0.0, 11.0), (1.0, 5.0)]
-    assert psnr_per_time(scores) == (TimeScore(0.0, 10.5, 2), TimeScore(0.5, 25.0, 2), TimeScore(1.0, 5.0, 1))
+    assert psnr_per_time(scores) == (
+        TimeScore(0.0, 10.5, 2),
+        TimeScore(0.5, 25.0, 2),
+        TimeScore(1.0, 5.0, 1),
+    )
     assert psnr_per_time([(None, 3.0)]) == ()
 
 
@@ -64,7 +70,8 @@ def test_a_still_scene_does_not_flicker() -> None:
 @pytest.mark.parametrize("count", [3, 5, 61, 100])
 def test_blinking_is_twice_the_difference_of_its_two_images(count: int) -> None:
     scene = drawing(moving_scene(Blinking(0.5, num_times=count), times=even(count)))
-    dark, bright = scene.image(camera(), 0.0), scene.image(camera(), 1 / (count - 1))
+    dark = scene.image(camera(), 0.0)
+    bright = scene.image(camera(), 1 / (count - 1))
     wanted = 2 * 255 * float((bright - dark).abs().double().mean())
     assert wanted > 1
     assert flicker(scene, camera(), even(count)).value == pytest.approx(wanted, rel=1e-5)
@@ -86,7 +93,9 @@ def test_a_linear_change_does_not_flicker_however_it_is_sampled() -> None:
             return replace(super().offsets(means, 0.0), colors=shift)
 
     times = (0.0, 0.1, 0.15, 0.6, 1.0)
-    assert flicker(drawing(moving_scene(Brightening())), camera(), times).value == pytest.approx(0, abs=1e-3)
+    assert flicker(drawing(moving_scene(Brightening())), camera(), times).value == pytest.approx(
+        0, abs=1e-3
+    )
 
 
 def test_at_most_sixty_images_are_drawn() -> None:
@@ -120,7 +129,9 @@ def test_what_stands_where_the_truth_moves_is_wrong_by_the_truths_change(split) 
     truth = torch.stack([loader[i].composite(torch.zeros(3)) for i in range(3)])
     wanted = 255 * float(truth.diff(dim=0).abs().double().mean())
     assert wanted > 0.1
-    assert flicker_error(drawing(still_scene()), loader, views).value == pytest.approx(wanted, rel=1e-4)
+    assert flicker_error(drawing(still_scene()), loader, views).value == pytest.approx(
+        wanted, rel=1e-4
+    )
 
 
 def test_masks_leave_pixels_out_of_the_flicker_error(split) -> None:
@@ -133,10 +144,17 @@ def test_masks_leave_pixels_out_of_the_flicker_error(split) -> None:
             return replace(super().__getitem__(index), mask=mask)
 
     masked = Masked(views, DataConfig(root=views[0].image_path.parent))
-    truth = torch.stack([loader[i].composite(torch.zeros(3)) for i in range(3)]).diff(dim=0).abs().double()
+    truth = (
+        torch.stack([loader[i].composite(torch.zeros(3)) for i in range(3)])
+        .diff(dim=0)
+        .abs()
+        .double()
+    )
     total = truth[0, :, 8:].sum() + truth[1, :, 12:].sum()
     wanted = 255 * float(total) / (3 * 16 * (8 + 4))
-    assert flicker_error(drawing(still_scene()), masked, views).value == pytest.approx(wanted, rel=1e-4)
+    assert flicker_error(drawing(still_scene()), masked, views).value == pytest.approx(
+        wanted, rel=1e-4
+    )
 
 
 def test_cameras_that_stand_are_found_whatever_the_order(split) -> None:

@@ -1,4 +1,5 @@
-"""Errors of tracks against scenes that move as the truth does, not at all, or by a known amount too little."""
+"""Errors of tracks against scenes that move as the truth does, not at all, or by a known amount too
+little."""
 
 from __future__ import annotations
 
@@ -81,25 +82,39 @@ def test_true_motion_has_no_error_and_a_still_model_all_of_it() -> None:
     still = track_scores(still_scene(), sliding_truth(), split(), views())
     assert still.motion_px == right.motion_px
     assert still.error_px == pytest.approx(still.motion_px)
-    # bound at 0.5: half a unit at the ends, a quarter next to it; the time of binding does not count
+    # bound at 0.5: half a unit at the ends, a quarter next to it; the time of binding does not
+    # count
     assert still.error_px == pytest.approx(PX_PER_UNIT * (0.5 + 0.25 + 0.25 + 0.5) / 4, rel=1e-5)
 
 
 def test_motion_that_is_too_slow_is_off_by_the_rest() -> None:
-    slow = track_scores(only_movers(moving_scene(Sliding(speed=0.2))), sliding_truth(), split(), views())
+    slow = track_scores(
+        only_movers(moving_scene(Sliding(speed=0.2))), sliding_truth(), split(), views()
+    )
     assert slow.error_px == pytest.approx(0.8 * (slow.motion_px or 0), rel=1e-4)
-    fast = track_scores(only_movers(moving_scene(Sliding(speed=1000.0))), sliding_truth(), split(), views())
-    assert fast.error_px == pytest.approx(np.hypot(20, 14)), "no more than the diagonal of the image"
+    fast = track_scores(
+        only_movers(moving_scene(Sliding(speed=1000.0))), sliding_truth(), split(), views()
+    )
+    assert fast.error_px == pytest.approx(np.hypot(20, 14)), (
+        "no more than the diagonal of the image"
+    )
     assert fast.within_5px == 0.0
 
 
 def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
-    """Half a turn about y: the Gaussians alone, 0.5 from each point, would leave them up to 1 away."""
-    rows, center, away = [1, 3], torch.zeros(1, 3), np.array([[0.3, 0.2, 0.4], [-0.3, 0.2, -0.4]])
+    """Half a turn about y: the Gaussians alone, 0.5 from each point, would leave them up to 1
+    away."""
+    rows = [1, 3]
+    center = torch.zeros(1, 3)
+    away = np.array([[0.3, 0.2, 0.4], [-0.3, 0.2, -0.4]])
     angles = torch.linspace(0, torch.pi / 2, 9)
     quats = torch.stack([angles.cos(), 0 * angles, angles.sin(), 0 * angles], dim=1)
     splines = {"places": torch.zeros(1, 9, 3), "quats": quats[None]}
-    body = BodyField(Sliding(speed=0.0), BodyRest(center, torch.ones(1), torch.zeros(2, dtype=torch.long)), splines)
+    body = BodyField(
+        Sliding(speed=0.0),
+        BodyRest(center, torch.ones(1), torch.zeros(2, dtype=torch.long)),
+        splines,
+    )
     scene = moving_scene(body)
     turns = [Rotation.from_quat(body.poses(t)[1][0].detach().numpy()[[1, 2, 3, 0]]) for t in TIMES]
     points = np.stack([turn.apply(row_of_balls().means[rows].numpy() + away) for turn in turns])
@@ -112,7 +127,9 @@ def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
 
 def test_points_are_bound_when_they_are_seen() -> None:
     """Those that appear at 0.75 only are bound then, where the balls are at that time."""
-    found = track_scores(only_movers(moving_scene(Sliding(speed=0.0))), sliding_truth(3), split(), views())
+    found = track_scores(
+        only_movers(moving_scene(Sliding(speed=0.0))), sliding_truth(3), split(), views()
+    )
     assert found.error_px == pytest.approx(0.25 * PX_PER_UNIT, rel=1e-4)
 
 
@@ -124,7 +141,8 @@ def test_masked_gaussians_carry_points_too() -> None:
 
 
 def turning_back(scale: float) -> tuple[GaussianScene, TrueTracks]:
-    """A ball that goes along x to the middle of the clip and back, of one Gaussian per time; and where it truly is."""
+    """A ball that goes along x to the middle of the clip and back, of one Gaussian per time; and
+    where it truly is."""
     ways = [min(time, 1 - time) for time in TIMES]
     means = torch.tensor([[way - 1.0, 0.0, 0.0] for way in ways])
     velocities = scale * torch.tensor([[1.0, 0.0, 0.0]] * 2 + [[0.0] * 3] + [[-1.0, 0.0, 0.0]] * 2)
@@ -132,19 +150,27 @@ def turning_back(scale: float) -> tuple[GaussianScene, TrueTracks]:
     setup = FieldSetup(torch.zeros(3), torch.ones(3), len(TIMES), len(TIMES), 1.0)
     field = FreePrimitives(FreeField(), setup, torch.Generator()).started(start)
     scene = DynamicScene(
-        gaussians=row_of_balls().replace(means=means), seen_at=TIMES, field=field, moving=torch.arange(5)
+        gaussians=row_of_balls().replace(means=means),
+        seen_at=TIMES,
+        field=field,
+        moving=torch.arange(5),
     )
     rows = np.arange(len(TIMES))
     names = np.array([f"v{k}" for k in rows])
-    return scene, TrueTracks(means[:, None].numpy(), 7 * np.array(TIMES), names, rows, np.ones((5, 1), bool))
+    return scene, TrueTracks(
+        means[:, None].numpy(), 7 * np.array(TIMES), names, rows, np.ones((5, 1), bool)
+    )
 
 
 def test_gaussians_that_are_there_for_a_while_hand_points_on() -> None:
-    """None of them goes both ways; what is missing is that the middle one, which stands, hands on nothing at first."""
+    """None of them goes both ways; what is missing is that the middle one, which stands, hands on
+    nothing at first."""
     scene, truth = turning_back(1.0)
     found = track_scores(scene, truth, split(), views())
     assert found.motion_px == pytest.approx(PX_PER_UNIT * (0.5 + 0.25 + 0.25 + 0.5) / 4, rel=1e-4)
-    assert found.error_px == pytest.approx(PX_PER_UNIT * 0.25, rel=0.05), "a quarter is lost in the first gap each way"
+    assert found.error_px == pytest.approx(PX_PER_UNIT * 0.25, rel=0.05), (
+        "a quarter is lost in the first gap each way"
+    )
     still = track_scores(turning_back(0.0)[0], truth, split(), views())
     assert still.error_px == pytest.approx(still.motion_px, rel=1e-4)
 
@@ -166,10 +192,13 @@ def test_reasons_say_why_there_is_no_error() -> None:
 def test_the_true_motion_of_the_benchmark_follows_the_true_tracks(
     name: SceneName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """benchmarks/motion.py: its oracle moves Gaussians as the synthetic scene moves its points, and can be trained."""
+    """benchmarks/motion.py: its oracle moves Gaussians as the synthetic scene moves its points, and
+    can be trained."""
     monkeypatch.setattr(MOTION, "DRAWN", 1000)
     monkeypatch.setattr(MOTION, "LOOKS", 5)
-    root = write_dynamic_capture(name, tmp_path / name, DynamicOptions(12, num_times=5, num_cameras=2, samples=1))
+    root = write_dynamic_capture(
+        name, tmp_path / name, DynamicOptions(12, num_times=5, num_cameras=2, samples=1)
+    )
     options = [f"data.root={root}", "train.steps=4", "train.initial_downscale=1"]
     trainer = MOTION.oracle(name, load_config(MOTION.PRESET, options))
     gaussians = trainer.model.scene.gaussians
@@ -178,7 +207,11 @@ def test_the_true_motion_of_the_benchmark_follows_the_true_tracks(
     )
     capture = trainer.capture
     pairs = list(
-        zip(capture.splits["test"], training_cameras(capture.splits["test"], trainer.config.data), strict=True)
+        zip(
+            capture.splits["test"],
+            training_cameras(capture.splits["test"], trainer.config.data),
+            strict=True,
+        )
     )
     truth = read_true_tracks(capture)
     found = track_scores(opaque, truth, pairs, all_views(capture.splits))

@@ -48,7 +48,9 @@ def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:
         return torch.rand(*shape, generator=random) * 2 - 1
 
     sh = uniform(count, (degree + 1) ** 2, 3)
-    return Gaussians(uniform(count, 3), uniform(count, 4), uniform(count, 3) * 0.3 - 1.5, uniform(count) + 1, sh)
+    return Gaussians(
+        uniform(count, 3), uniform(count, 4), uniform(count, 3) * 0.3 - 1.5, uniform(count) + 1, sh
+    )
 
 
 def as_scene(gaussians: Gaussians) -> StaticScene:
@@ -62,8 +64,12 @@ def camera(width: int = 20, height: int = 14, distance: float = 4.0) -> Cameras:
     return Cameras(pose[None], intrinsics[None], width, height)
 
 
-def image(rgb: torch.Tensor, cameras: Cameras, name: str = "a", mask: torch.Tensor | None = None) -> Image:
-    return Image(name=name, cameras=cameras, rgb_premultiplied=rgb, alpha=None, mask=mask, time=None)
+def image(
+    rgb: torch.Tensor, cameras: Cameras, name: str = "a", mask: torch.Tensor | None = None
+) -> Image:
+    return Image(
+        name=name, cameras=cameras, rgb_premultiplied=rgb, alpha=None, mask=mask, time=None
+    )
 
 
 @pytest.mark.parametrize("background", [0.0, 0.3, 1.0])
@@ -77,14 +83,20 @@ def test_a_hole_in_a_white_object_shows_on_black_alone(background: float) -> Non
     scores = background_scores(truth, nothing, torch.full((3,), background))
     assert scores["psnr_white"] == pytest.approx(100.0)
     assert scores["psnr_black"] == pytest.approx(-10 * math.log10(0.5), abs=1e-4)
-    masked = background_scores(replace(truth, mask=1 - alpha), nothing, torch.full((3,), background))
+    masked = background_scores(
+        replace(truth, mask=1 - alpha), nothing, torch.full((3,), background)
+    )
     assert masked["psnr_black"] == pytest.approx(100.0)
-    without = background_scores(image(alpha[..., None].expand(-1, -1, 3), cameras), nothing, torch.zeros(3))
+    without = background_scores(
+        image(alpha[..., None].expand(-1, -1, 3), cameras), nothing, torch.zeros(3)
+    )
     assert without == {"psnr_white": None, "psnr_black": None}
 
 
 def test_scores_are_those_of_the_images() -> None:
-    gaussians, cameras, options = some_gaussians(), camera(), RenderOptions()
+    gaussians = some_gaussians()
+    cameras = camera()
+    options = RenderOptions()
     background = torch.tensor([0.2, 0.4, 0.6])
     rendered = render(gaussians, cameras, options, background=background).rgb[0].clamp(0, 1)
     darker = rendered * 0.5
@@ -103,7 +115,9 @@ def test_scores_are_those_of_the_images() -> None:
 
 
 def test_masks_reach_every_metric() -> None:
-    gaussians, cameras, options = some_gaussians(), camera(), RenderOptions()
+    gaussians = some_gaussians()
+    cameras = camera()
+    options = RenderOptions()
     rendered = render(gaussians, cameras, options).rgb[0].clamp(0, 1)
     mask = torch.ones(14, 20)
     mask[:, :10] = 0
@@ -120,7 +134,11 @@ def test_masks_reach_every_metric() -> None:
     ("truth", "mask", "message"),
     [
         (torch.full((14, 20, 3), math.nan), None, "view 'a': psnr is not finite, the image holds"),
-        (torch.zeros(14, 20, 3), torch.zeros(14, 20), "view 'a': psnr is not finite, its mask ignores every pixel"),
+        (
+            torch.zeros(14, 20, 3),
+            torch.zeros(14, 20),
+            "view 'a': psnr is not finite, its mask ignores every pixel",
+        ),
     ],
 )
 def test_values_that_are_not_finite_are_refused(truth, mask, message) -> None:
@@ -130,9 +148,12 @@ def test_values_that_are_not_finite_are_refused(truth, mask, message) -> None:
 
 
 def test_views_are_drawn_at_their_own_times() -> None:
-    scene, options, black = moving_scene(Sliding()), RenderOptions(), torch.zeros(3)
+    scene = moving_scene(Sliding())
+    options = RenderOptions()
+    black = torch.zeros(3)
     images = [
-        replace(image(render(scene.at(t), camera(), options).rgb[0].clamp(0, 1), camera()), time=t) for t in (0.0, 0.8)
+        replace(image(render(scene.at(t), camera(), options).rgb[0].clamp(0, 1), camera()), time=t)
+        for t in (0.0, 0.8)
     ]
     scores, _ = score_views(scene, images, options, black, NO_LPIPS)
     assert [(s.psnr, s.time) for s in scores] == [(100.0, 0.0), (100.0, 0.8)]
@@ -194,10 +215,13 @@ CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20, 6], [
 
 
 def of_a_square(mask: torch.Tensor | None = None) -> tuple[Image, Rendering]:
-    """A grey square of 4 x 5 px before nothing, and on white a render of it that is 0.1 too bright."""
+    """A grey square of 4 x 5 px before nothing, and on white a render of it that is 0.1 too
+    bright."""
     alpha = torch.zeros(12, 20)
     alpha[3:7, 8:13] = 1
-    image = Image("a", CAMERA, 0.5 * alpha[..., None].expand(-1, -1, 3).contiguous(), alpha, mask, None)
+    image = Image(
+        "a", CAMERA, 0.5 * alpha[..., None].expand(-1, -1, 3).contiguous(), alpha, mask, None
+    )
     shown = (0.6 * alpha + 1 - alpha)[..., None].expand(-1, -1, 3)
     return image, Rendering(shown[None].contiguous(), (1 - alpha)[None], None)
 
@@ -209,7 +233,9 @@ def test_scores_in_the_box_and_on_black() -> None:
     larger = 10 * math.log10(12 * 20 / 20)
     on_black = background_scores(image, rendering, torch.ones(3))["psnr_black"]
     assert on_black == pytest.approx(20 + larger, abs=1e-4)
-    black = rendering.rgb[0] * image.alpha[..., None] if image.alpha is not None else rendering.rgb[0]
+    black = (
+        rendering.rgb[0] * image.alpha[..., None] if image.alpha is not None else rendering.rgb[0]
+    )
     assert scores["ssim_black"] == pytest.approx(ssim(black, image.rgb_premultiplied), abs=1e-6)
     assert scores["lpips_black"] is None
 
@@ -232,15 +258,27 @@ def test_nobody_is_to_be_seen() -> None:
 def run(person: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a capture without another clip: the last of its three frames is held out."""
     folder = tmp_path_factory.mktemp("runs")
-    root = shutil.copytree(person, folder / "capture", ignore=shutil.ignore_patterns("*_pose.*", "pose"))
-    keys = [f"data.root={root}", "data.pose_frames=2::", f"run.dir={folder / 'run'}", "train.steps=6", "run.threads=1"]
-    return dyngs.train(dyngs.load_config("human", [*keys, "model.resolution=24", "model.fit=false"]))
+    root = shutil.copytree(
+        person, folder / "capture", ignore=shutil.ignore_patterns("*_pose.*", "pose")
+    )
+    keys = [
+        f"data.root={root}",
+        "data.pose_frames=2::",
+        f"run.dir={folder / 'run'}",
+        "train.steps=6",
+        "run.threads=1",
+    ]
+    return dyngs.train(
+        dyngs.load_config("human", [*keys, "model.resolution=24", "model.fit=false"])
+    )
 
 
 def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:
     loaded = load_run(run)
     capture = read_capture(loaded.config.data)
-    trained, held = (avatar_of(scene_of_split(loaded, capture, split)) for split in ("test", "pose"))
+    trained, held = (
+        avatar_of(scene_of_split(loaded, capture, split)) for split in ("test", "pose")
+    )
     assert trained is not None
     assert held is not None
     assert (len(trained.moves_as), len(held.moves_as)) == (2, 1)
@@ -259,16 +297,25 @@ def test_refined_poses_stand_beside_those_as_given(
         assert main(["eval", str(run), "--split", "pose", *more]) == 0
         stored[name] = json.loads((run / "metrics_pose.json").read_text())
     out = capsys.readouterr().out
-    assert out.count("on black, poses refined") == out.count("on black, poses from silhouettes") == 2
-    given, refined = stored["given"], stored["refined"]
-    changed = {key for key in given if given[key] != refined[key]} - {"fps", "deform_fraction", "per_view"}
+    assert (
+        out.count("on black, poses refined") == out.count("on black, poses from silhouettes") == 2
+    )
+    given = stored["given"]
+    refined = stored["refined"]
+    changed = {key for key in given if given[key] != refined[key]} - {
+        "fps",
+        "deform_fraction",
+        "per_view",
+    }
     assert changed == {"psnr_own_poses", "own_poses", "silhouette_poses"}
     timed = {"render_seconds", "deform_seconds"}
     views = [
-        [{k: x for k, x in view.items() if k not in timed} for view in own["per_view"]] for own in (given, refined)
+        [{k: x for k, x in view.items() if k not in timed} for view in own["per_view"]]
+        for own in (given, refined)
     ]
     assert views[0] == views[1], "as given is not touched"
-    own, again = refined["own_poses"], stored["again"]["own_poses"]
+    own = refined["own_poses"]
+    again = stored["again"]["own_poses"]
     assert own["psnr"] == refined["psnr_own_poses"] == again["psnr"]
     assert own["psnr_person"] == again["psnr_person"], "the same on every run"
     assert own["psnr_black"] > given["psnr_black"] - 0.1
@@ -276,9 +323,14 @@ def test_refined_poses_stand_beside_those_as_given(
     assert len(own["per_view"]) == given["num_views"]
 
 
-def test_poses_that_were_trained_on_are_not_refined(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_poses_that_were_trained_on_are_not_refined(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["eval", str(run), "--split", "train", "--refine"]) == 2
-    assert "--refine is for images that were not trained on; name them with --split" in capsys.readouterr().err
+    assert (
+        "--refine is for images that were not trained on; name them with --split"
+        in capsys.readouterr().err
+    )
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -288,14 +340,19 @@ def test_a_shrunk_camera_sees_the_same() -> None:
     small = one_camera(20, 14).scaled(0.5)
     assert (small.width, small.height) == (10, 7)
     corner = torch.tensor([20.0, 14.0, 1.0])
-    ray, same = (torch.linalg.inv(c.intrinsics[0]) @ p for c, p in ((one_camera(20, 14), corner), (small, corner / 2)))
+    ray, same = (
+        torch.linalg.inv(c.intrinsics[0]) @ p
+        for c, p in ((one_camera(20, 14), corner), (small, corner / 2))
+    )
     assert torch.allclose(ray[:2], (ray / same * same)[:2])
     assert torch.allclose(small.intrinsics[0] @ ray / ray[2], torch.tensor([10.0, 7.0, 1.0]))
     assert one_camera().scaled(1.0).width == 20
 
 
 def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
-    drawings = [Drawing(still_scene(1), RenderOptions(), torch.ones(3), scale) for scale in (1.0, 0.5)]
+    drawings = [
+        Drawing(still_scene(1), RenderOptions(), torch.ones(3), scale) for scale in (1.0, 0.5)
+    ]
     images = [1 - drawing.image(one_camera(40, 28), None).mean(2) for drawing in drawings]
     assert [tuple(x.shape) for x in images] == [(28, 40), (28, 40)]
     assert not torch.equal(*images)

@@ -25,12 +25,19 @@ from dyngs.splats.formats import read_splats
 
 @pytest.fixture(scope="module")
 def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
-    """Of five balls the second and the fourth are one body, which turns by 0.9 times half a turn and moves aside."""
+    """Of five balls the second and the fourth are one body, which turns by 0.9 times half a turn
+    and moves aside."""
     opened = open_run(write_moving_run(tmp_path_factory.mktemp("rolling")))
     angles = torch.linspace(-0.6, 1.1, 9) * np.pi / 2
     quats = torch.stack([angles.cos(), angles.sin() * 0.6, 0 * angles, angles.sin() * 0.8], dim=1)
-    places = torch.stack([torch.linspace(-1, 1, 9), torch.linspace(0, 0.5, 9) ** 2, torch.zeros(9)], dim=1)
-    rest = BodyRest(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), torch.zeros(len(MOVING_ROWS), dtype=torch.long))
+    places = torch.stack(
+        [torch.linspace(-1, 1, 9), torch.linspace(0, 0.5, 9) ** 2, torch.zeros(9)], dim=1
+    )
+    rest = BodyRest(
+        torch.tensor([[0.1, 0.2, 0.0]]),
+        torch.ones(1),
+        torch.zeros(len(MOVING_ROWS), dtype=torch.long),
+    )
     field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]})
     assert isinstance(opened.scene, DynamicScene)
     return opened.showing(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
@@ -40,7 +47,9 @@ TURNED = Writing((0.5, 0.5, 0.5, 0.5), "y")
 
 
 @pytest.mark.parametrize("how", [Writing(), TURNED])
-def test_the_animation_shows_the_scene_at_all_times(tmp_path: Path, rolling: Opened, how: Writing) -> None:
+def test_the_animation_shows_the_scene_at_all_times(
+    tmp_path: Path, rolling: Opened, how: Writing
+) -> None:
     written = write_bodies(rolling, tmp_path / "a.glb", 0.25, how)
     whole = read_splats(written.path).gaussians
     file = GltfFile(written.path)
@@ -62,14 +71,19 @@ def test_the_animation_shows_the_scene_at_all_times(tmp_path: Path, rolling: Ope
     for time in (0.0, 0.25, 0.3, 0.875):
         now = time * rolling.seconds
         place = np.array([np.interp(now, seconds, samples["translation"][:, k]) for k in range(3)])
-        expected = splats_at(rolling, rolling.scene, time, how).gaussians.means[list(MOVING_ROWS)].numpy()
+        expected = (
+            splats_at(rolling, rolling.scene, time, how).gaussians.means[list(MOVING_ROWS)].numpy()
+        )
         atol = 1e-5 if time != 0.3 else 0.02  # between two poses of the file
         np.testing.assert_allclose(turns(now).apply(local) + place, expected, atol=atol)
 
 
-def test_without_the_animation_it_is_the_scene_at_that_time(tmp_path: Path, rolling: Opened) -> None:
+def test_without_the_animation_it_is_the_scene_at_that_time(
+    tmp_path: Path, rolling: Opened
+) -> None:
     written = write_bodies(rolling, tmp_path / "a.glb", 0.7)
-    meant, found = written.splat.gaussians, read_splats(written.path).gaussians
+    meant = written.splat.gaussians
+    found = read_splats(written.path).gaussians
     order = [*MOVING_ROWS, 0, 2, 4]
     for name, x in found.tensors().items():
         torch.testing.assert_close(x, meant.tensors()[name][order], atol=1e-5, rtol=0)
@@ -83,15 +97,25 @@ def test_a_body_without_a_rotation_stands(tmp_path: Path, rolling: Opened) -> No
     body = bodies_of(rolling.scene.field)
     assert body is not None
     blank = {name: torch.zeros_like(body.parameters[name].detach()) for name in ("places", "quats")}
-    damaged = rolling.showing(replace(rolling.scene, field=BodyField(body.others, body.rest, blank)))
+    damaged = rolling.showing(
+        replace(rolling.scene, field=BodyField(body.others, body.rest, blank))
+    )
     assert len(read_splats(write_bodies(damaged, tmp_path / "a.glb", 0.0).path).gaussians) == 5
 
 
-def test_a_run_without_bodies_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_bodies_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = write_moving_run(tmp_path)
     with pytest.raises(DyngsError, match="no body that turns"):
         write_bodies(open_run(run), tmp_path / "a.glb", 0.0)
-    for wrong in (["--out", "a.ply"], ["--times", "0:1:3"], ["--static"], ["--sh-degree", "1"], ["--format", "ply"]):
+    for wrong in (
+        ["--out", "a.ply"],
+        ["--times", "0:1:3"],
+        ["--static"],
+        ["--sh-degree", "1"],
+        ["--format", "ply"],
+    ):
         assert main(["export", str(run), "--bodies", *wrong]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert not list(tmp_path.glob("**/*.glb"))

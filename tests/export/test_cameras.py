@@ -1,4 +1,5 @@
-"""Cameras written as transforms.json come back as they were: poses, lenses, times, points, splits."""
+"""Cameras written as transforms.json come back as they were: poses, lenses, times, points,
+splits."""
 
 from __future__ import annotations
 
@@ -24,16 +25,21 @@ LENSES = [
 
 @pytest.fixture
 def capture(still: Path) -> Capture:
-    """A capture whose world is far away, with a lens of another kind for each of its first views."""
+    """A capture whose world is far away, with a lens of another kind for each of its first
+    views."""
     found = read_capture(still)
     random = np.random.default_rng(0)
     views = [
-        replace(view, lens=LENSES[i % 4], camera_id=i, mask_path=view.image_path if i == 1 else None)
+        replace(
+            view, lens=LENSES[i % 4], camera_id=i, mask_path=view.image_path if i == 1 else None
+        )
         for i, view in enumerate(found.splits["train"])
     ]
     cloud = PointCloud(random.normal(size=(5, 3)), random.integers(0, 255, (5, 3)).astype(np.uint8))
     splits = {**found.splits, "train": tuple(views)}
-    return replace(found, splits=splits, points=cloud, world_offset=np.array([10.0, 0, -20]), span=(2.0, 4.0))
+    return replace(
+        found, splits=splits, points=cloud, world_offset=np.array([10.0, 0, -20]), span=(2.0, 4.0)
+    )
 
 
 def test_a_written_capture_is_read_as_it_was(capture: Capture, tmp_path: Path) -> None:
@@ -50,9 +56,15 @@ def test_a_written_capture_is_read_as_it_was(capture: Capture, tmp_path: Path) -
     for view in capture.splits["train"]:
         same = views[view.image_path.resolve()]
         centre = -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] + capture.world_offset
-        np.testing.assert_allclose(-same.cam_from_world[:3, :3].T @ same.cam_from_world[:3, 3], centre, atol=1e-9)
-        np.testing.assert_allclose(same.cam_from_world[:3, :3], view.cam_from_world[:3, :3], atol=1e-9)
-        np.testing.assert_allclose(same.intrinsics, view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1.0]))
+        np.testing.assert_allclose(
+            -same.cam_from_world[:3, :3].T @ same.cam_from_world[:3, 3], centre, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            same.cam_from_world[:3, :3], view.cam_from_world[:3, :3], atol=1e-9
+        )
+        np.testing.assert_allclose(
+            same.intrinsics, view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1.0])
+        )
         assert (same.lens, same.camera_id) == (replace(view.lens, focal_ratio=1.0), view.camera_id)
         assert (same.mask_path is None) == (view.mask_path is None)
 

@@ -1,4 +1,5 @@
-"""Chosen camera paths: times along them, fixed cameras, views by name, and scenes without cameras."""
+"""Chosen camera paths: times along them, fixed cameras, views by name, and scenes without
+cameras."""
 
 from __future__ import annotations
 
@@ -43,7 +44,9 @@ def still_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
 
 
 @pytest.mark.parametrize("name", ["orbit", "spiral"])
-def test_time_runs_along_a_path_unless_told_otherwise(name: str, moving_run: Opened, still_run: Opened) -> None:
+def test_time_runs_along_a_path_unless_told_otherwise(
+    name: str, moving_run: Opened, still_run: Opened
+) -> None:
     path = choose_path(moving_run, PathOptions(name, 5))
     assert path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
     assert len(path.notes) == 1
@@ -68,8 +71,11 @@ def test_a_clip_is_followed_in_its_own_time(moving_run: Opened, still_run: Opene
 @pytest.mark.parametrize("path", ["orbit", "spiral", "along"])
 def test_up_counts_for_runs(path: str, moving_run: Opened) -> None:
     for name, up in (("y", [0.0, 1.0, 0.0]), ("-y", [0.0, -1.0, 0.0])):
-        poses = choose_path(replace(moving_run, stated_up=name), PathOptions(path, 3)).cameras.cam_from_world
-        rights, downs = poses[:, 0, :3], poses[:, 1, :3]
+        poses = choose_path(
+            replace(moving_run, stated_up=name), PathOptions(path, 3)
+        ).cameras.cam_from_world
+        rights = poses[:, 0, :3]
+        downs = poses[:, 1, :3]
         torch.testing.assert_close(rights @ torch.tensor(up), torch.zeros(3), atol=1e-6, rtol=0)
         assert (downs @ torch.tensor(up) < 0).all()
 
@@ -115,24 +121,30 @@ def test_a_camera_that_stands_still(moving_run: Opened) -> None:
         torch.testing.assert_close(path.cameras.cam_from_world[i], wanted.cameras.cam_from_world[0])
         torch.testing.assert_close(path.cameras.intrinsics[i], wanted.cameras.intrinsics[0])
     assert choose_path(moving_run, PathOptions(None, view="1")).times == (TEST_TIMES[1],)
-    assert choose_path(moving_run, PathOptions(None, split="train", view="1")).times == (TRAIN_TIMES[1],)
+    assert choose_path(moving_run, PathOptions(None, split="train", view="1")).times == (
+        TRAIN_TIMES[1],
+    )
     small = choose_path(moving_run, PathOptions(None, times=(0.5,), size=(8, 4))).cameras
     assert (len(small), small.width, small.height) == (1, 8, 4)
 
 
 def test_views_are_found_by_name_image_and_number(moving_run: Opened) -> None:
     capture = moving_run.capture
-    test, train = capture.splits["test"], capture.splits["train"]
+    test = capture.splits["test"]
+    train = capture.splits["train"]
     assert view_to_show(capture) is test[0]
     assert view_to_show(capture, test[2].name) is test[2]
     assert view_to_show(capture, "r_002") is test[2]
     assert view_to_show(capture, "2") is test[2]
-    assert view_to_show(capture, train[3].name) is train[3]  # no split given: names are looked for in all
+    # no split given: names are looked for in all
+    assert view_to_show(capture, train[3].name) is train[3]
     assert view_to_show(capture, "r_004") is train[4]
     assert view_to_show(capture, "4", "train") is train[4]
     assert view_to_show(capture.replace(splits={"train": train, "test": ()})) is train[0]
     for name, split in (("9", None), ("r_9", None), ("-1", None), (train[0].name, "test")):
-        with pytest.raises(DyngsError, match=rf"no view '{name}'; the split test has 3 views: .*\(0\) to .*\(2\)"):
+        with pytest.raises(
+            DyngsError, match=rf"no view '{name}'; the split test has 3 views: .*\(0\) to .*\(2\)"
+        ):
             view_to_show(capture, name, split)
     with pytest.raises(DyngsError, match="'val' has no views"):
         view_to_show(capture, None, "val")
@@ -142,13 +154,17 @@ def some_gaussians(count: int = 50) -> Gaussians:
     generator = torch.Generator().manual_seed(0)
     means = torch.randn(count, 3, generator=generator)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    return Gaussians(means, quats, torch.full((count, 3), -3.0), torch.zeros(count), torch.zeros(count, 1, 3))
+    return Gaussians(
+        means, quats, torch.full((count, 3), -3.0), torch.zeros(count), torch.zeros(count, 1, 3)
+    )
 
 
 @pytest.mark.parametrize("path", ["orbit", "spiral"])
 @pytest.mark.parametrize("up", ["z", "-y", "x"])
 def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) -> None:
-    file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians(), RasterizeMode.ANTIALIASED, 0.1)).path
+    file = write_splats(
+        tmp_path / "a.ply", SplatFile(some_gaussians(), RasterizeMode.ANTIALIASED, 0.1)
+    ).path
     opened = replace(open_scene(file), stated_up=up)
     cameras = choose_path(opened, PathOptions(path, num_frames=5, size=(80, 60))).cameras
     axis = np.zeros(3)
@@ -158,11 +174,18 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
         in_camera = (cameras.cam_from_world[i] @ means.T).T[:, :3]
         pixels = (cameras.intrinsics[i] @ in_camera.T).T
         pixels = pixels[:, :2] / pixels[:, 2:]
-        inside = (in_camera[:, 2] > 0) & (pixels >= 0).all(dim=1) & (pixels <= torch.tensor([80, 60])).all(dim=1)
+        inside = (
+            (in_camera[:, 2] > 0)
+            & (pixels >= 0).all(dim=1)
+            & (pixels <= torch.tensor([80, 60])).all(dim=1)
+        )
         assert inside.float().mean() > 0.9
         image_up = -cameras.cam_from_world[i, 1, :3].numpy()
         assert image_up @ axis > 0.5
-    assert (opened.scene.options.mode, opened.scene.options.eps2d) == (RasterizeMode.ANTIALIASED, 0.1)
+    assert (opened.scene.options.mode, opened.scene.options.eps2d) == (
+        RasterizeMode.ANTIALIASED,
+        0.1,
+    )
     assert torch.equal(opened.background, torch.zeros(3))
     assert (choose_path(opened, PathOptions(path)).times, opened.notes) == (None, ())
     assert opened.scene.is_static
@@ -171,7 +194,8 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
 @pytest.mark.parametrize("factor", FACTORS)
 def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Path) -> None:
     source = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians(), up="z")).path
-    frames, centers = [], []
+    frames = []
+    centers = []
     for file, unit in ((source, 1.0), (write_scaled(tmp_path / "b.ply", source, factor), factor)):
         opened = open_scene(file)
         cameras = choose_path(opened, PathOptions("orbit", num_frames=3, size=(80, 60))).cameras
@@ -194,7 +218,9 @@ def test_an_unknown_path_is_named(tmp_path: Path) -> None:
         choose_path(open_scene(file), PathOptions("circle"))
 
 
-@pytest.mark.parametrize("options", [PathOptions(times=(0.5,)), PathOptions(None), PathOptions(view="0")])
+@pytest.mark.parametrize(
+    "options", [PathOptions(times=(0.5,)), PathOptions(None), PathOptions(view="0")]
+)
 def test_a_file_has_neither_times_nor_views(options: PathOptions, tmp_path: Path) -> None:
     file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians())).path
     with pytest.raises(DyngsError, match=r"a \.ply holds one time and no views"):
@@ -227,7 +253,9 @@ def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
     options = HumanOptions(size=32, num_frames=2, num_new=0, num_cameras=1, num_test=1, samples=1)
     root = write_human_capture(tmp_path / "person", options)
     run = RunConfig(threads=1, dir=tmp_path / "run")
-    folder = train(Config(data=DataConfig(root=root, test_every=0), model=MODEL, train=TRAIN, run=run))
+    folder = train(
+        Config(data=DataConfig(root=root, test_every=0), model=MODEL, train=TRAIN, run=run)
+    )
     path = choose_path(open_run(folder), PathOptions("orbit", 4))
     assert np.diff(directions(path.cameras.centers)) == pytest.approx(90, abs=1)
     assert any("goes all around" in note for note in path.notes)

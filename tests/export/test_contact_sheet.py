@@ -41,7 +41,10 @@ def test_error_gain_is_five() -> None:
 
 
 def test_large_and_unequal_images_fit() -> None:
-    rows = [SheetRow("a" * 200, *[np.zeros((h, w, 3), np.uint8)] * 2) for h, w in ((40, 100), (10, 10), (1, 1))]
+    rows = [
+        SheetRow("a" * 200, *[np.zeros((h, w, 3), np.uint8)] * 2)
+        for h, w in ((40, 100), (10, 10), (1, 1))
+    ]
     sheet = contact_sheet(rows, panel_width=50)
     assert sheet.shape[1] == GAP + 3 * (50 + GAP)
     assert sheet.shape[0] == 3 * LABEL_HEIGHT + 20 + 10 + 1 + GAP
@@ -67,7 +70,8 @@ def test_wrong_rows_are_refused() -> None:
 def test_depth_limits_ignore_the_transparent_and_the_stray() -> None:
     depth = np.linspace(2.0, 3.0, 1000).reshape(20, 50)
     depth[0, 0], alpha = 1e9, np.ones((20, 50))
-    alpha[1], depth[1] = 0.0, np.nan
+    alpha[1] = 0.0
+    depth[1] = np.nan
     near, far = depth_limits(depth, alpha)
     assert 2.0 <= near < 2.1
     assert 2.9 < far < 3.0

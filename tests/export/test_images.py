@@ -46,8 +46,12 @@ def read_image(path: Path) -> np.ndarray:
 BALLS = StaticScene(gaussians=two_balls())
 
 
-def write_balls(cameras: Cameras, out: Path | None, output: OutputOptions | None = None) -> list[Path]:
-    return write_path_images(opened_scene(BALLS), CameraPath(cameras), out, output or OutputOptions())
+def write_balls(
+    cameras: Cameras, out: Path | None, output: OutputOptions | None = None
+) -> list[Path]:
+    return write_path_images(
+        opened_scene(BALLS), CameraPath(cameras), out, output or OutputOptions()
+    )
 
 
 def names(folder: Path) -> list[str]:
@@ -55,7 +59,9 @@ def names(folder: Path) -> list[str]:
 
 
 def write_run(folder: Path, size: int = 24) -> Path:
-    root = write_still_capture(folder / "capture", StillOptions(size=size, num_train=2, num_test=2, samples=1))
+    root = write_still_capture(
+        folder / "capture", StillOptions(size=size, num_train=2, num_test=2, samples=1)
+    )
     config = Config(data=DataConfig.model_validate({"root": root}))
     save_config(config, folder / "run" / RESOLVED_NAME)
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in two_balls().tensors().items()}
@@ -65,8 +71,10 @@ def write_run(folder: Path, size: int = 24) -> Path:
 
 
 def test_frames_are_the_renders_one_by_one() -> None:
-    gaussians, cameras = two_balls(), cameras_around(3)
-    options, background = RenderOptions(depth="expected"), torch.tensor([0.1, 0.2, 0.9])
+    gaussians = two_balls()
+    cameras = cameras_around(3)
+    options = RenderOptions(depth="expected")
+    background = torch.tensor([0.1, 0.2, 0.9])
     together = render(gaussians, cameras, options, background=background)
     frames = list(path_frames(replace(BALLS, background=background), CameraPath(cameras), options))
     assert len(frames) == 3
@@ -76,7 +84,8 @@ def test_frames_are_the_renders_one_by_one() -> None:
         assert frame.depth is not None
         assert together.depth is not None
         np.testing.assert_allclose(frame.depth, together.depth[i], rtol=1e-5)
-    np.testing.assert_allclose(frames[0].rgb[0, 0], [0.1, 0.2, 0.9], atol=0.01)  # a corner shows the background
+    # a corner shows the background
+    np.testing.assert_allclose(frames[0].rgb[0, 0], [0.1, 0.2, 0.9], atol=0.01)
     red = frames[0].rgb[9, 9]
     assert red[0] > 0.8
     assert red[1] < 0.2
@@ -92,7 +101,8 @@ def test_frames_are_drawn_lazily() -> None:
 
 
 def test_each_frame_shows_the_scene_at_its_time() -> None:
-    scene, times = moving_scene(Sliding()), (0.0, 0.3, 1.0)
+    scene = moving_scene(Sliding())
+    times = (0.0, 0.3, 1.0)
     frames = list(path_frames(scene, static_path(camera(), times)))
     for frame, time in zip(frames, times, strict=True):
         np.testing.assert_array_equal(frame.rgb, render_frame(scene, camera(), time).rgb)
@@ -153,7 +163,8 @@ def test_path_with_nothing_to_do(tmp_path) -> None:
 
 def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
     """The same ball drawn from twice as far away must not have the same colour."""
-    near, far = cameras_around(1, distance=3.0), cameras_around(1, distance=6.0)
+    near = cameras_around(1, distance=3.0)
+    far = cameras_around(1, distance=6.0)
     poses = torch.cat([near.cam_from_world, far.cam_from_world])
     cameras = Cameras(poses, near.intrinsics.repeat(2, 1, 1), 24, 18)
     write_balls(cameras, tmp_path, OutputOptions(depth=True))
@@ -164,7 +175,8 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path) -> None:
 
 def test_depth_of_a_moving_path_shares_one_range(tmp_path) -> None:
     """Of 20 frames 8 are looked at beforehand, each at its own time."""
-    opened, path = opened_scene(moving_scene(Sliding())), static_path(camera(), np.linspace(0, 1, 20).tolist())
+    opened = opened_scene(moving_scene(Sliding()))
+    path = static_path(camera(), np.linspace(0, 1, 20).tolist())
     written = write_path_images(opened, path, tmp_path, OutputOptions(depth=True))
     assert len(written) == 60
 
@@ -179,18 +191,24 @@ def test_views_of_a_moving_run_are_drawn_at_their_own_times(tmp_path) -> None:
 
 def test_split_of_a_run(tmp_path) -> None:
     run_dir = write_run(tmp_path)
-    written = write_split_images(open_run(run_dir), "test", tmp_path / "out", OutputOptions(depth=True, alpha=True))
+    written = write_split_images(
+        open_run(run_dir), "test", tmp_path / "out", OutputOptions(depth=True, alpha=True)
+    )
     stems = ["r_000", "r_001"]
     assert names(tmp_path / "out") == sorted(
-        [f"{s}{end}" for s in stems for end in (".png", "_alpha.png", "_depth.png", "_depth.exr")] + ["sheet.png"]
+        [f"{s}{end}" for s in stems for end in (".png", "_alpha.png", "_depth.png", "_depth.exr")]
+        + ["sheet.png"]
     )
     assert written[-1].name == "sheet.png"
     assert len(written) == 9
-    assert read_image(tmp_path / "out" / "r_000.png")[0, 0].tolist() == [1.0, 1.0, 1.0]  # white, as in training
+    # white, as in training
+    assert read_image(tmp_path / "out" / "r_000.png")[0, 0].tolist() == [1.0, 1.0, 1.0]
     sheet = read_image(written[-1])
     assert sheet.shape[1] >= 3 * 24
     assert sheet.shape[0] >= 2 * 24
-    write_split_images(open_run(run_dir), "train", tmp_path / "train", OutputOptions(video=tmp_path / "train.mp4"))
+    write_split_images(
+        open_run(run_dir), "train", tmp_path / "train", OutputOptions(video=tmp_path / "train.mp4")
+    )
     assert names(tmp_path / "train") == ["r_000.png", "r_001.png", "sheet.png"]
     assert len(list(read_frames(tmp_path / "train.mp4"))) == 2
     with pytest.raises(DyngsError, match="'val' has no views"):
@@ -210,7 +228,8 @@ def test_images_of_the_capture_are_not_replaced(tmp_path) -> None:
             write_split_images(open_run(run_dir), "test", out)
     (tmp_path / "links").mkdir()
     os.link(views[0].image_path, tmp_path / "links" / "frame_0000.png")
-    opened, path = open_run(run_dir), CameraPath(cameras_around(1))
+    opened = open_run(run_dir)
+    path = CameraPath(cameras_around(1))
     with pytest.raises(DyngsError, match=r"holds frame_0000\.png, a link to"):
         write_path_images(opened, path, tmp_path / "links")
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
@@ -225,7 +244,12 @@ def test_file_stems_known_answers() -> None:
     assert file_stems(["sheet", "r", "r_depth"]) == ["sheet_2", "r", "r_depth_2"]
     assert file_stems(["..", "", "C:\\x"]) == ["view", "view_2", "C__x"]
     # devices of Windows, whatever follows them, but not names that only begin so
-    assert file_stems(["a/CON", "a/nul.left", "a/com1", "a/console"]) == ["CON_", "nul.left_", "com1_", "console"]
+    assert file_stems(["a/CON", "a/nul.left", "a/com1", "a/console"]) == [
+        "CON_",
+        "nul.left_",
+        "com1_",
+        "console",
+    ]
 
 
 @settings(max_examples=25, deadline=None)

@@ -23,7 +23,8 @@ def test_a_run_and_its_files(tmp_path: Path) -> None:
         written = write_run_splats(run, tmp_path / "a.ply", 0.7, how=how)
         read = read_splats(written.path)
         assert compare_run(run, run.scene, 0.7, written.splat, read).psnr > 80
-        assert compare_run(run, run.scene, 0.0, written.splat, read).psnr < 40  # another time is seen as such
+        # another time is seen as such
+        assert compare_run(run, run.scene, 0.0, written.splat, read).psnr < 40
     cameras = capture_cameras(run)
     assert cameras is not None
     assert max(cameras.width, cameras.height) <= 240
@@ -35,8 +36,14 @@ def test_what_is_lost_is_measured(tmp_path: Path) -> None:
     assert compare_splats(splat, exact).psnr > 80
     coarse = write_splats(tmp_path / "a.splat", splat)
     assert compare_splats(splat, coarse).psnr < 30
-    again = replace(splat, turned=turn_between(AXES["x"], AXES["z"]))  # a file that had been turned before
-    assert compare_splats(again, write_splats(tmp_path / "b.ply", upright(again, None, tmp_path / "b.ply"))).psnr > 80
+    # a file that had been turned before
+    again = replace(splat, turned=turn_between(AXES["x"], AXES["z"]))
+    assert (
+        compare_splats(
+            again, write_splats(tmp_path / "b.ply", upright(again, None, tmp_path / "b.ply"))
+        ).psnr
+        > 80
+    )
     assert torch.isfinite(torch.tensor(compare_splats(splat, coarse).psnr))
 
 

@@ -25,7 +25,8 @@ def test_a_prune_run_moves_as_before(tmp_path: Path, moves: bool) -> None:
     assert written.num_bytes == written.path.stat().st_size
     assert written.precision.change is not None
     assert written.precision.change <= 0.5
-    before, after = load_run(run_dir), load_run(tmp_path / "small")
+    before = load_run(run_dir)
+    after = load_run(tmp_path / "small")
     assert (after.config, after.info) == (before.config, before.info)
     assert after.scene.is_static is not moves
     for time in (0.0, 0.6):
@@ -47,7 +48,8 @@ def test_a_run_with_masks_is_stored_with_them(tmp_path: Path) -> None:
 
 
 def with_outlier(run_dir: Path, **values: float) -> None:
-    """Save the run anew with a value of its first Gaussian, behind all cameras, replaced in each named attribute."""
+    """Save the run anew with a value of its first Gaussian, behind all cameras, replaced in each
+    named attribute."""
     checkpoint = latest_checkpoint(run_dir)
     tensors = {name: x.clone() for name, x in checkpoint.tensors.items()}
     for name, value in values.items():
@@ -55,14 +57,18 @@ def with_outlier(run_dir: Path, **values: float) -> None:
     save_checkpoint(run_dir, replace(checkpoint, tensors=tensors), 1.0)
 
 
-@pytest.mark.parametrize("values", [{"means": 1e8}, {"means": -3e37}, {"means": 1e6, "sh": 1e8, "log_scales": -90.0}])
+@pytest.mark.parametrize(
+    "values", [{"means": 1e8}, {"means": -3e37}, {"means": 1e6, "sh": 1e8, "log_scales": -90.0}]
+)
 def test_an_outlier_does_not_spoil_the_others(tmp_path: Path, values: dict[str, float]) -> None:
     run_dir = write_moving_run(tmp_path)
     with_outlier(run_dir, **values)
     written = write_scene_file(run_dir, tmp_path / "small", 0.5)
     assert written.precision.change is not None
     assert written.precision.change <= 0.5
-    before, after = (load_run(folder).scene.at(0.6).means for folder in (run_dir, tmp_path / "small"))
+    before, after = (
+        load_run(folder).scene.at(0.6).means for folder in (run_dir, tmp_path / "small")
+    )
     order = [x[:, 0].argsort() for x in (before, after)]
     torch.testing.assert_close(after[order[1]], before[order[0]], atol=0.1, rtol=1e-6)
 
@@ -74,8 +80,13 @@ def test_a_file_that_changes_images_more_than_allowed_is_not_written(
     run_dir = write_moving_run(tmp_path)
     before = sorted(run_dir.rglob("*"))
     coarse = {f"gaussians.{name}": 0.5 for name in ("means", "log_scales", "sh_base")}
-    monkeypatch.setattr("dyngs.storage.measure.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5))
-    with pytest.raises(DyngsError, match=r"more than the 0.5 allowed; nothing was written. Give a larger --max-change"):
+    monkeypatch.setattr(
+        "dyngs.storage.measure.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5)
+    )
+    with pytest.raises(
+        DyngsError,
+        match=r"more than the 0.5 allowed; nothing was written. Give a larger --max-change",
+    ):
         write_scene_file(run_dir, run_dir if into_run else tmp_path / "small", 0.5)
     assert sorted(run_dir.rglob("*")) == before
     assert not (tmp_path / "small").exists()
@@ -106,14 +117,20 @@ def test_extremes_are_stored_as_they_are_drawn(tmp_path: Path, values: dict[str,
 
 @pytest.mark.parametrize("count", [0, 1])
 @pytest.mark.parametrize("degree", range(5))
-def test_no_gaussian_and_one_of_any_degree_are_stored(tmp_path: Path, count: int, degree: int) -> None:
+def test_no_gaussian_and_one_of_any_degree_are_stored(
+    tmp_path: Path, count: int, degree: int
+) -> None:
     run_dir = write_moving_run(tmp_path, moves=False)
     checkpoint = latest_checkpoint(run_dir)
     tensors = {name: x[:count].clone() for name, x in checkpoint.tensors.items()}
     tensors["gaussians.sh"] = torch.ones(count, (degree + 1) ** 2, 3)
     save_checkpoint(run_dir, replace(checkpoint, tensors=tensors), 1.0)
     write_scene_file(run_dir, tmp_path / "small", 1.0)
-    assert tuple(load_run(tmp_path / "small").scene.gaussians.sh.shape) == (count, (degree + 1) ** 2, 3)
+    assert tuple(load_run(tmp_path / "small").scene.gaussians.sh.shape) == (
+        count,
+        (degree + 1) ** 2,
+        3,
+    )
 
 
 def test_without_its_capture_steps_are_assumed(tmp_path: Path) -> None:

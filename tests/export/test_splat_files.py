@@ -1,4 +1,5 @@
-"""Files of a run: where things are at each moment, its parts, sequences that are whole or not there."""
+"""Files of a run: where things are at each moment, its parts, sequences that are whole or not
+there."""
 
 from __future__ import annotations
 
@@ -91,7 +92,9 @@ def test_a_still_run_has_no_time(still: Opened, tmp_path: Path) -> None:
 
 def test_the_default_is_the_beginning(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
-    torch.testing.assert_close(x_of(written(open_run(run_dir), tmp_path / "a.ply")), moved_x(ALL, 0.0))
+    torch.testing.assert_close(
+        x_of(written(open_run(run_dir), tmp_path / "a.ply")), moved_x(ALL, 0.0)
+    )
 
 
 def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
@@ -124,7 +127,8 @@ def test_a_sequence(moving: Opened, part, rows: tuple[int, ...], tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("count", "last"), [(1, "frame_0000.ply"), (10_000, "frame_9999.ply"), (10_001, "frame_10000.ply")]
+    ("count", "last"),
+    [(1, "frame_0000.ply"), (10_000, "frame_9999.ply"), (10_001, "frame_10000.ply")],
 )
 def test_names_are_in_order_of_frames(count: int, last: str) -> None:
     names = frame_names(count)
@@ -132,7 +136,9 @@ def test_names_are_in_order_of_frames(count: int, last: str) -> None:
     assert sorted(names) == names
 
 
-def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(moving: Opened, tmp_path: Path) -> None:
+def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
+    moving: Opened, tmp_path: Path
+) -> None:
     folder = tmp_path / "seq"
     write_run_sequence(moving, folder, (0.0, 0.5))
     (folder / "notes.txt").write_text("mine")
@@ -146,12 +152,20 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(moving
         write_run_sequence(moving, folder / "notes.txt", (0.0, 0.5))
 
 
-@pytest.mark.parametrize("problem", [DyngsError("NaN"), OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize(
+    "problem", [DyngsError("NaN"), OSError(28, "No space left on device"), KeyboardInterrupt()]
+)
 @pytest.mark.parametrize("exists", [False, True])
 def test_a_sequence_that_fails_leaves_nothing(
-    moving: Opened, problem: BaseException, exists: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    moving: Opened,
+    problem: BaseException,
+    exists: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    folder, real, count = tmp_path / "seq", splat_files.write_splats, []
+    folder = tmp_path / "seq"
+    real = splat_files.write_splats
+    count = []
     if exists:
         folder.mkdir()
         (folder / "notes.txt").write_text("mine")
@@ -186,7 +200,9 @@ def test_the_cameras_know(run: Opened) -> None:
 
 
 def test_without_a_capture_nothing_is_turned(run: Opened) -> None:
-    lost = replace(run, captured=Captured(run.config.data.model_copy(update={"root": Path("no")}), run.info))
+    lost = replace(
+        run, captured=Captured(run.config.data.model_copy(update={"root": Path("no")}), run.info)
+    )
     assert up_of(lost) is None
     how, line = writing_of(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
@@ -217,7 +233,9 @@ def test_positions_are_those_of_the_scene(times: tuple[float, ...], speed: float
 
 def test_only_what_moves() -> None:
     tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, part="moving")
-    np.testing.assert_allclose(tracks.positions, expected(TRAIN_TIMES)[list(MOVING_ROWS)], atol=1e-6)
+    np.testing.assert_allclose(
+        tracks.positions, expected(TRAIN_TIMES)[list(MOVING_ROWS)], atol=1e-6
+    )
     assert tracks.moving.tolist() == [True, True]
     assert tracks.ids.tolist() == list(MOVING_ROWS)
     with pytest.raises(DyngsError, match="nothing moves"):
@@ -238,7 +256,9 @@ def test_far_scenes_keep_their_precision() -> None:
     offset = (500_000.25, 5_400_000.125, 0.0)
     tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, Similarity(shift=offset))
     assert tracks.positions.dtype == np.float64
-    np.testing.assert_allclose(tracks.positions - np.array(offset), expected(TRAIN_TIMES), atol=1e-6)
+    np.testing.assert_allclose(
+        tracks.positions - np.array(offset), expected(TRAIN_TIMES), atol=1e-6
+    )
 
 
 def test_a_file_holds_arrays_without_pickle(tmp_path: Path) -> None:
@@ -260,10 +280,14 @@ def test_nothing_is_written_of_positions_that_are_not_finite(tmp_path: Path) -> 
     assert not any(tmp_path.iterdir())
 
 
-def test_sizes_beyond_the_limit_are_refused_before_memory_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sizes_beyond_the_limit_are_refused_before_memory_is_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(splat_files, "MAX_BYTES", 5 * 4 * 3 * 4)
     assert tracks_of(moving_scene(Sliding()), (0.0,) * 4).positions.nbytes == 5 * 4 * 3 * 4
-    with pytest.raises(DyngsError, match=r"tracks of 5 Gaussians at 5 times .* fewer --times, or --dynamic"):
+    with pytest.raises(
+        DyngsError, match=r"tracks of 5 Gaussians at 5 times .* fewer --times, or --dynamic"
+    ):
         tracks_of(moving_scene(Sliding()), (0.0,) * 5)
     monkeypatch.undo()
     with pytest.raises(DyngsError, match=r"6\.0 GB"):
@@ -281,9 +305,15 @@ def test_every_moment_is_where_it_should_be(tmp_path: Path) -> None:
     written = write_moving(run, tmp_path / "a.4dgs", times)
     for i in (0, 3, 8, 9):
         read = read_moment(written.path, i).gaussians
-        torch.testing.assert_close(read.means[:, 0], moved_x((0, 1, 2, 3, 4), times[i]), rtol=0, atol=0.01)
-        torch.testing.assert_close(read.base_rgb, written.splats[i].gaussians.base_rgb.clamp(0, 1), rtol=0, atol=0.01)
-        torch.testing.assert_close(read.scales, written.splats[i].gaussians.scales, rtol=0.02, atol=0)
+        torch.testing.assert_close(
+            read.means[:, 0], moved_x((0, 1, 2, 3, 4), times[i]), rtol=0, atol=0.01
+        )
+        torch.testing.assert_close(
+            read.base_rgb, written.splats[i].gaussians.base_rgb.clamp(0, 1), rtol=0, atol=0.01
+        )
+        torch.testing.assert_close(
+            read.scales, written.splats[i].gaussians.scales, rtol=0.02, atol=0
+        )
 
 
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -309,7 +339,8 @@ def test_without_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
-    """What moves, is posed or has a 3D filter: seen by cameras moved with it, at a time in between."""
+    """What moves, is posed or has a 3D filter: seen by cameras moved with it, at a time in
+    between."""
     scene = replace(scene_of_kind(kind), colour=None)
     edit = Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (3.0, -1.0, 0.5))
     splat = splats_at(opened_scene(scene), scene, 0.3, Writing(edit=edit, up="y"))

@@ -1,4 +1,5 @@
-"""Surfaces of Gaussians as files, through the command: still and moving ones, in the capture's own coordinates."""
+"""Surfaces of Gaussians as files, through the command: still and moving ones, in the capture's own
+coordinates."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ def mesh_of(path: Path) -> trimesh.Trimesh:
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_balls_side_by_side(tmp_path: Path, suffix: str) -> None:
     """Five of a radius of about 0.3, from x = -1 to 1, somewhere far away."""
-    run, out = write_moving_run(tmp_path, moves=False, offset=(100.0, 0.0, 0.0)), tmp_path / f"balls{suffix}"
+    run = write_moving_run(tmp_path, moves=False, offset=(100.0, 0.0, 0.0))
+    out = tmp_path / f"balls{suffix}"
     assert main(["export", str(run), "--format", "mesh", "--cells", "32", "--out", str(out)]) == 0
     mesh = mesh_of(out)
     assert len(mesh.faces) > 200
@@ -33,12 +35,24 @@ def test_balls_side_by_side(tmp_path: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_mesh_far_from_the_origin_is_the_mesh_moved(tmp_path: Path, suffix: str) -> None:
-    offset, found = (500_123.25, 4_600_321.5, 117.0), []
+    offset = (500_123.25, 4_600_321.5, 117.0)
+    found = []
     for name, where in (("near", (0.0, 0.0, 0.0)), ("far", offset)):
         (tmp_path / name).mkdir()
         run = write_moving_run(tmp_path / name, moves=False, offset=where)
         out = tmp_path / f"{name}{suffix}"
-        command = ["export", str(run), "--format", "mesh", "--cells", "32", "--up", "keep", "--out", str(out)]
+        command = [
+            "export",
+            str(run),
+            "--format",
+            "mesh",
+            "--cells",
+            "32",
+            "--up",
+            "keep",
+            "--out",
+            str(out),
+        ]
         assert main(command) == 0
         found.append(mesh_of(out))
     near, far = found
@@ -60,13 +74,18 @@ def test_up_is_what_programs_take_for_it(
     run = write_moving_run(tmp_path, moves=False, offset=(1.0, 2.0, 3.0))
     command = ["export", str(run), "--format", "mesh", "--cells", "32", "--from-up", "z"]
     meshes = []
-    for name, options in (("kept", ["--up", "keep"]), ("turned", [] if up is None else [f"--up={up}"])):
+    for name, options in (
+        ("kept", ["--up", "keep"]),
+        ("turned", [] if up is None else [f"--up={up}"]),
+    ):
         out = tmp_path / f"{name}{suffix}"
         assert main([*command, "--out", str(out), *options]) == 0
         meshes.append(mesh_of(out))
     kept, turned = meshes
     x, y, z = kept.vertices.T
-    wanted = {"y": (x, z, -y), "-y": (x, -z, y), "z": (x, y, z), "keep": (x, y, z)}[up or UP_IN[suffix]]
+    wanted = {"y": (x, z, -y), "-y": (x, -z, y), "z": (x, y, z), "keep": (x, y, z)}[
+        up or UP_IN[suffix]
+    ]
     np.testing.assert_allclose(turned.vertices, np.stack(wanted, 1), atol=1e-5)
     np.testing.assert_array_equal(turned.faces, kept.faces)
     np.testing.assert_array_equal(turned.visual.vertex_colors, kept.visual.vertex_colors)
@@ -76,13 +95,48 @@ def test_up_is_what_programs_take_for_it(
     assert (f"up is {up or 'y'} in the file" in said) == (up is not None or suffix != ".ply")
 
 
-def test_a_moving_scene_has_a_mesh_for_each_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, out = write_moving_run(tmp_path), tmp_path / "meshes"
-    assert main(["export", str(run), "--format", "mesh", "--cells", "24", "--times", "0:1:2", "--out", str(out)]) == 0
+def test_a_moving_scene_has_a_mesh_for_each_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_moving_run(tmp_path)
+    out = tmp_path / "meshes"
+    assert (
+        main(
+            [
+                "export",
+                str(run),
+                "--format",
+                "mesh",
+                "--cells",
+                "24",
+                "--times",
+                "0:1:2",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     assert len(re.findall(r"triangles with colours of .* vertices", capsys.readouterr().out)) == 2
     first, last = (mesh_of(path) for path in sorted(out.iterdir()))
     assert not np.array_equal(first.vertices[:50], last.vertices[:50])
-    assert main(["export", str(run), "--format", "mesh", "--cells", "24", "--times", "0:1:2", "--out", str(out)]) == 0
+    assert (
+        main(
+            [
+                "export",
+                str(run),
+                "--format",
+                "mesh",
+                "--cells",
+                "24",
+                "--times",
+                "0:1:2",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     np.testing.assert_array_equal(mesh_of(out / "mesh_0000.ply").vertices, first.vertices)
 
 
@@ -92,13 +146,20 @@ def test_a_moving_scene_has_a_mesh_for_each_time(tmp_path: Path, capsys: pytest.
         ("--cells 7", "--cells 7: give 8 to 1024"),
         ("--level 2", "--level goes with --format mesh of a radiance field"),
         ("--segments 3", "--segments goes with --format mesh of curved triangles"),
-        ("--out x.stl", r"x\.stl: a mesh of a surface is one file that ends in \.ply, \.glb, \.obj"),
+        (
+            "--out x.stl",
+            r"x\.stl: a mesh of a surface is one file that ends in \.ply, \.glb, \.obj",
+        ),
         ("--times 0:1:2 --out x.ply", r"x\.ply: a sequence is a folder of files; give --out x"),
         ("--static", "--static does not go with --format mesh"),
     ],
 )
 def test_what_does_not_go_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: str, words: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: str,
+    words: str,
 ) -> None:
     run = write_moving_run(tmp_path)
     (tmp_path / "empty").mkdir()
@@ -111,10 +172,15 @@ def test_what_does_not_go_is_one_line(
     assert not list(run.glob("mesh*"))
 
 
-def test_a_file_of_gaussians_has_no_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, file = write_moving_run(tmp_path, moves=False), tmp_path / "balls.ply"
+def test_a_file_of_gaussians_has_no_views(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_moving_run(tmp_path, moves=False)
+    file = tmp_path / "balls.ply"
     assert main(["export", str(run), "--out", str(file)]) == 0
     capsys.readouterr()
     assert main(["export", str(file), "--format", "mesh", "--out", str(tmp_path / "mesh.glb")]) == 2
-    assert re.fullmatch(r"dyngs: error: .*balls\.ply: a file has no training views, .*\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        r"dyngs: error: .*balls\.ply: a file has no training views, .*\n", capsys.readouterr().err
+    )
     assert not (tmp_path / "mesh.glb").exists()

@@ -19,13 +19,16 @@ from dyngs.export.video import VideoWriter
 
 def _image(height: int, width: int, shift: int = 0) -> np.ndarray:
     rgb = np.zeros((height, width, 3), np.uint8)
-    rgb[: height // 2], rgb[height // 2 :] = [200, 30, 60], [20, 220, 90]
+    rgb[: height // 2] = [200, 30, 60]
+    rgb[height // 2 :] = [20, 220, 90]
     return np.roll(rgb, shift, axis=0)
 
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(60, 91), st.integers(16, 51), st.sampled_from([10.0, 23.976, 60.0]))
-def test_images_survive(tmp_path_factory: pytest.TempPathFactory, height: int, width: int, fps: float) -> None:
+def test_images_survive(
+    tmp_path_factory: pytest.TempPathFactory, height: int, width: int, fps: float
+) -> None:
     file = tmp_path_factory.mktemp("video") / "v.mp4"
     images = [_image(height, width, 3 * i) for i in range(4)]
     with VideoWriter(file, fps=fps) as video:
@@ -66,10 +69,16 @@ def test_an_error_leaves_the_former_file(tmp_path: Path) -> None:
 
 
 def test_bad_names_and_rates_are_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"v\.nope.*\.mp4"), VideoWriter(tmp_path / "v.nope") as video:
+    with (
+        pytest.raises(DyngsError, match=r"v\.nope.*\.mp4"),
+        VideoWriter(tmp_path / "v.nope") as video,
+    ):
         video.add(_image(16, 16))
     (tmp_path / "file").write_text("")
-    with pytest.raises(DyngsError, match="cannot write"), VideoWriter(tmp_path / "file" / "v.mp4") as video:
+    with (
+        pytest.raises(DyngsError, match="cannot write"),
+        VideoWriter(tmp_path / "file" / "v.mp4") as video,
+    ):
         video.add(_image(16, 16))
     with pytest.raises(DyngsError, match="fps"):
         VideoWriter(tmp_path / "v.mp4", fps=0)

@@ -1,4 +1,5 @@
-"""Fields through the commands: trained, resumed, evaluated, drawn, exported as a mesh; what is refused, in a line."""
+"""Fields through the commands: trained, resumed, evaluated, drawn, exported as a mesh; what is
+refused, in a line."""
 
 from __future__ import annotations
 
@@ -32,7 +33,9 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("keys", [NGP, NERF], ids=["ngp", "nerf"])
-def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path, keys: list[str]) -> None:
+def test_a_run_that_is_cut_ends_with_the_same_bytes(
+    capture: Path, tmp_path: Path, keys: list[str]
+) -> None:
     run = dyngs.train(config_of(capture, *keys, *STEPS, f"run.dir={tmp_path / 'run'}"))
     last = checkpoint_paths(run)[-1]
     whole = last.read_bytes()
@@ -50,7 +53,9 @@ def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
     opened = open_run(run)
     for layer in ("colour", "depth"):
         shot = (
-            Shot(viewpoint_of(opened).start) if layer == "colour" else Shot(viewpoint_of(opened).start, layer="depth")
+            Shot(viewpoint_of(opened).start)
+            if layer == "colour"
+            else Shot(viewpoint_of(opened).start, layer="depth")
         )
         assert draw(opened, shot).std() > 0
 
@@ -74,8 +79,14 @@ def test_its_surface_is_a_mesh_with_colours(
     ("command", "said"),
     [
         (["export", "RUN", "--out", "OUT/scene.ply"], "Gaussians"),
-        (["export", "RUN", "--format", "mesh", "--level", "1e9", "--out", "OUT/mesh.ply"], "another --level"),
-        (["export", "RUN", "--format", "mesh", "--motion", "OUT/a.bvh", "--out", "OUT/mesh.ply"], "at its time"),
+        (
+            ["export", "RUN", "--format", "mesh", "--level", "1e9", "--out", "OUT/mesh.ply"],
+            "another --level",
+        ),
+        (
+            ["export", "RUN", "--format", "mesh", "--motion", "OUT/a.bvh", "--out", "OUT/mesh.ply"],
+            "at its time",
+        ),
         (["export", "RUN", "--format", "mesh", "--out", "OUT/mesh.stl"], ".ply"),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
     ],
@@ -114,7 +125,9 @@ def test_what_cannot_be_trained_is_refused(
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
-def test_one_camera_position_is_refused(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_camera_position_is_refused(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     meta = json.loads((capture / "transforms_train.json").read_text(encoding="utf-8"))
     one = tmp_path / "one"
     (one / "train").mkdir(parents=True)

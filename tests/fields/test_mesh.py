@@ -20,7 +20,8 @@ MIDDLE = torch.tensor([0.3, -0.1, 0.2])
 
 @dataclass(frozen=True)
 class Ball(NgpField):
-    """Density exp(10 (radius - distance)) around a point, of radius 0.5, and colours that are the direction."""
+    """Density exp(10 (radius - distance)) around a point, of radius 0.5, and colours that are the
+    direction."""
 
     def densities(self, points: torch.Tensor, time: float) -> torch.Tensor:
         return 25 * torch.exp(10 * (0.5 - (points - MIDDLE).norm(dim=1))) * (1.5 / self.space.half)
@@ -32,9 +33,18 @@ class Ball(NgpField):
 @pytest.fixture(scope="module")
 def scene() -> FieldScene:
     space = Space((0.1, 0.0, 0.0), 1.0, 2, 8)
-    plain = NgpField.new(NgpModel(levels=2, log2_rows=6, finest=16), space, torch.Generator().manual_seed(0))
+    plain = NgpField.new(
+        NgpModel(levels=2, log2_rows=6, finest=16), space, torch.Generator().manual_seed(0)
+    )
     field = Ball(
-        space, plain.pixels, plain.levels, plain.table, plain.density, plain.colour, plain.occupied, plain.across
+        space,
+        plain.pixels,
+        plain.levels,
+        plain.table,
+        plain.density,
+        plain.colour,
+        plain.occupied,
+        plain.across,
     )
     return FieldScene(field)
 
@@ -52,6 +62,8 @@ def test_a_ball_is_found_with_faces_outwards_and_colours(scene: FieldScene) -> N
 
 def test_another_level_is_another_surface(scene: FieldScene) -> None:
     found = surface_of(scene, level=25 * np.e, cells=40)
-    assert np.linalg.norm(found.vertices - MIDDLE.numpy(), axis=1).mean() == pytest.approx(0.4, abs=2e-3)
+    assert np.linalg.norm(found.vertices - MIDDLE.numpy(), axis=1).mean() == pytest.approx(
+        0.4, abs=2e-3
+    )
     with pytest.raises(DyngsError, match="no surface"):
         surface_of(scene, level=1e6, cells=10)

@@ -12,7 +12,8 @@ from dyngs.kinds import assemble
 
 def test_it_learns(capture: Path) -> None:
     """The mean loss of the last steps, of both networks, is far below that of the first ones."""
-    trainer = assemble(config_of(capture, *NERF, "train.steps=60", "train.alpha_weight=0"))  # its weight would rise
+    # its weight would rise
+    trainer = assemble(config_of(capture, *NERF, "train.steps=60", "train.alpha_weight=0"))
     losses = [trainer.step().loss for _ in range(60)]
     assert sum(losses[-20:]) < 0.8 * sum(losses[:20])
 
@@ -20,4 +21,6 @@ def test_it_learns(capture: Path) -> None:
 def test_the_rate_falls_to_a_tenth(capture: Path) -> None:
     trainer = assemble(config_of(capture, *NERF, "train.steps=1000", "train.batch_size=2"))
     assert trainer.model.num_rays == 32
-    assert [trainer.model.rate(step) for step in (0, 500, 1000)] == pytest.approx([2e-3, 2e-3 * 0.1**0.5, 2e-4])
+    assert [trainer.model.rate(step) for step in (0, 500, 1000)] == pytest.approx(
+        [2e-3, 2e-3 * 0.1**0.5, 2e-4]
+    )

@@ -29,13 +29,26 @@ def field_of(model: NgpModel = SMALL, space: Space = SPACE) -> NgpField:
 def rays_towards_it(count: int = 20) -> Rays:
     generator = torch.Generator().manual_seed(1)
     origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator)) * 4
-    return Rays(origins, torch.nn.functional.normalize(0.5 * torch.randn(count, 3, generator=generator) - origins))
+    return Rays(
+        origins,
+        torch.nn.functional.normalize(0.5 * torch.randn(count, 3, generator=generator) - origins),
+    )
 
 
 def test_sizes_are_for_a_cpu_or_as_published() -> None:
-    own, published = NgpSizes.of(NgpModel()), NgpSizes.of(NgpModel(sizes="published"))
-    assert (len(own.levels.rows), own.features, max(own.levels.rows), own.num_samples) == (8, 4, 2**16, 2**14)
-    assert (len(published.levels.rows), published.features, max(published.levels.rows)) == (16, 2, 2**19)
+    own = NgpSizes.of(NgpModel())
+    published = NgpSizes.of(NgpModel(sizes="published"))
+    assert (len(own.levels.rows), own.features, max(own.levels.rows), own.num_samples) == (
+        8,
+        4,
+        2**16,
+        2**14,
+    )
+    assert (len(published.levels.rows), published.features, max(published.levels.rows)) == (
+        16,
+        2,
+        2**19,
+    )
     assert published.num_samples == 2**18
     assert (own.across, published.across, max(published.levels.sizes)) == (1024, 1024, 4096)
     small = NgpSizes.of(NgpModel(), pixels=200)
@@ -45,12 +58,15 @@ def test_sizes_are_for_a_cpu_or_as_published() -> None:
 
 @pytest.mark.parametrize("time", [False, True])
 def test_rays_see_what_places_along_them_are(time: bool) -> None:
-    """Sample by sample, by the densities and colours of places: occupied ones, up to where nothing is left."""
-    field, rays = field_of(SMALL.model_copy(update={"time": time})), rays_towards_it()
+    """Sample by sample, by the densities and colours of places: occupied ones, up to where nothing
+    is left."""
+    field = field_of(SMALL.model_copy(update={"time": time}))
+    rays = rays_towards_it()
     with torch.no_grad():
         seen = field.seen(rays, 0.3, near=0.1)
         for r in range(len(rays)):
-            at = 0.5 * field.step + torch.arange(3000) * field.step  # from the camera on, nearly as the samples lie
+            # from the camera on, nearly as the samples lie
+            at = 0.5 * field.step + torch.arange(3000) * field.step
             points = rays.origins[r] + at[:, None] * rays.directions[r]
             unit = field.space.unit(points)
             inside = ((unit >= 0) & (unit <= 1)).all(1)
@@ -59,7 +75,8 @@ def test_rays_see_what_places_along_them_are(time: bool) -> None:
             left = torch.exp(-field.densities(points, 0.3) * field.step * inside)
             weights = (1 - left) * torch.cat([torch.ones(1), left.cumprod(0)[:-1]])
             colours = field.colours(points, rays.directions[r].expand(3000, 3), 0.3)
-            assert (seen.colour[r] - (weights[:, None] * colours).sum(0)).abs().max() < 0.02  # shifted by half a step
+            # shifted by half a step
+            assert (seen.colour[r] - (weights[:, None] * colours).sum(0)).abs().max() < 0.02
             assert (seen.transmittance[r] - left.prod()).abs() < 0.02
     assert float(seen.transmittance.max()) == 1
     assert float(seen.transmittance.min()) < 0.2
@@ -74,13 +91,18 @@ def test_all_that_is_learned_gets_gradients() -> None:
 def test_rays_that_miss_see_the_background() -> None:
     rays = Rays(torch.tensor([[5.0, 0, 0]]), torch.tensor([[1.0, 0, 0]]))
     seen = field_of().seen(rays, 0.0, near=0.1)
-    assert (seen.num_samples, seen.transmittance.tolist(), seen.colour.abs().sum().item()) == (0, [1.0], 0.0)
+    assert (seen.num_samples, seen.transmittance.tolist(), seen.colour.abs().sum().item()) == (
+        0,
+        [1.0],
+        0.0,
+    )
 
 
 @pytest.mark.parametrize("cells", [8, 5])
 def test_what_is_stored_is_restored(cells: int) -> None:
     """Cells as bits, also where they do not fill the last byte."""
-    model, space = SMALL.model_copy(update={"cells": cells}), Space((0.1, 0.0, -0.2), 1.2, 3, cells)
+    model = SMALL.model_copy(update={"cells": cells})
+    space = Space((0.1, 0.0, -0.2), 1.2, 3, cells)
     field = field_of(model, space)
     info = CheckpointInfo(1, 1.0, (0.0, 0.0, 0.0), "white", "classic")
     checkpoint = Checkpoint(info, tensors_of(FieldScene(field).state()))
@@ -88,15 +110,21 @@ def test_what_is_stored_is_restored(cells: int) -> None:
     again = NgpField.restored(model, space, checkpoint)
     assert torch.equal(again.occupied, field.occupied)
     assert all(torch.equal(again.parameters[name], x) for name, x in field.parameters.items())
-    bad: dict[str, Any] = {"field.table": field.table.detach()[1:], "field.occupied": torch.zeros(3, dtype=torch.uint8)}
+    bad: dict[str, Any] = {
+        "field.table": field.table.detach()[1:],
+        "field.occupied": torch.zeros(3, dtype=torch.uint8),
+    }
     for name, x in bad.items():
         with pytest.raises(ValueError, match=name.removeprefix("field.")):
             NgpField.restored(model, space, Checkpoint(info, checkpoint.tensors | {name: x}))
 
 
 def test_mist_is_as_thick_in_each_cube() -> None:
-    field = NgpField.new(SMALL, Space((0.1, 0.0, -0.2), 1.2, 4, 8), torch.Generator().manual_seed(0))
-    middle, side = torch.tensor([0.1, 0.0, -0.2]), torch.tensor([1.2, 0.3, -0.5])
+    field = NgpField.new(
+        SMALL, Space((0.1, 0.0, -0.2), 1.2, 4, 8), torch.Generator().manual_seed(0)
+    )
+    middle = torch.tensor([0.1, 0.0, -0.2])
+    side = torch.tensor([1.2, 0.3, -0.5])
     points = torch.stack([middle + 0.4 * side, middle + side, middle + 2 * side, middle + 8 * side])
     with torch.no_grad():
         found = field.densities(points, 0.0)

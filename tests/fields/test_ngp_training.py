@@ -32,9 +32,13 @@ def trained(capture: Path, steps: int, *keys: str) -> Trainer[NgpTraining]:
 
 def held_out_psnr(trainer: Trainer[NgpTraining]) -> float:
     images = ImageLoader(trainer.capture.splits["test"], trainer.config.data)
-    scene, white = trainer.model.scene, torch.ones(3)
+    scene = trainer.model.scene
+    white = torch.ones(3)
     with torch.no_grad():
-        drawn = [scene.render(x.cameras, background=white).rgb[0] for x in (images[i] for i in range(len(images)))]
+        drawn = [
+            scene.render(x.cameras, background=white).rgb[0]
+            for x in (images[i] for i in range(len(images)))
+        ]
     return sum(psnr(x, images[i].composite(white)) for i, x in enumerate(drawn)) / len(drawn)
 
 
@@ -46,7 +50,9 @@ def test_views_that_were_held_out_are_learned(capture: Path) -> None:
     assert isinstance(field, NgpField)
     assert 0.02 < float(field.occupied.float().mean()) < 0.6, "empty cells were found"
     image = trainer.images[0]
-    which = torch.randint(24 * 24, (trainer.model.num_rays,), generator=torch.Generator().manual_seed(0))
+    which = torch.randint(
+        24 * 24, (trainer.model.num_rays,), generator=torch.Generator().manual_seed(0)
+    )
     rays, _ = rays_of(image.cameras, which)
     samples = field.seen(rays, 0.0, near=0.1).num_samples
     assert 0.4 < samples / 2**12 < 2.5, "rays fill a step, about"
@@ -84,7 +90,9 @@ def test_a_cube_that_no_camera_sees_is_refused(capture: Path) -> None:
     config = config_of(capture, *NGP, "model.half_extent=0.1")
     read = read_capture(config.data)
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
-    views = [replace(view, cam_from_world=away @ view.cam_from_world) for view in read.splits["train"]]
+    views = [
+        replace(view, cam_from_world=away @ view.cam_from_world) for view in read.splits["train"]
+    ]
     with pytest.raises(DyngsError, match="no training camera sees anything of the cube"):
         assemble(config, replace(read, splits={**read.splits, "train": views}))
 

@@ -30,7 +30,14 @@ def ball(cascades: int) -> Ball:
     space = Space((0.2, 0.0, 0.0), 1.0, cascades, 16)
     plain = NgpField.new(MODEL, space, torch.Generator().manual_seed(0))
     return Ball(
-        space, plain.pixels, plain.levels, plain.table, plain.density, plain.colour, plain.occupied, plain.across
+        space,
+        plain.pixels,
+        plain.levels,
+        plain.table,
+        plain.density,
+        plain.colour,
+        plain.occupied,
+        plain.across,
     )
 
 
@@ -39,17 +46,23 @@ def occupancy_of(field: NgpField, num_random: int = 2**20) -> Occupancy:
 
 
 def test_cells_of_all_cubes_are_found() -> None:
-    field, generator = ball(2), torch.Generator().manual_seed(0)
+    field = ball(2)
+    generator = torch.Generator().manual_seed(0)
     found = occupancy_of(field).updated(field, 32, (), generator)
     for cascade, half in enumerate((1.0, 2.0)):
-        middles = torch.stack(torch.meshgrid(*[(torch.arange(16) + 0.5) / 8 - 1] * 3, indexing="ij"), -1) * half
-        distance, cell = middles.norm(dim=-1), half / 8 * 3**0.5 / 2
+        middles = (
+            torch.stack(torch.meshgrid(*[(torch.arange(16) + 0.5) / 8 - 1] * 3, indexing="ij"), -1)
+            * half
+        )
+        distance = middles.norm(dim=-1)
+        cell = half / 8 * 3**0.5 / 2
         assert bool(found[cascade][distance < 0.6 - cell].all())
         assert not bool(found[cascade][distance > 0.6 + cell].any())
 
 
 def test_what_is_gone_fades() -> None:
-    field, generator = ball(1), torch.Generator().manual_seed(0)
+    field = ball(1)
+    generator = torch.Generator().manual_seed(0)
     occupancy = occupancy_of(field)
     before = occupancy.updated(field, 32, (), generator)
     empty = replace(field, height=0.0)
@@ -60,11 +73,14 @@ def test_what_is_gone_fades() -> None:
         last = occupancy.updated(empty, 32, (), generator)
     values = occupancy.state()["values"]
     assert float(values.max()) < THRESHOLD
-    assert torch.equal(last, (values > values.double().mean()).view(last.shape)), "the mean decides then"
+    assert torch.equal(last, (values > values.double().mean()).view(last.shape)), (
+        "the mean decides then"
+    )
 
 
 def test_later_half_of_the_cells_at_most_are_looked_at() -> None:
-    field, generator = ball(1), torch.Generator().manual_seed(0)
+    field = ball(1)
+    generator = torch.Generator().manual_seed(0)
     occupancy = occupancy_of(field)
     found = occupancy.updated(field, WARM_UP + 16, (), generator)
     seen = (occupancy.state()["values"] > 0).float().mean()
@@ -76,7 +92,8 @@ def test_later_half_of_the_cells_at_most_are_looked_at() -> None:
 
 
 def test_few_random_cells_are_looked_at_where_few_are_asked_for() -> None:
-    field, generator = ball(1), torch.Generator().manual_seed(0)
+    field = ball(1)
+    generator = torch.Generator().manual_seed(0)
     field.occupied.zero_()
     occupancy = occupancy_of(field, 50)
     occupancy.updated(field, WARM_UP + 16, (), generator)
@@ -84,7 +101,8 @@ def test_few_random_cells_are_looked_at_where_few_are_asked_for() -> None:
 
 
 def test_what_no_camera_sees_is_never_occupied() -> None:
-    field, generator = ball(1), torch.Generator().manual_seed(0)
+    field = ball(1)
+    generator = torch.Generator().manual_seed(0)
     seen = torch.ones(field.space.shape, dtype=torch.bool)
     seen[:, :8] = False
     occupancy = Occupancy(field.space, seen, 2**20)
@@ -96,7 +114,8 @@ def test_what_no_camera_sees_is_never_occupied() -> None:
 
 
 def test_all_cells_are_looked_at_ever_less_often() -> None:
-    field, generator = ball(1), torch.Generator().manual_seed(0)
+    field = ball(1)
+    generator = torch.Generator().manual_seed(0)
     field.occupied.zero_()
     occupancy = occupancy_of(field, 1)
     assert [step for step in range(1, 80) if occupancy.is_due(step)] == [32, 48, 64]

@@ -15,7 +15,9 @@ ACROSS = Rays(torch.tensor([[-3.0, 0.2, 0.1]]), torch.tensor([[1.0, 0.0, 0.0]]))
 
 
 def test_rays_are_clipped_to_the_space() -> None:
-    rays = Rays(torch.tensor([[-3.0, 0, 0], [-3, 5, 0], [0.5, 0, 0]]), torch.tensor([[1.0, 0, 0]] * 3))
+    rays = Rays(
+        torch.tensor([[-3.0, 0, 0], [-3, 5, 0], [0.5, 0, 0]]), torch.tensor([[1.0, 0, 0]] * 3)
+    )
     begin, end = crossed(rays, SPACE, 0.1)
     assert begin.tolist() == pytest.approx([2.0, begin[1].item(), 0.1])
     assert end[[0, 2]].tolist() == pytest.approx([4.0, 0.5])
@@ -29,8 +31,14 @@ def test_each_part_of_the_way_has_one_sample(count: int, seed: int, cascades: in
     shifts = torch.rand(1, count, generator=torch.Generator().manual_seed(seed))
     found = evenly(ACROSS, space, 0.05, shifts)[0].double()
     begin, end = (float(x) for x in crossed(ACROSS, space, 0.05))
-    parts = (found - begin) / (end - begin) if cascades == 1 else (1 / begin - 1 / found) / (1 / begin - 1 / end)
-    assert (parts * count - torch.arange(count)).tolist() == pytest.approx(shifts[0].tolist(), abs=1e-3)
+    parts = (
+        (found - begin) / (end - begin)
+        if cascades == 1
+        else (1 / begin - 1 / found) / (1 / begin - 1 / end)
+    )
+    assert (parts * count - torch.arange(count)).tolist() == pytest.approx(
+        shifts[0].tolist(), abs=1e-3
+    )
 
 
 def test_more_samples_go_where_the_weights_are() -> None:

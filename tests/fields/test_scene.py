@@ -20,7 +20,9 @@ from dyngs.ops.rays import Space
 
 def scene_of(space: Space) -> FieldScene:
     model = NgpModel(levels=3, log2_rows=8, finest=32, cells=8)
-    return FieldScene(NgpField.new(model, space, torch.Generator().manual_seed(0)), background=torch.ones(3))
+    return FieldScene(
+        NgpField.new(model, space, torch.Generator().manual_seed(0)), background=torch.ones(3)
+    )
 
 
 def test_depth_is_along_the_axis_of_the_camera_and_expected_is_divided_by_alpha() -> None:
@@ -28,18 +30,23 @@ def test_depth_is_along_the_axis_of_the_camera_and_expected_is_divided_by_alpha(
     centre = (view.centers[0] + 3 * view.cam_from_world[0, 2, :3]).tolist()
     scene = scene_of(Space((centre[0], centre[1], centre[2]), 0.5, 1, 8))
     with torch.no_grad():
-        whole, sums = (scene.render(view, options=DrawOptions(0.1, x)) for x in ("expected", "accumulated"))
+        whole, sums = (
+            scene.render(view, options=DrawOptions(0.1, x)) for x in ("expected", "accumulated")
+        )
     assert whole.depth is not None
     assert sums.depth is not None
     hit = whole.alpha > 0.02
     assert 5 < int(hit.sum()) < 108
     assert torch.allclose(whole.depth[hit] * whole.alpha[hit], sums.depth[hit], atol=1e-5)
     assert bool(((whole.depth[hit] > 2.1) & (whole.depth[hit] < 3.9)).all())
-    assert torch.equal(whole.rgb[~hit & (whole.alpha == 0)], torch.ones_like(whole.rgb[~hit & (whole.alpha == 0)]))
+    assert torch.equal(
+        whole.rgb[~hit & (whole.alpha == 0)], torch.ones_like(whole.rgb[~hit & (whole.alpha == 0)])
+    )
 
 
 def test_an_image_does_not_depend_on_how_it_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, view = scene_of(Space((0.0, 0.0, 0.0), 1.0, 3, 8)), camera(12, 9)
+    scene = scene_of(Space((0.0, 0.0, 0.0), 1.0, 3, 8))
+    view = camera(12, 9)
     with torch.no_grad():
         whole = scene.render(view).rgb
         monkeypatch.setattr("dyngs.fields.scene.CHUNK", 7)
@@ -63,7 +70,9 @@ def test_with_time_it_moves(moving: Path, keys: list[str]) -> None:
     assert not torch.equal(first, last)
 
 
-@pytest.mark.parametrize("bad", [[0.0, 0, 0, -1, 1, 8], [0.0, 0, 0, 1, 99, 8], [0.0, 0, 0, 1, 1, 0.5]])
+@pytest.mark.parametrize(
+    "bad", [[0.0, 0, 0, -1, 1, 8], [0.0, 0, 0, 1, 99, 8], [0.0, 0, 0, 1, 1, 0.5]]
+)
 def test_a_space_that_is_none_is_refused(bad: list[float]) -> None:
     with pytest.raises(ValueError, match="space"):
         stored_space({"space": torch.tensor(bad, dtype=torch.float64)})

@@ -42,8 +42,12 @@ def test_an_object_lies_in_a_cube_that_the_cameras_frame(still: Capture) -> None
 def test_a_real_capture_has_cubes_up_to_its_points(still: Capture) -> None:
     directions = np.random.default_rng(0).normal(size=(500, 3))
     directions /= np.abs(directions).max(axis=1, keepdims=True)
-    near, far = (space_of(NgpModel(), 16, real(still, distance * directions)) for distance in (3.0, 60.0))
-    assert near.half == pytest.approx(space_of(NgpModel(), 16, still).half), "what cameras frame that look at a point"
+    near, far = (
+        space_of(NgpModel(), 16, real(still, distance * directions)) for distance in (3.0, 60.0)
+    )
+    assert near.half == pytest.approx(space_of(NgpModel(), 16, still).half), (
+        "what cameras frame that look at a point"
+    )
     assert near.outermost >= 2 * 3.0
     assert far.outermost > 60
     assert space_of(NgpModel(), 16, real(still, None)).cascades == MOST_CASCADES
@@ -67,8 +71,11 @@ def test_one_camera_position_tells_no_depth(still: Capture) -> None:
 
 
 def test_rays_go_through_pixel_centres() -> None:
-    """What lies along the ray of a pixel is projected to its centre; z is what the depth of an image means."""
-    turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    """What lies along the ray of a pixel is projected to its centre; z is what the depth of an
+    image means."""
+    turn, _ = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    )
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3], pose[:3, 3] = turn, torch.tensor([0.3, -0.2, 1.0])
     intrinsics = torch.tensor([[30.0, 0, 11], [0, 28, 7], [0, 0, 1]], dtype=torch.float64)
@@ -76,7 +83,9 @@ def test_rays_go_through_pixel_centres() -> None:
     rays, z = rays_of(camera)
     local = (rays.origins + 2.5 * rays.directions) @ pose[:3, :3].T + pose[:3, 3]
     pixels = local @ intrinsics.T
-    expected = torch.stack(torch.meshgrid(torch.arange(20) + 0.5, torch.arange(15) + 0.5, indexing="xy"), -1)
+    expected = torch.stack(
+        torch.meshgrid(torch.arange(20) + 0.5, torch.arange(15) + 0.5, indexing="xy"), -1
+    )
     assert torch.allclose(pixels[:, :2] / pixels[:, 2:], expected.view(-1, 2).double())
     assert torch.allclose(local[:, 2], 2.5 * z)
     assert torch.allclose(rays.directions.norm(dim=1), torch.ones(300, dtype=torch.float64))
@@ -87,7 +96,8 @@ def test_rays_go_through_pixel_centres() -> None:
 def test_a_part_of_an_image_is_its_pixels(capture: Path, still: Capture) -> None:
     image = ImageLoader(still.splits["train"], config_of(capture).data)[0]
     pixels = torch.tensor([5, 24 * 11 + 7, 5])
-    part, white = part_of(image, pixels), torch.ones(3)
+    part = part_of(image, pixels)
+    white = torch.ones(3)
     assert torch.equal(part.composite(white)[0], image.composite(white).view(-1, 3)[pixels])
     assert part.alpha is not None
     assert part.alpha.shape == (1, 3)

@@ -57,7 +57,12 @@ def left() -> list[str]:
 
 @pytest.mark.parametrize("top", ["", "my scene/", "a/b/"])
 def test_an_archive_is_read_as_its_folder(tmp_path: Path, root: Path, top: str) -> None:
-    junk = {"__MACOSX/._x.png": b"x", "__MACOSX/scene/._transforms.json": b"{", ".DS_Store": b"", f"{top}._a.png": b""}
+    junk = {
+        "__MACOSX/._x.png": b"x",
+        "__MACOSX/scene/._transforms.json": b"{",
+        ".DS_Store": b"",
+        f"{top}._a.png": b"",
+    }
     file = packed(tmp_path / "scene.zip", root, top, junk)
     views = read_capture(file).splits["train"]
     expected = read_capture(root).splits["train"]
@@ -85,11 +90,15 @@ def test_folders_that_windows_separates_are_folders(tmp_path: Path, root: Path) 
     file = tmp_path / "scene.zip"
     with zipfile.ZipFile(file, "w") as out:
         for source in root.rglob("*.*"):
-            out.writestr("scene\\" + str(source.relative_to(root)).replace("/", "\\"), source.read_bytes())
+            out.writestr(
+                "scene\\" + str(source.relative_to(root)).replace("/", "\\"), source.read_bytes()
+            )
     assert len(read_capture(file).splits["train"]) == 3
 
 
-def test_training_says_where_it_is_unpacked_and_keeps_the_archive(tmp_path: Path, root: Path) -> None:
+def test_training_says_where_it_is_unpacked_and_keeps_the_archive(
+    tmp_path: Path, root: Path
+) -> None:
     file = packed(tmp_path / "scene.zip", root, "scene/")
     said: list[str] = []
     config = with_capture(load_config("static", [f"data.root={file}"]), say=said.append)
@@ -100,13 +109,17 @@ def test_training_says_where_it_is_unpacked_and_keeps_the_archive(tmp_path: Path
 def test_a_run_on_an_archive_is_evaluated_without_the_cache(tmp_path: Path, root: Path) -> None:
     file = packed(tmp_path / "scene.zip", root)
     words = ["train.steps=2", "init.num_random=50", "init.triangulate=0", "run.threads=1"]
-    assert main(["train", "static", f"data.root={file}", f"run.dir={tmp_path / 'run'}", *words]) == 0
+    assert (
+        main(["train", "static", f"data.root={file}", f"run.dir={tmp_path / 'run'}", *words]) == 0
+    )
     shutil.rmtree(cache_folder("captures"))
     assert main(["eval", str(tmp_path / "run")]) == 0
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["num_views"] == 1
 
 
-def test_photos_in_an_archive_are_posed(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_in_an_archive_are_posed(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found: list[Path] = []
 
     def pose(images: Path, out: Path, *_: object) -> SimpleNamespace:
@@ -123,7 +136,9 @@ def test_photos_in_an_archive_are_posed(tmp_path: Path, root: Path, monkeypatch:
     assert found == [unpacked(file) / "holiday"] * 2
 
 
-def test_inspect_reads_an_archive(tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_reads_an_archive(
+    tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["data", "inspect", str(packed(tmp_path / "scene.zip", root))]) == 0
     out = capsys.readouterr().out
     assert "3 train, 1 test" in out
@@ -133,7 +148,9 @@ def test_inspect_reads_an_archive(tmp_path: Path, root: Path, capsys: pytest.Cap
 def test_processes_unpack_one_archive_at_once(tmp_path: Path, root: Path) -> None:
     file = packed(tmp_path / "scene.zip", root)
     code = f"from pathlib import Path\nfrom dyngs.files.archive import unpacked\nprint(unpacked(Path({str(file)!r})))"
-    children = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) for _ in range(3)]
+    children = [
+        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) for _ in range(3)
+    ]
     found = {child.communicate()[0] for child in children}
     assert all(child.returncode == 0 for child in children)
     assert len(found) == 1
@@ -156,13 +173,22 @@ def test_the_slower_process_takes_the_folder_of_the_faster(
     assert len(left()) == 1
 
 
-BAD_NAMES = ("../evil.png", "a/../../evil.png", "/tmp/evil.png", "..\\evil.png", "C:\\evil.png", "images/aux.png")
+BAD_NAMES = (
+    "../evil.png",
+    "a/../../evil.png",
+    "/tmp/evil.png",
+    "..\\evil.png",
+    "C:\\evil.png",
+    "images/aux.png",
+)
 
 
 @pytest.mark.parametrize("name", BAD_NAMES)
 def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, root: Path, name: str) -> None:
     file = packed(tmp_path / "scene.zip", root, more={name: b"evil"})
-    with pytest.raises(DyngsError, match=r"scene\.zip: holds the file .*, which is no name below its folder"):
+    with pytest.raises(
+        DyngsError, match=r"scene\.zip: holds the file .*, which is no name below its folder"
+    ):
         unpacked(file)
     assert left() == []
     assert not list(tmp_path.rglob("evil*"))
@@ -180,15 +206,22 @@ def test_links_are_refused(tmp_path: Path, root: Path) -> None:
 
 def test_bombs_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
     file = tmp_path / "bomb.zip"
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as out, out.open("zeros.png", "w") as member:
+    with (
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as out,
+        out.open("zeros.png", "w") as member,
+    ):
         for _ in range(160):
             member.write(bytes(2**20))
-    with pytest.raises(DyngsError, match=r"asks for 167,772,160 bytes, of which 134,217,728 are read at most.*=2$"):
+    with pytest.raises(
+        DyngsError, match=r"asks for 167,772,160 bytes, of which 134,217,728 are read at most.*=2$"
+    ):
         unpacked(file)
     assert left() == []
 
 
-def test_too_many_files_are_refused(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_files_are_refused(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(archive, "MOST_FILES", 2)
     with pytest.raises(DyngsError, match="asks for 6 files, of which 2"):  # 5, and a folder
         unpacked(packed(tmp_path / "scene.zip", root))
@@ -218,7 +251,10 @@ def encrypted(content: bytes) -> bytes:
     [
         (lambda content: b"", "cannot be read"),
         (lambda content: content[:-40], "cannot be read"),
-        (lambda content: b"not a zip at all", "cannot be read .*not a zip file.*; download it again, or unpack it"),
+        (
+            lambda content: b"not a zip at all",
+            "cannot be read .*not a zip file.*; download it again, or unpack it",
+        ),
         (lambda content: content.replace(b"abcdefgh", b"abXdefgh"), "cannot be read .*CRC"),
         (encrypted, "is encrypted; unpack it with its password"),
     ],
@@ -237,7 +273,9 @@ def test_damaged_archives_are_one_line(
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
-def test_a_full_disk_leaves_nothing(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_nothing(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = packed(tmp_path / "scene.zip", root)
 
     def full(*_: object) -> None:

@@ -1,4 +1,5 @@
-"""The border of a capture: links, absolute paths and ``..`` that leave it, in every reader; and sizes of images."""
+"""The border of a capture: links, absolute paths and ``..`` that leave it, in every reader; and
+sizes of images."""
 
 from __future__ import annotations
 
@@ -29,9 +30,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.files.containment import check_size, images_up_to, inside, leaving_links, staying_within
 
-PLY = (
-    "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"
-)
+PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"  # noqa: E501
 
 
 def read(root: Path, **options: object) -> Capture:
@@ -43,9 +42,16 @@ def write_nerfstudio(root: Path) -> None:
     for i, name in enumerate(names):
         write_image(root / name, random_pixels(8, 12, 3, seed=i))
         write_image(root / "masks" / f"{i}.png", random_pixels(8, 12, 1, seed=i))
-    write_frames(root / "transforms.json", names, {"w": 12, "h": 8, "fl_x": 10.0, "ply_file_path": "points.ply"})
+    write_frames(
+        root / "transforms.json",
+        names,
+        {"w": 12, "h": 8, "fl_x": 10.0, "ply_file_path": "points.ply"},
+    )
     (root / "points.ply").write_text(PLY)
-    edit_json(root / "transforms.json", lambda content: content["frames"][0].update(mask_path="masks/0.png"))
+    edit_json(
+        root / "transforms.json",
+        lambda content: content["frames"][0].update(mask_path="masks/0.png"),
+    )
 
 
 def write_video_cameras(root: Path) -> None:
@@ -73,12 +79,27 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "colmap": write_colmap,
 }
 FILES = [
-    *(("nerfstudio", name) for name in ("images", "images/1.png", "masks/0.png", "points.ply", "transforms.json")),
+    *(
+        ("nerfstudio", name)
+        for name in ("images", "images/1.png", "masks/0.png", "points.ply", "transforms.json")
+    ),
     *(("videos", name) for name in ("a.mp4", "b", "b/frame_0001.png", "cameras.json")),
     *(("llff", name) for name in ("poses_bounds.npy", "cam00/frame_0000.png", "cam01")),
-    *(("nerfies", name) for name in ("points.npy", "scene.json", "metadata.json", "rgb/1x/000001.png", "rgb")),
+    *(
+        ("nerfies", name)
+        for name in ("points.npy", "scene.json", "metadata.json", "rgb/1x/000001.png", "rgb")
+    ),
     *(("nerfies", f"camera/{i:06d}.json") for i in range(2)),
-    *(("colmap", name) for name in ("images/left", "images/left/01.jpg", "sparse/0/points3D.bin", "sparse", "images")),
+    *(
+        ("colmap", name)
+        for name in (
+            "images/left",
+            "images/left/01.jpg",
+            "sparse/0/points3D.bin",
+            "sparse",
+            "images",
+        )
+    ),
 ]
 
 
@@ -90,13 +111,19 @@ def test_no_reader_opens_what_lies_outside(kind: str, name: str, tmp_path: Path)
     (tmp_path / "private").mkdir()
     shutil.move(root / name, tmp_path / "private" / "own")
     (root / name).symlink_to("../" * (name.count("/") + 1) + "private/own")
-    with pytest.raises(DyngsError, match=r"private/own.*lies outside the capture.*data\.follow_links=true"):
+    with pytest.raises(
+        DyngsError, match=r"private/own.*lies outside the capture.*data\.follow_links=true"
+    ):
         read(root)
     followed = read(root, follow_links=True)
-    assert [view.name for view in followed.splits["train"]] == [view.name for view in wanted.splits["train"]]
+    assert [view.name for view in followed.splits["train"]] == [
+        view.name for view in wanted.splits["train"]
+    ]
 
 
-@pytest.mark.parametrize("written", ["../own.png", "{tmp}/own.png", "images/../../own.png", "..\\own.png", "../own"])
+@pytest.mark.parametrize(
+    "written", ["../own.png", "{tmp}/own.png", "images/../../own.png", "..\\own.png", "../own"]
+)
 @pytest.mark.parametrize("key", ["file_path", "mask_path"])
 def test_paths_that_leave_the_capture(key: str, written: str, tmp_path: Path) -> None:
     root = tmp_path / "capture"
@@ -113,8 +140,12 @@ def test_paths_that_leave_the_capture(key: str, written: str, tmp_path: Path) ->
 @pytest.mark.parametrize("follow", [False, True])
 def test_paths_that_name_no_file(written: str, follow: bool, tmp_path: Path) -> None:
     write_nerfstudio(tmp_path)
-    edit_json(tmp_path / "transforms.json", lambda content: content["frames"][1].update(file_path=written))
-    with pytest.raises(DyngsError, match=r"frame 1 .*(names no file|the key 'file_path' is missing)"):
+    edit_json(
+        tmp_path / "transforms.json", lambda content: content["frames"][1].update(file_path=written)
+    )
+    with pytest.raises(
+        DyngsError, match=r"frame 1 .*(names no file|the key 'file_path' is missing)"
+    ):
         read(tmp_path, follow_links=follow)
 
 
@@ -131,7 +162,9 @@ def test_a_huge_image_is_refused_when_a_capture_is_read(kind: str, tmp_path: Pat
 def test_names_that_no_file_can_have(written: str, tmp_path: Path) -> None:
     """As a missing image or in one line."""
     write_nerfstudio(tmp_path)
-    edit_json(tmp_path / "transforms.json", lambda content: content["frames"][1].update(file_path=written))
+    edit_json(
+        tmp_path / "transforms.json", lambda content: content["frames"][1].update(file_path=written)
+    )
     report = inspect_capture(tmp_path)
     assert report.problems
     assert all("\n" not in line for line in report.problems)
@@ -174,7 +207,9 @@ def test_a_folder_whose_name_begins_the_same_is_outside(tmp_path: Path) -> None:
 
 def test_sizes() -> None:
     check_size(Path("a.png"), 10_000, 10_000)
-    with pytest.raises(DyngsError, match=r"a\.png: 20000x20000 .*are 400 megapixels.*max_megapixels is 150;"):
+    with pytest.raises(
+        DyngsError, match=r"a\.png: 20000x20000 .*are 400 megapixels.*max_megapixels is 150;"
+    ):
         check_size(Path("a.png"), 20_000, 20_000)
     with pytest.raises(DyngsError, match=r"of 1000 channels are 250 megapixels"):
         check_size(Path("a.exr"), 1000, 1000, 1000)

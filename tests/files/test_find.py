@@ -77,7 +77,9 @@ def test_missing_files_keep_their_place(tmp_path: Path) -> None:
     assert finder.find("../1.png") == Path(str(tmp_path)).parent / "1.png"
 
 
-@pytest.mark.parametrize("written", ["C:\\x\\..\\..\\secret.txt", "..\\secret.txt", "Link/secret.txt", "../secret.TXT"])
+@pytest.mark.parametrize(
+    "written", ["C:\\x\\..\\..\\secret.txt", "..\\secret.txt", "Link/secret.txt", "../secret.TXT"]
+)
 def test_nothing_outside_is_found(tmp_path: Path, written: str) -> None:
     secret = touched(tmp_path / "secret.txt")
     root = tmp_path / "capture"
@@ -92,7 +94,10 @@ def test_images_of_another_size(tmp_path: Path) -> None:
     for name in ("images_8", "images_2", "images_old", "other_3"):
         (tmp_path / name).mkdir()
     touched(tmp_path / "images_5")
-    assert shrunk_folders(tmp_path / "images") == {2: tmp_path / "images_2", 8: tmp_path / "images_8"}
+    assert shrunk_folders(tmp_path / "images") == {
+        2: tmp_path / "images_2",
+        8: tmp_path / "images_8",
+    }
     assert images_folder(tmp_path) == tmp_path / "images_2"
     small = touched(tmp_path / "images_2/1.png")
     assert FileFinder(tmp_path).find("images/1.png") == small

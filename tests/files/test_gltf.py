@@ -29,7 +29,9 @@ def test_another_reader_finds_the_mesh(tmp_path: Path) -> None:
         "meshes": [{"primitives": [primitive]}],
     }
     document.write(tmp_path / "x.glb")
-    found = trimesh.load(io.BytesIO((tmp_path / "x.glb").read_bytes()), file_type="glb", process=False)
+    found = trimesh.load(
+        io.BytesIO((tmp_path / "x.glb").read_bytes()), file_type="glb", process=False
+    )
     (mesh,) = found.geometry.values()  # pyright: ignore[reportAttributeAccessIssue]
     np.testing.assert_array_equal(mesh.vertices, points)
     np.testing.assert_array_equal(mesh.faces.ravel(), faces)
@@ -38,16 +40,20 @@ def test_another_reader_finds_the_mesh(tmp_path: Path) -> None:
 
 
 def test_numbers_come_back_and_normalised_integers_as_fractions(tmp_path: Path) -> None:
-    """Also where an accessor is a column of interleaved rows, and NaN, which the readers of formats judge."""
+    """Also where an accessor is a column of interleaved rows, and NaN, which the readers of formats
+    judge."""
     document = GlbDocument()
     plain = np.array([[1.5, -2.0, np.nan], [0.0, 3.0, np.inf]], np.float32)
-    first, second = document.add_numbers(plain), document.add_numbers(np.array([[0, 51, 102, 255]], np.uint8))
+    first = document.add_numbers(plain)
+    second = document.add_numbers(np.array([[0, 51, 102, 255]], np.uint8))
     document.write(tmp_path / "x.glb")
     size = int.from_bytes((tmp_path / "x.glb").read_bytes()[12:16], "little")
     changed = json.loads((tmp_path / "x.glb").read_bytes()[20 : 20 + size])
     changed["accessors"][second]["normalized"] = True
     changed["bufferViews"][first]["byteStride"] = 12
-    changed["accessors"].append({"bufferView": first, "byteOffset": 4, "componentType": 5126, "count": 2})
+    changed["accessors"].append(
+        {"bufferView": first, "byteOffset": 4, "componentType": 5126, "count": 2}
+    )
     changed["accessors"][-1]["type"] = "SCALAR"
     changed["buffers"][0]["uri"] = "x.bin"
     (tmp_path / "x.bin").write_bytes((tmp_path / "x.glb").read_bytes()[28 + size :])

@@ -42,14 +42,17 @@ def test_bad_hdf5(hdf5: Path) -> None:
 
 
 def test_hdf5_that_asks_for_much_or_lies_elsewhere(tmp_path: Path) -> None:
-    """A data set of 800 GB, of which nothing is there; one in another file; one of texts; a link."""
+    """A data set of 800 GB, of which nothing is there; one in another file; one of texts; a
+    link."""
     h5py: Any = pytest.importorskip("h5py")
     path = tmp_path / "m.hdf5"
     (tmp_path / "other").write_bytes(bytes(800))
     with h5py.File(path, "w") as file:
         file.create_dataset("huge", shape=(10**9, 100), chunks=(1000, 100), dtype="u1")
         file.create_dataset("wide", shape=(2, 10**9), chunks=(1, 1000), dtype="u1")
-        file.create_dataset("other", shape=(100,), dtype="f8", external=[(str(tmp_path / "other"), 0, 800)])
+        file.create_dataset(
+            "other", shape=(100,), dtype="f8", external=[(str(tmp_path / "other"), 0, 800)]
+        )
         file.create_dataset("text", data=["a", "b"])
         file["linked"] = h5py.ExternalLink("n.hdf5", "huge")
     lines = {
@@ -66,9 +69,13 @@ def test_hdf5_that_asks_for_much_or_lies_elsewhere(tmp_path: Path) -> None:
     assert hdf5_length(path, "huge") == 10**9
 
 
-def test_without_h5py_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_h5py_the_line_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(DyngsError, match=r"x\.hdf5: HDF5 files need .* pip install 'dyngs\[people\]'"):
+    with pytest.raises(
+        DyngsError, match=r"x\.hdf5: HDF5 files need .* pip install 'dyngs\[people\]'"
+    ):
         read_hdf5(tmp_path / "x.hdf5", "masks")
 
 
@@ -94,8 +101,12 @@ def test_hdf5_that_would_fill_the_memory(hdf5: Path) -> None:
     h5py = pytest.importorskip("h5py")
     with h5py.File(hdf5, "a") as file:
         file.create_dataset("empty", (10**6, 10**6), np.float32)
-        file.create_dataset("row", (2, 10**5, 10**5), np.uint8, chunks=(1, 1000, 1000), compression="gzip")
-        file.create_dataset("chunk", (200, 1000, 1000), np.uint8, chunks=(200, 1000, 1000), compression="gzip")
+        file.create_dataset(
+            "row", (2, 10**5, 10**5), np.uint8, chunks=(1, 1000, 1000), compression="gzip"
+        )
+        file.create_dataset(
+            "chunk", (200, 1000, 1000), np.uint8, chunks=(200, 1000, 1000), compression="gzip"
+        )
     for key, rows in (("empty", ...), ("row", 0), ("chunk", 0)):
         with pytest.raises(DyngsError, match=r"m\.hdf5: .*data\.max_megapixels is 150"):
             read_hdf5(hdf5, key, rows)
@@ -103,9 +114,11 @@ def test_hdf5_that_would_fill_the_memory(hdf5: Path) -> None:
 
 
 def test_damaged_hdf5_is_read_or_refused_in_one_line(hdf5: Path) -> None:
-    data, lines = hdf5.read_bytes(), []
+    data = hdf5.read_bytes()
+    lines = []
     for seed in range(300):
-        rng, changed = np.random.default_rng(seed), bytearray(data)
+        rng = np.random.default_rng(seed)
+        changed = bytearray(data)
         for _ in range(rng.choice([1, 4, 16])):
             changed[int(rng.integers(len(changed)))] = rng.integers(256)
         hdf5.write_bytes(changed)

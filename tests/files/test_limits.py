@@ -45,7 +45,9 @@ def test_a_file_is_read_up_to_its_limit(tmp_path: Path, monkeypatch: pytest.Monk
     file = tmp_path / "a.txt"
     file.write_bytes(b"12345")
     assert read_limited(file, 5) == b"12345"
-    with pytest.raises(DyngsError, match=r"a\.txt: asks for 5 bytes, of which 4 are read at most; .*DYNGS_LIMITS=2"):
+    with pytest.raises(
+        DyngsError, match=r"a\.txt: asks for 5 bytes, of which 4 are read at most; .*DYNGS_LIMITS=2"
+    ):
         read_limited(file, 4)
     monkeypatch.setenv(VARIABLE, "2")
     assert read_limited(file, 4) == b"12345"

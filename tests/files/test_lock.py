@@ -32,7 +32,9 @@ HOLD += "with writing(Path(sys.argv[1])): print('held', flush=True); time.sleep(
 @contextmanager
 def _holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A process that has the lock of ``folder``."""
-    with subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True
+    ) as process:
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == "held\n"
@@ -43,13 +45,23 @@ def _holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 def _train(capture: Path, run_dir: Path, *words: str) -> list[str]:
     """Words of a command for a run that is not soon over."""
-    keys = (f"data.root={capture}", f"run.dir={run_dir}", "run.threads=1", "train.steps=100000", "train.save_every=5")
+    keys = (
+        f"data.root={capture}",
+        f"run.dir={run_dir}",
+        "run.threads=1",
+        "train.steps=100000",
+        "train.save_every=5",
+    )
     more = ("init.kind=random", "init.num_random=50", "model.sh_degree=0", "train.log_every=5")
     return ["train", "static", *keys, *more, *words]
 
 
 def test_the_second_is_told_who_holds_it(tmp_path: Path) -> None:
-    with _holder(tmp_path / "run") as process, pytest.raises(InUseError) as caught, writing(tmp_path / "run"):
+    with (
+        _holder(tmp_path / "run") as process,
+        pytest.raises(InUseError) as caught,
+        writing(tmp_path / "run"),
+    ):
         raise AssertionError("both have it")
     told = str(caught.value)
     assert f"process {process.pid} on " in told
@@ -79,7 +91,11 @@ def test_what_came_of_nothing_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_one_process_cannot_have_it_twice(tmp_path: Path) -> None:
-    with writing(tmp_path), pytest.raises(InUseError, match=f"process {os.getpid()}"), writing(tmp_path):
+    with (
+        writing(tmp_path),
+        pytest.raises(InUseError, match=f"process {os.getpid()}"),
+        writing(tmp_path),
+    ):
         raise AssertionError
 
 
@@ -102,7 +118,9 @@ def test_a_lock_file_that_is_none_is_told_and_left(tmp_path: Path) -> None:
         raise AssertionError
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is")
+@pytest.mark.skipif(
+    not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is"
+)
 def test_a_folder_that_is_renamed_is_found(tmp_path: Path) -> None:
     (tmp_path / "above").mkdir()
     with writing(tmp_path / "above" / "a") as held:
@@ -149,8 +167,11 @@ def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
     assert (tmp_path / "n").read_text() == "90"
 
 
-def test_two_trainings_into_one_folder(still: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The second ends at once with one line; readers may read; the first goes on, and can be resumed after a kill."""
+def test_two_trainings_into_one_folder(
+    still: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second ends at once with one line; readers may read; the first goes on, and can be
+    resumed after a kill."""
     run = tmp_path / "run"
     words = [sys.executable, "-m", "dyngs", *_train(still, run)]
     first = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -174,14 +195,20 @@ def test_two_trainings_into_one_folder(still: Path, tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links")
-@pytest.mark.parametrize("name", ["checkpoints", "export", "log.jsonl", "tradeoff/training", "body"])
+@pytest.mark.parametrize(
+    "name", ["checkpoints", "export", "log.jsonl", "tradeoff/training", "body"]
+)
 def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) -> None:
-    """The run of a stranger may hold links to files and folders of the user, which training would change."""
+    """The run of a stranger may hold links to files and folders of the user, which training would
+    change."""
     run = tmp_path / "run"
     (run / name).parent.mkdir(parents=True)
     (tmp_path / "precious").mkdir()
     (run / name).symlink_to(tmp_path / "precious")
-    with pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, out of .*run"), writing(run):
+    with (
+        pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, out of .*run"),
+        writing(run),
+    ):
         pytest.fail("it may be written to")
     assert list((tmp_path / "precious").iterdir()) == []
     (run / name).unlink()
@@ -191,10 +218,13 @@ def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) ->
         pass
 
 
-# --- folders of the cache ---------------------------------------------------------------------------------------------
+# --- folders of the cache
+# ---------------------------------------------------------------------------------------------
 
 
-def _made_by(count: int, folder: Path, make: Callable[[], None]) -> tuple[list[str], list[Exception]]:
+def _made_by(
+    count: int, folder: Path, make: Callable[[], None]
+) -> tuple[list[str], list[Exception]]:
     """Let so many threads make the folder at once; return what they said, and the errors."""
     said: list[str] = []
     errors: list[Exception] = []
@@ -228,7 +258,8 @@ def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("short_wait")
 def test_of_three_one_makes_the_folder_and_the_others_use_it(tmp_path: Path) -> None:
-    folder, calls = tmp_path / "cache" / "a", list[int]()
+    folder = tmp_path / "cache" / "a"
+    calls = list[int]()
 
     def make() -> None:
         calls.append(1)
@@ -247,7 +278,8 @@ def test_of_three_one_makes_the_folder_and_the_others_use_it(tmp_path: Path) -> 
 
 @pytest.mark.usefixtures("short_wait")
 def test_where_the_first_fails_the_next_tries(tmp_path: Path) -> None:
-    folder, calls = tmp_path / "a", list[int]()
+    folder = tmp_path / "a"
+    calls = list[int]()
 
     def make() -> None:
         calls.append(1)
@@ -263,12 +295,15 @@ def test_where_the_first_fails_the_next_tries(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_without_locks_the_first_that_is_done_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_locks_the_first_that_is_done_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def no_locks(_: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(run_lock, "_lock", no_locks)
-    folder, said = tmp_path / "a", list[str]()
+    folder = tmp_path / "a"
+    said = list[str]()
 
     def make() -> None:
         with new_folder(folder) as started:

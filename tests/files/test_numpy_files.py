@@ -50,15 +50,23 @@ def write_member(path: Path, shape: object, content: bytes = b"", descr: str = "
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + content)
+        archive.writestr(
+            "a.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + content
+        )
     return path
 
 
-def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The directory says how large it is; with a lower limit, since packing 512 MiB takes seconds."""
+def test_a_bomb_is_refused_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The directory says how large it is; with a lower limit, since packing 512 MiB takes
+    seconds."""
     most = 1 << 26
     monkeypatch.setattr(numpy_files, "MOST_BYTES", most)
-    with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as file:
+    with (
+        zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("a.npy", "w") as file,
+    ):
         for _ in range(most // (1 << 22) + 1):
             file.write(bytes(1 << 22))
     assert (tmp_path / "x.npz").stat().st_size < 1e6
@@ -86,7 +94,9 @@ def test_headers_that_lie(tmp_path: Path, shape: str, problem: str) -> None:
     assert problem in refusal(path, "a")
 
 
-def test_numbers_of_one_byte_count_as_those_of_eight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_of_one_byte_count_as_those_of_eight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(numpy_files, "MOST_BYTES", 800)
     write_member(tmp_path / "x.npz", "(101,)", bytes(101), "|u1")
     assert "asks for 808 bytes of arrays" in refusal(tmp_path / "x.npz", "a")
@@ -118,14 +128,18 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
 
 def test_npz(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
-    with pytest.raises(DyngsError, match=r"a\.npz: no such file; it should hold the body parameters poses, trans"):
+    with pytest.raises(
+        DyngsError, match=r"a\.npz: no such file; it should hold the body parameters poses, trans"
+    ):
         read_npz(path, ("poses", "trans"))
     np.savez(path, poses=np.zeros(3), gender="neutral")
     assert set(read_npz(path, ("poses",), ("gender", "scale"))) == {"poses", "gender"}
     with pytest.raises(DyngsError, match="'trans' is missing"):
         read_npz(path, ("poses", "trans"))
     np.savez(path, poses=np.array([{}]))
-    with pytest.raises(DyngsError, match=r"a\.npz: 'poses' is not an array of numbers .*it holds Python objects"):
+    with pytest.raises(
+        DyngsError, match=r"a\.npz: 'poses' is not an array of numbers .*it holds Python objects"
+    ):
         read_npz(path, ("poses",))
     np.save(tmp_path / "b.npy", np.zeros(3))
     for damaged in (b"", b"PK\x03\x04", b"\x80\x04N.", (tmp_path / "b.npy").read_bytes()):
@@ -140,7 +154,8 @@ def test_an_array_with_a_damaged_header_is_one_line(tmp_path: Path, byte: int) -
     """NumPy reads the header as Python text, so nearly any error may come of it."""
     path = tmp_path / "points.npy"
     np.save(path, np.zeros((2, 17)))
-    content, said = path.read_bytes(), []
+    content = path.read_bytes()
+    said = []
     for place in range(10, 70):
         path.write_bytes(content[:place] + bytes([byte]) + content[place + 1 :])
         try:

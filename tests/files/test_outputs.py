@@ -1,4 +1,5 @@
-"""No output replaces an input, by whatever name; folders that are made appear complete or not at all."""
+"""No output replaces an input, by whatever name; folders that are made appear complete or not at
+all."""
 
 from __future__ import annotations
 
@@ -47,13 +48,18 @@ def test_a_file_that_is_read_is_no_output_by_any_name(tmp_path: Path, as_folder:
         inputs.require_output(tmp_path / f"other{number}" / "new.jpg")
 
 
-def test_other_case_on_a_file_system_that_ignores_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the system numbers files, equal numbers tell; where it does not, the names, whatever their case."""
+def test_other_case_on_a_file_system_that_ignores_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the system numbers files, equal numbers tell; where it does not, the names, whatever
+    their case."""
     (tmp_path / "Walk.MP4").write_text("a video")
     real = os.stat
 
     def ignoring_case(path: Path, **options: object) -> os.stat_result:
-        values = list(real(tmp_path / "Walk.MP4" if str(path).lower() == str(tmp_path / "walk.mp4") else path))
+        values = list(
+            real(tmp_path / "Walk.MP4" if str(path).lower() == str(tmp_path / "walk.mp4") else path)
+        )
         return os.stat_result([values[0], 0, *values[2:]])
 
     monkeypatch.setattr(outputs.os, "stat", ignoring_case)
@@ -91,18 +97,30 @@ def test_folders_around_and_within_a_capture(tmp_path: Path) -> None:
 def test_own_outputs_are_replaced(tmp_path: Path) -> None:
     """An earlier export outside the capture, and all in a run folder that lies within it."""
     root = filled(tmp_path / "capture")
-    for name in ("capture/runs/a/config.yaml", "capture/runs/a/images/sheet.png", "out/sheet.png", "config.yaml"):
+    for name in (
+        "capture/runs/a/config.yaml",
+        "capture/runs/a/images/sheet.png",
+        "out/sheet.png",
+        "config.yaml",
+    ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("mine")
     inputs = Inputs([root])
-    for out in ("capture/runs/a", "capture/runs/a/images", "capture/runs/a/images/sheet.png", "out", "out/sheet.png"):
+    for out in (
+        "capture/runs/a",
+        "capture/runs/a/images",
+        "capture/runs/a/images/sheet.png",
+        "out",
+        "out/sheet.png",
+    ):
         inputs.require_output(tmp_path / out)
     with pytest.raises(DyngsError, match="exists and lies in"):
         inputs.require_output(root / "runs")  # a folder above a run is none
 
 
 def test_a_folder_with_a_link_to_an_input(tmp_path: Path) -> None:
-    root, out = filled(tmp_path / "capture"), tmp_path / "out"
+    root = filled(tmp_path / "capture")
+    out = tmp_path / "out"
     out.mkdir()
     (out / "scene.ply").write_text("read as well")
     Inputs([root, out / "scene.ply"]).require_output(out)  # the file itself may lie there
@@ -111,7 +129,9 @@ def test_a_folder_with_a_link_to_an_input(tmp_path: Path) -> None:
         Inputs([root]).require_output(out)
 
 
-def test_files_elsewhere_are_only_looked_for_if_there_is_something_to_replace(tmp_path: Path) -> None:
+def test_files_elsewhere_are_only_looked_for_if_there_is_something_to_replace(
+    tmp_path: Path,
+) -> None:
     calls: list[int] = []
     (tmp_path / "far.png").write_text("far")
     inputs = Inputs([None, tmp_path / "gone"], lambda: calls.append(1) or (tmp_path / "far.png",))
@@ -123,7 +143,8 @@ def test_files_elsewhere_are_only_looked_for_if_there_is_something_to_replace(tm
 
 def test_a_made_capture_stands_for_the_video_it_is_made_of(tmp_path: Path) -> None:
     root = filled(tmp_path / "capture")
-    video, other = tmp_path / "walk.mp4", tmp_path / "copy.mp4"
+    video = tmp_path / "walk.mp4"
+    other = tmp_path / "copy.mp4"
     for path in (video, other):
         path.write_text("a video")
         Inputs([root]).require_output(path)
@@ -160,7 +181,8 @@ def test_a_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="links")
 def test_outputs_in_a_run_stay_there(tmp_path: Path) -> None:
-    """A link of a stranger's run must not lead a sequence or a sweep elsewhere; that of the run itself may."""
+    """A link of a stranger's run must not lead a sequence or a sweep elsewhere; that of the run
+    itself may."""
     (tmp_path / "disk" / "run" / "checkpoints").mkdir(parents=True)
     (tmp_path / "disk" / "run" / "config.yaml").touch()
     (tmp_path / "precious").mkdir()

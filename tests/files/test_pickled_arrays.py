@@ -28,7 +28,9 @@ def test_names_of_other_versions(arrays: Arrays, module: str, name: str, known: 
     assert arrays.named(module, name) == Name(known)
 
 
-@pytest.mark.parametrize("name", [("os", "system"), ("numpy", "load"), ("functools", "partial"), (None, "a"), ("a", 1)])
+@pytest.mark.parametrize(
+    "name", [("os", "system"), ("numpy", "load"), ("functools", "partial"), (None, "a"), ("a", 1)]
+)
 def test_other_names(arrays: Arrays, name: tuple[Any, Any]) -> None:
     with pytest.raises(ValueError, match=r"it holds|no proper name"):
         arrays.named(*name)
@@ -44,7 +46,9 @@ def test_an_array_is_filled_once(arrays: Arrays) -> None:
             arrays.build(other, state)
 
 
-@pytest.mark.parametrize("text", ["f3", "V8", "O8,O8", "{'names': []}", "S" + "9" * 10, "M8[s]", None, 5])
+@pytest.mark.parametrize(
+    "text", ["f3", "V8", "O8,O8", "{'names': []}", "S" + "9" * 10, "M8[s]", None, 5]
+)
 def test_types_that_are_not_read(text: object) -> None:
     with pytest.raises((ValueError, TypeError)):
         Dtype(text)

@@ -1,4 +1,5 @@
-"""Pickles: plain values, arrays of all writers, and files that are damaged, hostile, or made to fill memory."""
+"""Pickles: plain values, arrays of all writers, and files that are damaged, hostile, or made to
+fill memory."""
 
 from __future__ import annotations
 
@@ -35,13 +36,24 @@ def pickled(tmp_path: Path, content: bytes) -> Path:
     return tmp_path / "a.pkl"
 
 
-ATOMS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text() | st.binary(min_size=1)
+ATOMS = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False)
+    | st.text()
+    | st.binary(min_size=1)
+)
 TREES = st.recursive(
-    ATOMS, lambda tree: st.lists(tree) | st.dictionaries(st.text(), tree) | st.tuples(tree, tree), max_leaves=12
+    ATOMS,
+    lambda tree: st.lists(tree) | st.dictionaries(st.text(), tree) | st.tuples(tree, tree),
+    max_leaves=12,
 )
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(TREES, st.integers(0, 5))
 def test_plain_values_come_back(tmp_path: Path, tree: object, protocol: int) -> None:
     assert read_pickle(pickled(tmp_path, pickle.dumps(tree, protocol))) == tree
@@ -63,7 +75,9 @@ ARRAYS = (
 
 @pytest.mark.parametrize("protocol", range(6))
 def test_arrays_come_back(tmp_path: Path, protocol: int) -> None:
-    read: Any = read_pickle(pickled(tmp_path, pickle.dumps({"a": ARRAYS, "again": ARRAYS[0]}, protocol)))
+    read: Any = read_pickle(
+        pickled(tmp_path, pickle.dumps({"a": ARRAYS, "again": ARRAYS[0]}, protocol))
+    )
     for value, expected in zip(read["a"], ARRAYS, strict=True):
         np.testing.assert_array_equal(np.asarray(value), expected)
         assert np.asarray(value).dtype.kind == np.asarray(expected).dtype.kind
@@ -71,13 +85,14 @@ def test_arrays_come_back(tmp_path: Path, protocol: int) -> None:
 
 
 def test_pickles_of_python_2(tmp_path: Path) -> None:
-    """As Python 2 wrote ``{'camera_f': numpy.array([1.5, 2.0]), 'width': 1080}`` with protocol 2."""
+    """As Python 2 wrote ``{'camera_f': numpy.array([1.5, 2.0]), 'width': 1080}`` with protocol
+    2."""
     numbers = np.array([1.5, -2.0]).tobytes()
-    content = (
-        b"\x80\x02}q\x00(U\x08camera_fq\x01cnumpy.core.multiarray\n_reconstruct\nq\x02cnumpy\nndarray\nq\x03K\x00\x85"
-    )
+    content = b"\x80\x02}q\x00(U\x08camera_fq\x01cnumpy.core.multiarray\n_reconstruct\nq\x02cnumpy\nndarray\nq\x03K\x00\x85"  # noqa: E501
     content += b"U\x01b\x87Rq\x04(K\x01K\x02\x85cnumpy\ndtype\nq\x05U\x02f8K\x00K\x01\x87Rq\x06(K\x03U\x01<NNN"
-    content += b"J\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89U\x10" + numbers + b"tbU\x05widthM8\x04u."
+    content += (
+        b"J\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89U\x10" + numbers + b"tbU\x05widthM8\x04u."
+    )
     read: Any = read_pickle(pickled(tmp_path, content))
     assert (list(read["camera_f"]), read["width"]) == ([1.5, -2.0], 1080)
 
@@ -102,7 +117,9 @@ class JoblibPickler(PythonPickler):
             return
         wrapper = Wrapper()
         order = "F" if obj.flags.f_contiguous and not obj.flags.c_contiguous else "C"
-        vars(wrapper).update(subclass=np.ndarray, shape=obj.shape, order=order, dtype=obj.dtype, allow_mmap=True)
+        vars(wrapper).update(
+            subclass=np.ndarray, shape=obj.shape, order=order, dtype=obj.dtype, allow_mmap=True
+        )
         if self.alignment:
             vars(wrapper)["numpy_array_alignment_bytes"] = self.alignment
         self.kept = [*getattr(self, "kept", []), wrapper]  # memo goes by id
@@ -118,12 +135,18 @@ class JoblibPickler(PythonPickler):
 
 @pytest.mark.parametrize("protocol", [2, 4])
 @pytest.mark.parametrize("alignment", [None, 16])
-def test_joblib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int, alignment: int | None) -> None:
+def test_joblib(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int, alignment: int | None
+) -> None:
     for name in ("joblib", "joblib.numpy_pickle"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    monkeypatch.setattr(sys.modules["joblib.numpy_pickle"], "NumpyArrayWrapper", Wrapper, raising=False)
+    monkeypatch.setattr(
+        sys.modules["joblib.numpy_pickle"], "NumpyArrayWrapper", Wrapper, raising=False
+    )
     monkeypatch.setattr(JoblibPickler, "alignment", alignment)
-    arrays = [np.random.default_rng(i).normal(size=(3, 5 + i)) for i in range(4)] + [np.asfortranarray(np.eye(3) + 1)]
+    arrays = [np.random.default_rng(i).normal(size=(3, 5 + i)) for i in range(4)] + [
+        np.asfortranarray(np.eye(3) + 1)
+    ]
     file = io.BytesIO()
     JoblibPickler(file, protocol).dump({1: {"pose": arrays, "n": 5}})
     read: Any = read_pickle(pickled(tmp_path, file.getvalue()))
@@ -197,7 +220,9 @@ def test_pickles_made_by_hand(content: bytes, tmp_path: Path) -> None:
     assert not Path("ran").exists()
 
 
-def test_names_that_are_known_stand_for_nothing_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_that_are_known_stand_for_nothing_that_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Not even a module of that name that lies beside the file is imported."""
     for name in ("chumpy", "scipy/sparse", "joblib"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -209,14 +234,20 @@ def test_names_that_are_known_stand_for_nothing_that_runs(tmp_path: Path, monkey
     assert "chumpy" not in sys.modules
 
 
-@pytest.mark.parametrize("make", [getattr(scipy.sparse, f"cs{x}_{kind}") for x in "cr" for kind in ("matrix", "array")])
+@pytest.mark.parametrize(
+    "make", [getattr(scipy.sparse, f"cs{x}_{kind}") for x in "cr" for kind in ("matrix", "array")]
+)
 @pytest.mark.parametrize("protocol", [0, 2, 5])
-def test_sparse_matrices_come_back_whole(tmp_path: Path, make: Callable[[object], object], protocol: int) -> None:
+def test_sparse_matrices_come_back_whole(
+    tmp_path: Path, make: Callable[[object], object], protocol: int
+) -> None:
     """Entries that are there twice add up, as they do in SciPy."""
     dense = np.where(np.random.default_rng(0).uniform(size=(5, 7)) < 0.3, 2.5, 0)
     read: Any = read_pickle(pickled(tmp_path, pickle.dumps({"J": make(dense)}, protocol)))
     np.testing.assert_array_equal(read["J"], dense)
-    old: Any = read_pickle(write_python2_pickle(tmp_path / "old.pkl", {"J": make(dense)}, min(protocol, 2)))
+    old: Any = read_pickle(
+        write_python2_pickle(tmp_path / "old.pkl", {"J": make(dense)}, min(protocol, 2))
+    )
     np.testing.assert_array_equal(old["J"], dense)
     twice: Any = make(np.ones((2, 2)))
     twice.indices[:] = 1
@@ -246,7 +277,9 @@ def test_damaged_sparse_matrices(part: str, value: object, tmp_path: Path) -> No
         getattr(matrix, part)[3] = value
     else:
         setattr(matrix, part, value)
-    with pytest.raises(DyngsError, match=r"cannot be read as a pickle \(|asks for .* entries of sparse matrices"):
+    with pytest.raises(
+        DyngsError, match=r"cannot be read as a pickle \(|asks for .* entries of sparse matrices"
+    ):
         read_pickle(pickled(tmp_path, pickle.dumps({"J": matrix}, 2)))
 
 
@@ -281,9 +314,16 @@ def test_arrays_that_lie_about_themselves(tmp_path: Path, state: tuple[Any, ...]
 def test_a_file_cannot_change_what_the_next_one_sees(tmp_path: Path) -> None:
     """BUILD on a class or function would set its attributes."""
     expected = np.arange(3.0)
-    for name in ("numpy\nndarray", "numpy\ndtype", "numpy.core.multiarray\n_reconstruct", "_codecs\nencode"):
+    for name in (
+        "numpy\nndarray",
+        "numpy\ndtype",
+        "numpy.core.multiarray\n_reconstruct",
+        "_codecs\nencode",
+    ):
         with pytest.raises(DyngsError, match="cannot be read as a pickle"):
-            read_pickle(pickled(tmp_path, f"c{name}\n(N}}V__defaults__\nNsV__new__\nI2\nstb.".encode()))
+            read_pickle(
+                pickled(tmp_path, f"c{name}\n(N}}V__defaults__\nNsV__new__\nI2\nstb.".encode())
+            )
         for protocol in (0, 5):
             read = read_pickle(pickled(tmp_path, pickle.dumps(expected, protocol)))
             np.testing.assert_array_equal(np.asarray(read), expected)
@@ -301,7 +341,10 @@ def test_pickled_arrays(tmp_path: Path) -> None:
     np.save(path, np.array({"K": [np.eye(3)]}, dtype=object), allow_pickle=True)
     read: Any = read_pickled_array(path)
     np.testing.assert_array_equal(read["K"][0], np.eye(3))
-    for array, line in ((np.zeros(3), "Python objects was expected"), (np.array([{}, {}]), "must hold one dictionary")):
+    for array, line in (
+        (np.zeros(3), "Python objects was expected"),
+        (np.array([{}, {}]), "must hold one dictionary"),
+    ):
         np.save(path, array, allow_pickle=True)
         with pytest.raises(DyngsError, match=line):
             read_pickled_array(path)
@@ -358,8 +401,12 @@ OVERSIZED = {
     "a list in itself": b"]2a.",
     "a dictionary in itself": b"}p1\nS'a'\ng1\ns.",
     "an array in itself": array(b"p1\n" + OBJECTS % b"g1\n") + b".",
-    "arrays in arrays": b"N" + b"".join(b"p2\n0" + array(OBJECTS % b"g2\n") for _ in range(50)) + b".",
-    "an array filled twice": b"(" + array(b"(I1\n(I0\ntcnumpy\ndtype\n(S'f8'\ntRI00\nS''\nt") + b"Nbt.",
+    "arrays in arrays": b"N"
+    + b"".join(b"p2\n0" + array(OBJECTS % b"g2\n") for _ in range(50))
+    + b".",
+    "an array filled twice": b"("
+    + array(b"(I1\n(I0\ntcnumpy\ndtype\n(S'f8'\ntRI00\nS''\nt")
+    + b"Nbt.",
     "bytes of 4 GB": b"\x96" + struct.pack("<Q", 1 << 32) + b".",
     "bytes of 2^63": b"\x8e" + struct.pack("<Q", 1 << 63) + b".",
     "text of 4 GB": b"X" + struct.pack("<I", (1 << 32) - 1) + b".",
@@ -370,14 +417,24 @@ OVERSIZED = {
     "rows": sparse(1 << 26, 1),
     "columns": sparse(1, 1 << 26, "csr"),
     "both": sparse(1 << 13, 1 << 13),
-    "numbers as keys": b"}(" + b"".join(b"J" + struct.pack("<i", i) + b"N" for i in range(70_000)) + b"u.",
-    "numbers found slowly": b"}(" + b"".join(key_of(i * (2**61 - 1)) for i in range(1, 60_000)) + b"u.",
+    "numbers as keys": b"}("
+    + b"".join(b"J" + struct.pack("<i", i) + b"N" for i in range(70_000))
+    + b"u.",
+    "numbers found slowly": b"}("
+    + b"".join(key_of(i * (2**61 - 1)) for i in range(1, 60_000))
+    + b"u.",
     "fractions as keys": b"}G?\xe0\0\0\0\0\0\0Ns.",
     "long keys": b"X" + struct.pack("<I", MANY) + b"a" * MANY + b"p1\n0}" + b"g1\nNs" * 9 + b".",
     "an array as a key": b"}" + array(b"(I1\n(I0\ntcnumpy\ndtype\n(S'f8'\ntRI00\nS''\nt") + b"Ns.",
     "a list as a key": b"}]Ns.",
-    "many axes": array(b"(I1\n(" + b"I1\n" * 5000 + b"tcnumpy\ndtype\n(S'f8'\ntRI00\nS'12345678'\nt") + b".",
-    "text that is none": array(b"(I1\n(I1\ntcnumpy\ndtype\n(S'U1'\ntRI00\nS'\\xff\\xff\\xff\\xff'\nt") + b".",
+    "many axes": array(
+        b"(I1\n(" + b"I1\n" * 5000 + b"tcnumpy\ndtype\n(S'f8'\ntRI00\nS'12345678'\nt"
+    )
+    + b".",
+    "text that is none": array(
+        b"(I1\n(I1\ntcnumpy\ndtype\n(S'U1'\ntRI00\nS'\\xff\\xff\\xff\\xff'\nt"
+    )
+    + b".",
     "an empty stack": b"0.",
     "beneath a mark": b"N(0a.",
     "a mark that is not there": b"NNt.",
@@ -397,7 +454,9 @@ def test_hostile_pickles_cost_little_and_end_in_one_line(tmp_path: Path, name: s
     path.write_bytes(OVERSIZED[name])
 
     def read() -> None:
-        with pytest.raises(DyngsError, match=r"a\.pkl: (cannot be read as a pickle \(|asks for)") as caught:
+        with pytest.raises(
+            DyngsError, match=r"a\.pkl: (cannot be read as a pickle \(|asks for)"
+        ) as caught:
             read_pickle(path)
         assert "\n" not in str(caught.value)
 
@@ -421,7 +480,9 @@ def test_instructions_of_one_byte_that_take_hundreds(
 def test_one_array_many_times(tmp_path: Path) -> None:
     """The same bytes for many arrays, and the same array in many places."""
     path = tmp_path / "a.pkl"
-    raw = b"B" + struct.pack("<I", 1 << 20) + bytes(1 << 20) + b"p1\n0cnumpy\ndtype\n(S'u1'\ntRp2\n0("
+    raw = (
+        b"B" + struct.pack("<I", 1 << 20) + bytes(1 << 20) + b"p1\n0cnumpy\ndtype\n(S'u1'\ntRp2\n0("
+    )
     again = array(b"(I1\n(I1048576\ntg2\nI00\ng1\nt")
     path.write_bytes(raw + again * 100 + b"t.")
     with pytest.raises(DyngsError, match="many large arrays out of the same bytes"):

@@ -46,7 +46,13 @@ def test_what_lives_and_what_is_not_ours_stays(tmp_path: Path) -> None:
     (outside / "precious").touch()
     folder = tmp_path / "folder"
     folder.mkdir()
-    kept = {mine.name, elsewhere, ".notes.123.txt", ".step_0000010.123.safetensors", "a.1-abcdef.dyngs.png"}
+    kept = {
+        mine.name,
+        elsewhere,
+        ".notes.123.txt",
+        ".step_0000010.123.safetensors",
+        "a.1-abcdef.dyngs.png",
+    }
     for name in kept:
         (folder / name).touch()
     link = dead.replace("mine", "link")
@@ -59,7 +65,9 @@ def test_what_lives_and_what_is_not_ours_stays(tmp_path: Path) -> None:
     assert _names(folder) == {*kept, link} - {mine.name, elsewhere}
 
 
-def test_nobody_can_plant_a_link_at_a_temporary_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_can_plant_a_link_at_a_temporary_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Neither at that of an earlier file of the same process, nor at one that is guessed."""
     precious = tmp_path / "precious"
     precious.write_text("mine")

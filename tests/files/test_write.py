@@ -36,7 +36,9 @@ def test_png_keeps_straight_alpha_exactly(tmp_path: Path) -> None:
 def test_exr_keeps_floats_beyond_one(tmp_path: Path) -> None:
     depth = np.array([[0.0, 1.5], [1e4, -2.0]], np.float32)
     write_image(tmp_path / "d.exr", depth)
-    assert np.array_equal(np.asarray(oiio.ImageBuf(str(tmp_path / "d.exr")).get_pixels(oiio.FLOAT))[..., 0], depth)
+    assert np.array_equal(
+        np.asarray(oiio.ImageBuf(str(tmp_path / "d.exr")).get_pixels(oiio.FLOAT))[..., 0], depth
+    )
 
 
 def test_to_uint8_rounds_clamps_and_drops_nan() -> None:
@@ -124,7 +126,9 @@ def test_devices_and_pipes_are_refused_and_stay(kind: str, way: str, tmp_path: P
         except OSError:
             pytest.skip("devices cannot be made here")
     before = path.lstat()
-    with pytest.raises(DyngsError, match=r"cannot write .*: it is a device, a pipe or the like; give the name of"):
+    with pytest.raises(
+        DyngsError, match=r"cannot write .*: it is a device, a pipe or the like; give the name of"
+    ):
         WAYS[way](path)
     after = path.lstat()
     assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
@@ -136,14 +140,18 @@ def test_stdout_is_no_file_even_where_it_is_redirected_to_one(name: str) -> None
     """The link in /dev would be replaced; the check writes nothing."""
     if not Path("/proc/self").exists():
         pytest.skip("not Linux")
-    with pytest.raises(DyngsError, match=f"cannot write {name}: it is a device, a pipe or the like"):
+    with pytest.raises(
+        DyngsError, match=f"cannot write {name}: it is a device, a pipe or the like"
+    ):
         require_replaceable(Path(name))
 
 
 def test_whole_numbers_of_16_bits_stay_as_they_are(tmp_path: Path) -> None:
     values = np.array([[0, 1, 255], [256, 40000, 65535]], dtype=np.uint16)
     write_image(tmp_path / "a.png", values)
-    assert np.array_equal(oiio.ImageBuf(str(tmp_path / "a.png")).get_pixels(oiio.UINT16)[..., 0], values)
+    assert np.array_equal(
+        oiio.ImageBuf(str(tmp_path / "a.png")).get_pixels(oiio.UINT16)[..., 0], values
+    )
 
 
 WRITERS = (
@@ -187,8 +195,13 @@ def test_files_and_folders_have_what_the_umask_allows(
     finally:
         os.umask(before)
     found = {
-        str(path.relative_to(work)): (path.is_dir(), stat.S_IMODE(path.stat().st_mode)) for path in work.rglob("*")
+        str(path.relative_to(work)): (path.is_dir(), stat.S_IMODE(path.stat().st_mode))
+        for path in work.rglob("*")
     }
     assert len(found) > 40
-    wrong = {name: oct(mode) for name, (is_dir, mode) in found.items() if mode != (0o777 if is_dir else 0o666) & ~umask}
+    wrong = {
+        name: oct(mode)
+        for name, (is_dir, mode) in found.items()
+        if mode != (0o777 if is_dir else 0o666) & ~umask
+    }
     assert wrong == {}

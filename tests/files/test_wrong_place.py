@@ -13,10 +13,22 @@ from dyngs.files.wrong_place import command_for
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Photos, a video, a folder of videos, a run and a capture, with empty files."""
-    for name in ("photos/a.jpg", "photos/b.JPG", "photos/c.png", "clip.mp4", "rig/left.mp4", "rig/right.mov"):
+    for name in (
+        "photos/a.jpg",
+        "photos/b.JPG",
+        "photos/c.png",
+        "clip.mp4",
+        "rig/left.mp4",
+        "rig/right.mov",
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    for name in ("run/config.yaml", "capture/transforms.json", "single/clip.mp4", "empty/notes.txt"):
+    for name in (
+        "run/config.yaml",
+        "capture/transforms.json",
+        "single/clip.mp4",
+        "empty/notes.txt",
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
@@ -71,7 +83,9 @@ def test_the_command_for_a_path(path: str, command: str | None) -> None:
     ],
 )
 @pytest.mark.usefixtures("workplace")
-def test_wrong_starts_name_the_right_command(words: str, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_starts_name_the_right_command(
+    words: str, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(words.split()) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1

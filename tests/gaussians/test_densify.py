@@ -1,4 +1,5 @@
-"""Clone, split, prune and reset: the published rules on hand-made sets, and invariants on random ones."""
+"""Clone, split, prune and reset: the published rules on hand-made sets, and invariants on random
+ones."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ from dyngs.gaussians.densify import DefaultDensifier, Densifier, DensifySchedule
 
 EXTENT = 10.0
 SMALL, LARGE = 0.05, 0.5  # either side of dense_fraction * extent = 0.1
-SCHEDULE = DensifySchedule(start=100, stop=1000, every=100, resets=(300, 600), prune_scale_after=300)
+SCHEDULE = DensifySchedule(
+    start=100, stop=1000, every=100, resets=(300, 600), prune_scale_after=300
+)
 
 
 def _gaussians(scales: list[float], opacities: list[float]) -> Gaussians:
@@ -47,7 +50,9 @@ def test_signal_is_the_mean_norm_in_ndc_units_over_the_views_that_see_it() -> No
     grad = torch.tensor([[[3e-4, 8e-4, 9.0, 9.0], [1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]])
     radii = torch.tensor([[[1, 2], [0, 0], [3, 3]]], dtype=torch.int32)
     densifier.after_backward(1, grad, radii, (200, 100))
-    densifier.after_backward(2, grad * 0, radii * torch.tensor([1, 1, 0])[None, :, None], (200, 100))
+    densifier.after_backward(
+        2, grad * 0, radii * torch.tensor([1, 1, 0])[None, :, None], (200, 100)
+    )
     assert densifier.state()["seen"].tolist() == [2, 0, 1]
     # hypot(3e-4 * 100, 8e-4 * 50); the second Gaussian was not seen, whatever its gradient
     torch.testing.assert_close(densifier.state()["grad_sum"], torch.tensor([0.05, 0.0, 0.0]))
@@ -80,7 +85,8 @@ def test_each_kind_of_gaussian_meets_its_fate() -> None:
     assert result.edit is not None
     assert result.edit.source.tolist() == [0, 1, 1, 2, 2]
     assert result.edit.is_new.tolist() == [False, False, True, True, True]
-    means, log_scales = result.changes["means"], result.changes["log_scales"]
+    means = result.changes["means"]
+    log_scales = result.changes["log_scales"]
     assert torch.equal(means[:3], gaussians.means[[0, 1, 1]])
     assert not torch.equal(means[3], means[4])
     torch.testing.assert_close(log_scales[3:].exp(), torch.full((2, 3), LARGE / 1.6))
@@ -99,8 +105,10 @@ def test_huge_ones_go_only_after_the_first_reset() -> None:
 
 
 def test_what_is_far_may_be_as_much_larger() -> None:
-    """Sky and far hills stay, and are copied where nearer ones would be split; ``center`` is what they are far from."""
-    center = torch.tensor([-60.0, 0.0, 0.0])  # distances 60, which is the reach, and 50, five extents: not yet far
+    """Sky and far hills stay, and are copied where nearer ones would be split; ``center`` is what
+    they are far from."""
+    # distances 60, which is the reach, and 50, five extents: not yet far
+    center = torch.tensor([-60.0, 0.0, 0.0])
     for scale, score, step, source in (
         (5.9, 0.0, 400, [0]),
         (6.1, 0.0, 400, []),
@@ -134,7 +142,9 @@ def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     assert result is not None
     assert result.edit is None
     assert result.zero_moments == {"logit_opacities"}
-    torch.testing.assert_close(result.changes["logit_opacities"].sigmoid(), torch.tensor([0.01, 0.006]))
+    torch.testing.assert_close(
+        result.changes["logit_opacities"].sigmoid(), torch.tensor([0.01, 0.006])
+    )
 
 
 def test_a_reset_with_a_densification_covers_the_new_rows() -> None:
@@ -149,7 +159,9 @@ def test_a_reset_with_a_densification_covers_the_new_rows() -> None:
 def test_one_gaussian_always_stays() -> None:
     densifier = _densifier()
     _signal(densifier, [1.0, 1.0, 1.0])
-    result = densifier.edit(400, _gaussians([5.0, LARGE, 5.0], [0.002, 0.001, 0.004]), torch.Generator())
+    result = densifier.edit(
+        400, _gaussians([5.0, LARGE, 5.0], [0.002, 0.001, 0.004]), torch.Generator()
+    )
     assert result is not None
     assert result.edit is not None
     assert result.edit.source.tolist() == [2]
@@ -188,10 +200,13 @@ def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> N
     free = plan_edit(gaussians, score, DefaultStrategy(), EXTENT, 1.0)
     plan = plan_edit(gaussians, score, DefaultStrategy(max_gaussians=cap), EXTENT, 1.0)
     total = int(plan.kept.sum() + plan.cloned.sum() + 2 * plan.split.sum())
-    survivors = int(((gaussians.opacities >= 0.005) & (gaussians.log_scales.amax(1).exp() <= 1.0)).sum())
+    survivors = int(
+        ((gaussians.opacities >= 0.005) & (gaussians.log_scales.amax(1).exp() <= 1.0)).sum()
+    )
     assert total <= max(cap, survivors, 1)
     assert total >= 1
-    chosen, wanted = plan.cloned | plan.split, free.cloned | free.split
+    chosen = plan.cloned | plan.split
+    wanted = free.cloned | free.split
     assert not (chosen & ~wanted).any()
     if chosen.any() and (wanted & ~chosen).any():
         assert score[chosen].min() >= score[wanted & ~chosen].max()
@@ -209,9 +224,12 @@ def test_which_side_the_limits_are_on() -> None:
         (0.25, 10.0, 1 / 1.6 - 1e-3, ""),  # and here they are not
         (0.25, 10.0, 1 / 1.6 + 1e-3, "split"),
     ):
-        two = _gaussians([1.0, 0.1], [0.5, 0.9])  # log scale and logit 0; the second sees to it that one is left
+        # log scale and logit 0; the second sees to it that one is left
+        two = _gaussians([1.0, 0.1], [0.5, 0.9])
         plan = plan_edit(two, torch.tensor([score, 0.0]), options, extent, max_scale)
-        found = " ".join(name for name in ("kept", "cloned", "split") if bool(getattr(plan, name)[0]))
+        found = " ".join(
+            name for name in ("kept", "cloned", "split") if bool(getattr(plan, name)[0])
+        )
         assert found == expected, (score, extent, max_scale)
         assert bool(plan.kept[1])
 
@@ -220,7 +238,9 @@ def test_a_split_that_replaces_nothing_takes_the_room_of_two() -> None:
     """One that is too large to stay frees no room by being split."""
     huge = _gaussians([1.5, 0.1, 0.1], [0.5, 0.5, 0.5])
     for cap, split in ((3, False), (4, True)):
-        plan = plan_edit(huge, torch.tensor([1.0, 0.0, 0.0]), DefaultStrategy(max_gaussians=cap), EXTENT, 1.0)
+        plan = plan_edit(
+            huge, torch.tensor([1.0, 0.0, 0.0]), DefaultStrategy(max_gaussians=cap), EXTENT, 1.0
+        )
         assert plan.split.tolist() == [split, False, False]
 
 
@@ -229,7 +249,9 @@ def test_a_split_that_replaces_nothing_takes_the_room_of_two() -> None:
 def test_without_growth_gaussians_are_only_removed(seed: int, n: int) -> None:
     """The same ones as with a cap that leaves no room."""
     generator = torch.Generator().manual_seed(seed)
-    scales, opacities, score = (torch.rand(n, generator=generator) * high + 1e-3 for high in (2.0, 0.02, 4e-4))
+    scales, opacities, score = (
+        torch.rand(n, generator=generator) * high + 1e-3 for high in (2.0, 0.02, 4e-4)
+    )
     gaussians = _gaussians(scales.tolist(), opacities.tolist())
     plan = plan_edit(gaussians, score, DefaultStrategy(grow=False), EXTENT, 1.0)
     capped = plan_edit(gaussians, score, DefaultStrategy(max_gaussians=1), EXTENT, 1.0)
@@ -244,7 +266,9 @@ def test_a_later_limit_replaces_the_cap(cap: int, expected: int) -> None:
     densifier.limit(cap)
     _signal(densifier, [1.0] * 4)
     step = next(step for step in range(1, 1000) if densifier.schedule.densifies_at(step))
-    result = densifier.edit(step, _gaussians([SMALL] * 4, [0.5] * 4), torch.Generator().manual_seed(0))
+    result = densifier.edit(
+        step, _gaussians([SMALL] * 4, [0.5] * 4), torch.Generator().manual_seed(0)
+    )
     assert result is not None
     assert result.edit is not None
     assert len(result.edit.source) == expected
@@ -255,7 +279,13 @@ def test_bad_values_are_never_multiplied(bad: float) -> None:
     gaussians = _gaussians([SMALL, SMALL], [0.5, 0.5])
     logits = gaussians.logit_opacities.clone()
     logits[0] = math.nan
-    plan = plan_edit(gaussians.replace(logit_opacities=logits), torch.tensor([1.0, bad]), DefaultStrategy(), 10.0, 1.0)
+    plan = plan_edit(
+        gaussians.replace(logit_opacities=logits),
+        torch.tensor([1.0, bad]),
+        DefaultStrategy(),
+        10.0,
+        1.0,
+    )
     assert plan.kept.tolist() == [False, True]
 
 
@@ -277,7 +307,8 @@ def test_rotate_equals_the_matrix(seed: int) -> None:
 
 
 def test_state_goes_round() -> None:
-    densifier, other = _densifier(), _densifier()
+    densifier = _densifier()
+    other = _densifier()
     _signal(densifier, [1.0, 2.0])
     other.load_state({name: x.clone() for name, x in densifier.state().items()})
     for d in (densifier, other):
@@ -287,7 +318,8 @@ def test_state_goes_round() -> None:
 
 
 def test_a_fixed_set_stays() -> None:
-    gaussians, generator = random_scene(n=5).gaussians, torch.Generator().manual_seed(1)
+    gaussians = random_scene(n=5).gaussians
+    generator = torch.Generator().manual_seed(1)
     before = {name: x.clone() for name, x in gaussians.tensors().items()}
     fixed = Densifier()
     fixed.after_backward(100, torch.ones(1, 5, 4), torch.ones(1, 5, 2), (8, 8))

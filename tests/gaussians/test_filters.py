@@ -25,15 +25,19 @@ def _camera(z: float, focal: float = 100.0) -> Cameras:
 def _gaussians(scales: torch.Tensor, logits: torch.Tensor) -> Gaussians:
     n = len(scales)
     quats = torch.zeros(n, 4, dtype=scales.dtype)
-    return Gaussians(torch.zeros(n, 3, dtype=scales.dtype), quats, scales.log(), logits, quats.new_zeros(n, 1, 3))
+    return Gaussians(
+        torch.zeros(n, 3, dtype=scales.dtype), quats, scales.log(), logits, quats.new_zeros(n, 1, 3)
+    )
 
 
 def test_width_follows_the_nearest_camera_that_sees_it() -> None:
     #                    centre           off to the side  outside both      behind both
     means = torch.tensor([[0.0, 0.0, 0.0], [2.2, 0.0, 0.0], [20.0, 0.0, 0.0], [0.0, 0.0, -9.0]])
-    near, far = _camera(2.0), _camera(4.0, focal=50.0)
+    near = _camera(2.0)
+    far = _camera(4.0, focal=50.0)
     std = filter_std(means, [near, far])
-    # The second is at pixel 100 + 110 = 210 <= 230 in the near camera; the others take the largest depth.
+    # The second is at pixel 100 + 110 = 210 <= 230 in the near camera; the others take the largest
+    # depth.
     expected = torch.tensor([2.0, 2.0, 2.0, 2.0]) / 100 * math.sqrt(0.2)
     torch.testing.assert_close(std, expected)
     only_far = filter_std(torch.tensor([[2.7, 0.0, 0.0], [0.0, 0.0, 0.0]]), [near, far])
@@ -53,11 +57,15 @@ def test_fused_values_are_the_formula(logit: float, scale: float, std: float) ->
     fused = fuse_filter(gaussians, torch.tensor([std], dtype=torch.float64))
     wide = (scales**2 + std**2).sqrt()
     torch.testing.assert_close(fused.scales, wide)
-    torch.testing.assert_close(fused.opacities, gaussians.opacities * (scales / wide).prod(1), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        fused.opacities, gaussians.opacities * (scales / wide).prod(1), rtol=1e-9, atol=0
+    )
 
 
 def test_gradients_are_right() -> None:
-    gaussians = _gaussians(torch.tensor([[0.1, 1.0, 3.0]], dtype=torch.float64), torch.tensor([0.7]).double())
+    gaussians = _gaussians(
+        torch.tensor([[0.1, 1.0, 3.0]], dtype=torch.float64), torch.tensor([0.7]).double()
+    )
     std = torch.tensor([0.5], dtype=torch.float64)
 
     def fuse(log_scales: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -88,4 +96,6 @@ def test_no_filter_changes_nothing() -> None:
     gaussians = _gaussians(torch.rand(5, 3) + 0.1, torch.randn(5))
     fused = fuse_filter(gaussians, torch.zeros(5))
     torch.testing.assert_close(fused.log_scales, gaussians.log_scales)
-    torch.testing.assert_close(fused.logit_opacities, gaussians.logit_opacities, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        fused.logit_opacities, gaussians.logit_opacities, rtol=1e-5, atol=1e-6
+    )

@@ -35,7 +35,8 @@ def test_it_has_as_few_triangles_as_asked_for(most: int) -> None:
     assert min(most, len(ball().faces)) / 3 < len(mesh.faces) <= most
     assert np.abs(radii(mesh) - RADIUS).max() < 0.3
     assert (np.diff(np.sort(mesh.faces, axis=1), axis=1) > 0).all()
-    assert len(torch.from_numpy(mesh.faces)) == len(mesh.faces)  # torch takes no arrays that are stored backwards
+    # torch takes no arrays that are stored backwards
+    assert len(torch.from_numpy(mesh.faces)) == len(mesh.faces)
 
 
 def test_joined_vertices_lie_where_planes_meet() -> None:
@@ -43,9 +44,13 @@ def test_joined_vertices_lie_where_planes_meet() -> None:
     axis = np.linspace(-1, 1, 21)
     u, v = (x.reshape(-1) for x in np.meshgrid(axis, axis, indexing="ij"))
     corner = np.arange(20)[:, None] * 21 + np.arange(20)
-    flat = np.stack([corner, corner + 21, corner + 1, corner + 22, corner + 1, corner + 21], -1).reshape(-1, 3)
+    flat = np.stack(
+        [corner, corner + 21, corner + 1, corner + 22, corner + 1, corner + 21], -1
+    ).reshape(-1, 3)
     sides = [
-        np.stack([u, v, np.full_like(u, s)], 1)[:, roll] for roll in ([0, 1, 2], [2, 0, 1], [1, 2, 0]) for s in (-1, 1)
+        np.stack([u, v, np.full_like(u, s)], 1)[:, roll]
+        for roll in ([0, 1, 2], [2, 0, 1], [1, 2, 0])
+        for s in (-1, 1)
     ]
     faces = np.concatenate([flat + k * 441 for k in range(6)])
     mesh = simplified(Mesh(np.concatenate(sides) + 1e-3, faces), 100)

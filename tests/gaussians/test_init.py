@@ -14,13 +14,20 @@ from hypothesis import strategies as st
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
 from dyngs.data.capture import View
 from dyngs.data.geometry import pinhole_matrix, times_seen
-from dyngs.gaussians.init import StartValues, Surroundings, initial_gaussians, mean_squared_neighbour_distance
+from dyngs.gaussians.init import (
+    StartValues,
+    Surroundings,
+    initial_gaussians,
+    mean_squared_neighbour_distance,
+)
 
 CENTERS = np.array([[4.0, 0.0, 1.0], [0.0, 4.0, 1.0], [-4.0, 0.0, 1.0], [0.0, -4.0, 1.0]])
 """Of cameras that look at the origin, or where ``offset`` shifts it."""
 
 
-def _views(offset: tuple[float, float, float] = (0.0, 0.0, 0.0), centers: np.ndarray = CENTERS) -> list[View]:
+def _views(
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0), centers: np.ndarray = CENTERS
+) -> list[View]:
     views = []
     for i, center in enumerate(centers):
         backward = center / np.linalg.norm(center)
@@ -29,7 +36,9 @@ def _views(offset: tuple[float, float, float] = (0.0, 0.0, 0.0), centers: np.nda
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, -np.cross(backward, right), -backward])
         pose[:3, 3] = -pose[:3, :3] @ (center + offset)
-        views.append(View(str(i), Path(f"{i}.png"), pose, pinhole_matrix(20.0, 20.0, 10.0, 10.0), 20, 20))
+        views.append(
+            View(str(i), Path(f"{i}.png"), pose, pinhole_matrix(20.0, 20.0, 10.0, 10.0), 20, 20)
+        )
     return views
 
 
@@ -67,20 +76,32 @@ def test_neighbour_distance_equals_brute_force(count: int, seed: int) -> None:
     if count == 1:
         assert found.tolist() == [1e-2]
         return
-    squared = torch.cdist(xyz, xyz).square().fill_diagonal_(math.inf).sort(1).values[:, : min(3, count - 1)]
+    squared = (
+        torch.cdist(xyz, xyz)
+        .square()
+        .fill_diagonal_(math.inf)
+        .sort(1)
+        .values[:, : min(3, count - 1)]
+    )
     torch.testing.assert_close(found, squared.mean(1).clamp_min(1e-7), rtol=1e-6, atol=1e-12)
 
 
 def test_coincident_points_have_the_floor_as_size() -> None:
-    gaussians = initial_gaussians(_with_points(np.zeros((9, 3))), PointsInit(), StartValues(), 0, _generator())
+    gaussians = initial_gaussians(
+        _with_points(np.zeros((9, 3))), PointsInit(), StartValues(), 0, _generator()
+    )
     torch.testing.assert_close(gaussians.scales, torch.full((9, 3), 1e-7**0.5))
 
 
 def test_points_that_are_not_finite_are_left_out() -> None:
     xyz = np.random.default_rng(0).random((8, 3))
     xyz[3, 1] = np.nan
-    assert len(initial_gaussians(_with_points(xyz), PointsInit(), StartValues(), 0, _generator())) == 7
-    nothing = initial_gaussians(_with_points(xyz[3:4]), PointsInit(num_random=5), StartValues(), 0, _generator())
+    assert (
+        len(initial_gaussians(_with_points(xyz), PointsInit(), StartValues(), 0, _generator())) == 7
+    )
+    nothing = initial_gaussians(
+        _with_points(xyz[3:4]), PointsInit(num_random=5), StartValues(), 0, _generator()
+    )
     assert len(nothing) == 5
 
 
@@ -91,7 +112,9 @@ def test_points_that_are_not_finite_are_left_out() -> None:
         (Surroundings(_views(), around_origin=True), PointsInit(num_random=4000), 1.1),
     ],
 )
-def test_random_points_fill_their_cube(scene: Surroundings, options: PointsInit | RandomInit, half: float) -> None:
+def test_random_points_fill_their_cube(
+    scene: Surroundings, options: PointsInit | RandomInit, half: float
+) -> None:
     gaussians = initial_gaussians(scene, options, StartValues(), 1, _generator())
     assert len(gaussians) == 4000
     assert half * 0.99 < float(gaussians.means.abs().max()) <= half * 1.000001
@@ -99,11 +122,18 @@ def test_random_points_fill_their_cube(scene: Surroundings, options: PointsInit 
     assert float((gaussians.base_rgb - 0.5).abs().max()) < 0.28209479177387814 / 255 + 1e-6
 
 
-@pytest.mark.parametrize(("offset", "by_convention"), [((7.0, -3.0, 11.0), True), ((0.0, 0.0, 0.0), False)])
-def test_other_random_points_lie_where_cameras_look(offset: tuple[float, float, float], by_convention: bool) -> None:
-    """Wherever the scene lies: all in three images or more, most of them near what all cameras look at."""
+@pytest.mark.parametrize(
+    ("offset", "by_convention"), [((7.0, -3.0, 11.0), True), ((0.0, 0.0, 0.0), False)]
+)
+def test_other_random_points_lie_where_cameras_look(
+    offset: tuple[float, float, float], by_convention: bool
+) -> None:
+    """Wherever the scene lies: all in three images or more, most of them near what all cameras look
+    at."""
     scene = Surroundings(_views(offset), around_origin=by_convention)
-    gaussians = initial_gaussians(scene, PointsInit(num_random=2000), StartValues(), 1, _generator())
+    gaussians = initial_gaussians(
+        scene, PointsInit(num_random=2000), StartValues(), 1, _generator()
+    )
     xyz = gaussians.means.double().numpy()
     assert len(xyz) == 2000
     assert times_seen(xyz, scene.views).min() >= 3
@@ -122,7 +152,9 @@ def test_mcmc_starts_smaller_and_more_opaque_and_keeps_its_cap() -> None:
     capped = StartValues.for_strategy(DefaultStrategy(max_gaussians=20))
     few = initial_gaussians(_with_points(xyz), PointsInit(), capped, 0, _generator())
     assert len(few) == 20
-    assert {tuple(row) for row in few.means.tolist()} <= {tuple(row) for row in plain.means.tolist()}
+    assert {tuple(row) for row in few.means.tolist()} <= {
+        tuple(row) for row in plain.means.tolist()
+    }
 
 
 def test_the_seed_decides() -> None:

@@ -1,4 +1,5 @@
-"""Levels of detail: merged Gaussians keep the moments of what they replace, and a cut is the scene, once."""
+"""Levels of detail: merged Gaussians keep the moments of what they replace, and a cut is the scene,
+once."""
 
 from __future__ import annotations
 
@@ -28,8 +29,13 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
 
 
 def test_merged_moments_are_those_of_the_mixture() -> None:
-    """Checked from samples' moments in closed form: E[x], E[x x^T], and the mean of all colour coefficients."""
-    several = cloud(40, degree=2).to(dtype=torch.float64).replace(logit_opacities=torch.full((40,), -5.0).double())
+    """Checked from samples' moments in closed form: E[x], E[x x^T], and the mean of all colour
+    coefficients."""
+    several = (
+        cloud(40, degree=2)
+        .to(dtype=torch.float64)
+        .replace(logit_opacities=torch.full((40,), -5.0).double())
+    )
     one, shares = merged(several, 4)
     second = covariances(several) + several.means[:, :, None] * several.means[:, None, :]
     for i in range(10):
@@ -43,10 +49,13 @@ def test_merged_moments_are_those_of_the_mixture() -> None:
 
 
 def test_mass_is_kept_until_it_is_opaque() -> None:
-    """A ball's area is 4 pi r^2: two of equal place and size are twice as opaque as one, and never more than opaque."""
+    """A ball's area is 4 pi r^2: two of equal place and size are twice as opaque as one, and never
+    more than opaque."""
     ball = cloud(1).to(dtype=torch.float64).replace(log_scales=torch.full((1, 3), -1.0).double())
     for opacity, expected in ((0.2, 0.4), (0.8, module.LARGEST_OPACITY)):
-        pair = Gaussians.joined([ball.replace(logit_opacities=torch.tensor([opacity]).double().logit())] * 2)
+        pair = Gaussians.joined(
+            [ball.replace(logit_opacities=torch.tensor([opacity]).double().logit())] * 2
+        )
         one, _ = merged(pair, 2)
         assert float(one.opacities) == pytest.approx(expected)
         torch.testing.assert_close(covariances(one), covariances(ball))
@@ -138,13 +147,21 @@ def test_what_is_behind_or_beside_the_camera_stays_coarse(small_blocks: None) ->
 
 
 def test_from_afar_fewer_look_the_same(small_blocks: None) -> None:
-    """A cloud a few pixels wide: five times fewer, and nearer to what a camera of many more pixels sees."""
+    """A cloud a few pixels wide: five times fewer, and nearer to what a camera of many more pixels
+    sees."""
     gaussians = cloud(2000)
     pose = camera().cam_from_world.clone()
     pose[0, 2, 3] *= 20
     far = Cameras(pose, camera().intrinsics, camera().width, camera().height)
-    sharp = Cameras(pose, camera().intrinsics * torch.tensor([8.0, 8, 1])[:, None], 8 * far.width, 8 * far.height)
-    truth = torch.nn.functional.avg_pool2d(render(gaussians, sharp).rgb.permute(0, 3, 1, 2), 8).permute(0, 2, 3, 1)
+    sharp = Cameras(
+        pose,
+        camera().intrinsics * torch.tensor([8.0, 8, 1])[:, None],
+        8 * far.width,
+        8 * far.height,
+    )
+    truth = torch.nn.functional.avg_pool2d(
+        render(gaussians, sharp).rgb.permute(0, 3, 1, 2), 8
+    ).permute(0, 2, 3, 1)
     seen = levels_of(gaussians).seen_by(far)
     assert len(seen) < len(gaussians) / 5
     errors = [float((render(x, far).rgb - truth).square().mean()) for x in (seen, gaussians)]

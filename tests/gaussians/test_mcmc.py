@@ -1,4 +1,5 @@
-"""Relocation keeps the image, the set grows to its cap, noise moves only what is nearly transparent."""
+"""Relocation keeps the image, the set grows to its cap, noise moves only what is nearly
+transparent."""
 
 from __future__ import annotations
 
@@ -33,13 +34,16 @@ def _profile_integral(opacity: Tensor, scale: Tensor, copies: int) -> Tensor:
     return torch.trapezoid(1 - (1 - alpha) ** copies, x)
 
 
-@pytest.mark.parametrize(("opacity", "copies"), [(0.5, 2), (0.9, 3), (0.3, 5), (0.99, 10), (0.999, 50)])
+@pytest.mark.parametrize(
+    ("opacity", "copies"), [(0.5, 2), (0.9, 3), (0.3, 5), (0.99, 10), (0.999, 50)]
+)
 def test_relocation_keeps_the_integral_of_the_profile(opacity: float, copies: int) -> None:
     o = torch.tensor([opacity], dtype=torch.float64)
     thinner, factor = relocated(o, torch.tensor([copies]), min_opacity=0.0)
     before = _profile_integral(o, torch.tensor(1.0), 1)
     after = _profile_integral(thinner, factor, copies)
-    torch.testing.assert_close(after, before, rtol=1e-12, atol=0)  # quadrature of an analytic function
+    # quadrature of an analytic function
+    torch.testing.assert_close(after, before, rtol=1e-12, atol=0)
     # On the axis the composite has the old opacity.
     torch.testing.assert_close(1 - (1 - thinner) ** copies, o, rtol=1e-12, atol=0)
 
@@ -50,7 +54,9 @@ def test_relocation_equals_the_published_double_sum() -> None:
     o, n = 0.7, 6
     thin = 1 - (1 - o) ** (1 / n)
     total = sum(
-        comb(i - 1, k) * (-1) ** k * thin ** (k + 1) / (k + 1) ** 0.5 for i in range(1, n + 1) for k in range(i)
+        comb(i - 1, k) * (-1) ** k * thin ** (k + 1) / (k + 1) ** 0.5
+        for i in range(1, n + 1)
+        for k in range(i)
     )
     thinner, factor = relocated(torch.tensor([o], dtype=torch.float64), torch.tensor([n]))
     assert float(thinner) == pytest.approx(thin, rel=1e-12)
@@ -64,7 +70,9 @@ def test_relocation_is_finite_at_the_ends() -> None:
     assert torch.isfinite(factor).all()
     assert (factor > 0).all()
     assert thinner[2] == 0.005
-    torch.testing.assert_close(torch.stack([thinner[3], factor[3]]), torch.tensor([0.5, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(
+        torch.stack([thinner[3], factor[3]]), torch.tensor([0.5, 1.0], dtype=torch.float64)
+    )
 
 
 def test_dead_ones_move_onto_living_ones() -> None:
@@ -78,7 +86,8 @@ def test_dead_ones_move_onto_living_ones() -> None:
     assert source[1] == 1
     assert source[4] == 4
     assert set(source) == set(source) & {1, 4}
-    logits, log_scales = result.changes["logit_opacities"], result.changes["log_scales"]
+    logits = result.changes["logit_opacities"]
+    log_scales = result.changes["log_scales"]
     for alive in (1, 4):
         rows = [i for i, s in enumerate(source) if s == alive]
         same = logits[rows].sigmoid()
@@ -98,7 +107,10 @@ def test_the_set_grows_to_its_cap_and_no_further() -> None:
         assert len(result.edit.source) == expected
         assert result.edit.source[:100].tolist() == list(range(100))
         untouched = ~result.edit.is_new[:100]
-        assert torch.equal(result.changes["log_scales"][:100][untouched], _gaussians([0.4] * 100).log_scales[untouched])
+        assert torch.equal(
+            result.changes["log_scales"][:100][untouched],
+            _gaussians([0.4] * 100).log_scales[untouched],
+        )
 
 
 @pytest.mark.parametrize(("cap", "expected"), [(104, 104), (50, 100), (200, 110)])
@@ -129,15 +141,21 @@ def test_nothing_outside_the_schedule_or_without_survivors() -> None:
 def test_noise_has_the_published_size_and_direction() -> None:
     count, lr = 4000, 1e-4
     one = _gaussians([0.004])
-    gaussians = Gaussians(**{name: x.repeat(count, *[1] * (x.ndim - 1)) for name, x in one.tensors().items()})
+    gaussians = Gaussians(
+        **{name: x.repeat(count, *[1] * (x.ndim - 1)) for name, x in one.tensors().items()}
+    )
     densifier = McmcDensifier(McmcStrategy(), SCHEDULE, 0.05)
     before = gaussians.means.clone()
     densifier.perturb(gaussians, lr, torch.Generator().manual_seed(0))
-    moved = (gaussians.means - before) / (5e5 * lr * torch.sigmoid(torch.tensor(100 * (0.005 - 0.004))))
+    moved = (gaussians.means - before) / (
+        5e5 * lr * torch.sigmoid(torch.tensor(100 * (0.005 - 0.004)))
+    )
     axes = rotate(one.quats.repeat(3, 1), torch.eye(3))
     sigma = axes.T @ torch.diag(one.scales[0] ** 2) @ axes
     expected = sigma @ sigma
-    torch.testing.assert_close(moved.T @ moved / count, expected, rtol=0.1, atol=0.05 * float(expected.abs().max()))
+    torch.testing.assert_close(
+        moved.T @ moved / count, expected, rtol=0.1, atol=0.05 * float(expected.abs().max())
+    )
 
 
 def test_opaque_ones_stay_put_and_no_noise_means_none() -> None:
@@ -152,16 +170,21 @@ def test_opaque_ones_stay_put_and_no_noise_means_none() -> None:
 
 def test_regularizers_are_weighted_means() -> None:
     gaussians = _gaussians([0.2, 0.4])
-    terms = McmcDensifier(McmcStrategy(opacity_reg=0.5, scale_reg=0.25), SCHEDULE, 0.05).regularizers(gaussians)
+    terms = McmcDensifier(
+        McmcStrategy(opacity_reg=0.5, scale_reg=0.25), SCHEDULE, 0.05
+    ).regularizers(gaussians)
     assert float(terms["opacity"]) == pytest.approx(0.5 * 0.3, rel=1e-6)
     assert float(terms["scale"]) == pytest.approx(0.25 * float(gaussians.scales.mean()), rel=1e-6)
 
 
 def test_the_result_does_not_depend_on_threads() -> None:
     n = 70_001  # above torch's grain of 32,768, so that two threads do share the work
-    opacities = torch.rand(n, generator=torch.Generator().manual_seed(1)).clamp(0.001, 0.999).tolist()
+    opacities = (
+        torch.rand(n, generator=torch.Generator().manual_seed(1)).clamp(0.001, 0.999).tolist()
+    )
     gaussians = _gaussians(opacities)
-    threads, results = torch.get_num_threads(), []
+    threads = torch.get_num_threads()
+    results = []
     try:
         for count in (1, 2):
             torch.set_num_threads(count)

@@ -22,7 +22,9 @@ def _gaussians(n: int, seed: int = 0) -> Gaussians:
 
 def _stored(optimizer: GaussianOptimizer) -> dict[str, torch.Tensor]:
     """Copies of parameters and moments."""
-    tensors = {f"gaussians.{name}": x.detach() for name, x in optimizer.parameters.tensors().items()}
+    tensors = {
+        f"gaussians.{name}": x.detach() for name, x in optimizer.parameters.tensors().items()
+    }
     return {name: x.clone() for name, x in (tensors | tensors_of(optimizer.state())).items()}
 
 
@@ -31,7 +33,9 @@ def _restored(tensors: dict[str, torch.Tensor]) -> GaussianOptimizer:
     return GaussianOptimizer(_gaussians(2, seed=9), OptimConfig()).restored(parameters, tensors)
 
 
-def _set_gradients(optimizer: GaussianOptimizer, seed: int, unseen: list[int] | None = None) -> dict[str, torch.Tensor]:
+def _set_gradients(
+    optimizer: GaussianOptimizer, seed: int, unseen: list[int] | None = None
+) -> dict[str, torch.Tensor]:
     gradients = _gaussians(len(optimizer.parameters), seed).tensors()
     for name, x in optimizer.parameters.tensors().items():
         gradients[name][unseen or []] = 0
@@ -40,15 +44,23 @@ def _set_gradients(optimizer: GaussianOptimizer, seed: int, unseen: list[int] | 
 
 
 def test_equals_torch_adam_with_a_rate_per_group() -> None:
-    start, options = _gaussians(7), OptimConfig(sparse=False)
+    start = _gaussians(7)
+    options = OptimConfig(sparse=False)
     optimizer = GaussianOptimizer(start, options)
-    theirs = {name: x.clone().requires_grad_() for name, x in start.tensors().items() if name != "sh"}
-    theirs |= {"dc": start.sh[:, :1].clone().requires_grad_(), "rest": start.sh[:, 1:].clone().requires_grad_()}
+    theirs = {
+        name: x.clone().requires_grad_() for name, x in start.tensors().items() if name != "sh"
+    }
+    theirs |= {
+        "dc": start.sh[:, :1].clone().requires_grad_(),
+        "rest": start.sh[:, 1:].clone().requires_grad_(),
+    }
     rates = {
         "means": 0.3, "quats": options.lr_quats, "log_scales": options.lr_scales,
         "logit_opacities": options.lr_opacities, "dc": options.lr_sh_dc, "rest": options.lr_sh_rest,
     }  # fmt: skip
-    adam = torch.optim.Adam([{"params": [theirs[n]], "lr": lr} for n, lr in rates.items()], eps=ADAM_EPS)
+    adam = torch.optim.Adam(
+        [{"params": [theirs[n]], "lr": lr} for n, lr in rates.items()], eps=ADAM_EPS
+    )
     for step in range(1, 6):
         gradients = _set_gradients(optimizer, step)
         gradients |= {"dc": gradients["sh"][:, :1], "rest": gradients["sh"][:, 1:]}
@@ -64,7 +76,8 @@ def test_equals_torch_adam_with_a_rate_per_group() -> None:
 
 
 def test_gaussians_that_rest_are_left_alone_where_they_are_not_seen() -> None:
-    """Of two that are not seen only the one that rests; one that is seen moves, be it at rest else or not."""
+    """Of two that are not seen only the one that rests; one that is seen moves, be it at rest else
+    or not."""
     optimizer = GaussianOptimizer(_gaussians(5), OptimConfig())
     resting = torch.tensor([0, 3])
     for step in (1, 2):
@@ -115,12 +128,14 @@ def test_of_frozen_gaussians_only_the_base_colour_learns() -> None:
 
 @pytest.mark.parametrize("frozen", [(False, True, False), (True, True, True)])
 def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
-    """Others keep theirs, with their moments; if nobody keeps them, there are none, in checkpoints neither."""
+    """Others keep theirs, with their moments; if nobody keeps them, there are none, in checkpoints
+    neither."""
     optimizer = GaussianOptimizer(_gaussians(3), OptimConfig())
     _set_gradients(optimizer, 1)
     optimizer.step(1, 0.1, dense=True)
     before = _stored(optimizer)
-    rows, base = torch.tensor(frozen), torch.full((3, 3), 0.7)
+    rows = torch.tensor(frozen)
+    base = torch.full((3, 3), 0.7)
     optimizer.drop_rest(base, rows)
     after = _stored(optimizer)
     assert torch.equal(after["gaussians.sh"][rows, 0], base[rows])
@@ -146,7 +161,8 @@ def test_an_edit_moves_parameters_and_moments() -> None:
     _set_gradients(optimizer, 1)
     optimizer.step(1, 0.1, dense=True)
     before = _stored(optimizer)
-    source, is_new = torch.tensor([0, 2, 2, 3]), torch.tensor([False, False, True, True])
+    source = torch.tensor([0, 2, 2, 3])
+    is_new = torch.tensor([False, False, True, True])
     changes = {"means": torch.full((4, 3), 7.0)}
     edit = EditResult(TopologyEdit(source, is_new), changes, frozenset({"logit_opacities"}))
     optimizer.apply(edit)
@@ -158,7 +174,10 @@ def test_an_edit_moves_parameters_and_moments() -> None:
         assert torch.equal(after[f"{kind}.sh"][:2], before[f"{kind}.sh"][source[:2]])
         assert after[f"{kind}.sh"][2:].count_nonzero() == 0
         assert after[f"{kind}.logit_opacities"].count_nonzero() == 0
-    assert all(x.is_leaf and x.requires_grad and x.grad is None for x in optimizer.parameters.tensors().values())
+    assert all(
+        x.is_leaf and x.requires_grad and x.grad is None
+        for x in optimizer.parameters.tensors().values()
+    )
 
 
 def test_a_reset_without_an_edit_keeps_all_else() -> None:
@@ -169,7 +188,11 @@ def test_a_reset_without_an_edit_keeps_all_else() -> None:
     lowered = torch.full((3,), -4.0)
     optimizer.apply(EditResult(None, {"logit_opacities": lowered}, frozenset({"logit_opacities"})))
     changed = {name for name, x in _stored(optimizer).items() if not torch.equal(x, before[name])}
-    assert changed == {"gaussians.logit_opacities", "exp_avg.logit_opacities", "exp_avg_sq.logit_opacities"}
+    assert changed == {
+        "gaussians.logit_opacities",
+        "exp_avg.logit_opacities",
+        "exp_avg_sq.logit_opacities",
+    }
     assert torch.equal(optimizer.parameters.logit_opacities.detach(), lowered)
 
 

@@ -13,8 +13,12 @@ from dyngs.kinds import assemble
 
 
 def test_corners_of_a_cube_follow_the_z_curve() -> None:
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float32)
-    assert corners[morton_order(corners)].tolist() == sorted(corners.tolist(), key=lambda p: p[::-1])
+    corners = np.array(
+        [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float32
+    )
+    assert corners[morton_order(corners)].tolist() == sorted(
+        corners.tolist(), key=lambda p: p[::-1]
+    )
 
 
 def test_neighbours_become_nearer() -> None:
@@ -24,7 +28,9 @@ def test_neighbours_become_nearer() -> None:
     assert np.linalg.norm(np.diff(along, axis=0), axis=1).mean() < 0.15
 
 
-@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((3, 3)), np.array([[1e30, 0, 0], [-1e30, 0, 1e-30]])])
+@pytest.mark.parametrize(
+    "points", [np.zeros((0, 3)), np.zeros((3, 3)), np.array([[1e30, 0, 0], [-1e30, 0, 1e-30]])]
+)
 def test_any_points_have_an_order(points: np.ndarray) -> None:
     assert sorted(morton_order(points)) == list(range(len(points)))
 
@@ -47,7 +53,9 @@ def test_an_outlier_does_not_put_the_others_into_one_cell() -> None:
 
 def test_a_scene_that_grows_stays_in_order(tmp_path: Path) -> None:
     """Until motion begins, which adds Gaussians at the end, and between steps: these move them."""
-    trainer = assemble(busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "control_nodes"))
+    trainer = assemble(
+        busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "control_nodes")
+    )
     checked = 0
     while not trainer.num_moving:
         before = trainer.model.scene.gaussians.means

@@ -1,4 +1,5 @@
-"""Adam of a field: torch's own, with a schedule, rows that can be rearranged, and a state that can be stored."""
+"""Adam of a field: torch's own, with a schedule, rows that can be rearranged, and a state that can
+be stored."""
 
 from __future__ import annotations
 
@@ -31,9 +32,12 @@ def give_gradients(learned: Parameters, step: int) -> dict[str, Tensor]:
 @pytest.mark.parametrize("decay", [1.0, 0.01, 0.0])
 def test_it_is_adam_with_a_falling_rate(decay: float) -> None:
     """The rate is log-linear from the first to the last; where the last is zero, linear."""
-    learned, num_steps = Parameters(start_values(), RATES, decay), 12
+    learned = Parameters(start_values(), RATES, decay)
+    num_steps = 12
     mine = {name: x.clone().requires_grad_() for name, x in start_values().items()}
-    adam = torch.optim.Adam([{"params": [x], "lr": RATES[name]} for name, x in mine.items()], eps=1e-15)
+    adam = torch.optim.Adam(
+        [{"params": [x], "lr": RATES[name]} for name, x in mine.items()], eps=1e-15
+    )
     for step in range(1, num_steps + 1):
         progress = (step - 1) / (num_steps - 1)
         for name, grad in give_gradients(learned, step).items():
@@ -49,7 +53,8 @@ def test_it_is_adam_with_a_falling_rate(decay: float) -> None:
 
 
 def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
-    learned, before = Parameters(start_values(), RATES), start_values()
+    learned = Parameters(start_values(), RATES)
+    before = start_values()
     give_gradients(learned, 1)
     for name, row in (("weight", (2, 1)), ("planes", (1, 2, 3, 0))):
         grad = learned[name].grad
@@ -81,7 +86,8 @@ def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
     give_gradients(learned, 1)
     learned.step(1, 0.0)
     before = {name: x.clone() for name, x in tensors_of(learned.state()).items()}
-    index, is_new = torch.tensor([3, 0, 0, 2, 3]), torch.tensor([False, False, True, False, True])
+    index = torch.tensor([3, 0, 0, 2, 3])
+    is_new = torch.tensor([False, False, True, False, True])
     edited = learned.edited(Role.PER_MOVING, TopologyEdit(index, is_new))
     after = tensors_of(edited.state())
     assert torch.equal(after["weight"], before["weight"][index])
@@ -91,7 +97,9 @@ def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
         assert torch.equal(after[name][~is_new], before[name][index][~is_new])
         assert not after[name][is_new].any()
     assert all(torch.equal(after[name], x) for name, x in before.items() if "weight" not in name)
-    assert learned.edited(Role.PER_GAUSSIAN, TopologyEdit(index, is_new)) is learned, "no tensor has that role"
+    assert learned.edited(Role.PER_GAUSSIAN, TopologyEdit(index, is_new)) is learned, (
+        "no tensor has that role"
+    )
     edited["weight"].grad = torch.ones(5, 5)
     edited.step(2, 0.5)
     assert all(torch.equal(x, before[name]) for name, x in tensors_of(learned.state()).items())
@@ -104,11 +112,14 @@ def test_rows_rearranged_take_their_moments_along() -> None:
     learned.step(1, 0.0)
     before = {name: x.clone() for name, x in tensors_of(learned.state()).items()}
     values = torch.randn(3, 5, generator=torch.Generator().manual_seed(2))
-    source, is_new = torch.tensor([2, 99, 0]), torch.tensor([False, True, False])
+    source = torch.tensor([2, 99, 0])
+    is_new = torch.tensor([False, True, False])
     found = tensors_of(learned.rearranged({"weight": values}, source, is_new).state())
     assert torch.equal(found["weight"], values)
     for name in ("exp_avg.weight", "exp_avg_sq.weight"):
-        assert torch.equal(found[name], torch.stack([before[name][2], torch.zeros(5), before[name][0]]))
+        assert torch.equal(
+            found[name], torch.stack([before[name][2], torch.zeros(5), before[name][0]])
+        )
     assert all(torch.equal(found[name], x) for name, x in before.items() if "weight" not in name)
 
 
@@ -132,7 +143,8 @@ def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
 
 def test_a_restored_one_may_have_other_rows_where_it_is_told() -> None:
     wide = Parameters(start_values() | {"weight": torch.randn(7, 5)}, RATES)
-    like, state = Parameters(start_values(), RATES), tensors_of(wide.state())
+    like = Parameters(start_values(), RATES)
+    state = tensors_of(wide.state())
     found = like.restored(state, {"weight": 7})
     assert all(torch.equal(x, state[name]) for name, x in tensors_of(found.state()).items())
     with pytest.raises(ValueError, match="weight"):
@@ -153,7 +165,10 @@ def test_without_moments_they_are_zero() -> None:
 
 def test_values_have_the_roles_they_were_given_and_moments_are_for_training() -> None:
     roles = {"weight": Role.PER_GAUSSIAN, "bias": Role.SHARED, "planes": Role.PER_MOVING}
-    for learned in (Parameters(start_values(), RATES, roles=roles), Parameters({}, {}, roles=roles)):
+    for learned in (
+        Parameters(start_values(), RATES, roles=roles),
+        Parameters({}, {}, roles=roles),
+    ):
         for name, x in learned.state().items():
             assert x.role is roles.get(name, Role.TRAINING)
 

@@ -26,7 +26,9 @@ EXACT = RenderOptions(alpha_min=0.0, transmittance_min=0.0)
 
 
 def leaves(gaussians: Gaussians) -> Gaussians:
-    return Gaussians(**{name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()})
+    return Gaussians(
+        **{name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()}
+    )
 
 
 def half_transparent_wall(z: float = 4.0) -> tuple[Gaussians, Scene]:
@@ -58,7 +60,8 @@ def test_is_the_three_ops_in_a_row(mode: RasterizeMode) -> None:
 def test_a_shader_gives_the_colours() -> None:
     """Instead of the harmonics; it sees what is drawn and where from, and its gradients go on."""
     scene = random_scene(degree=1)
-    gaussians, asked = leaves(scene.gaussians), []
+    gaussians = leaves(scene.gaussians)
+    asked = []
 
     def shader(drawn: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
         asked.append((len(drawn), len(cameras), radii.shape))
@@ -78,19 +81,27 @@ def test_a_shader_gives_the_colours() -> None:
 def test_gradcheck(depth: str) -> None:
     """Through activations, cameras, colours, alpha, depth and background, without thresholds.
 
-    Wide Gaussians: where alpha is nearly zero, 1 - transmittance has no digits, and depth / alpha none either.
+    Wide Gaussians: where alpha is nearly zero, 1 - transmittance has no digits, and depth / alpha
+    none either.
     """
     scene = random_scene(n=3, views=2, size=(4, 3), degree=1)
     scene = replace(scene, scales=5 * scene.scales)
     options = replace(EXACT, depth=depth, mode=RasterizeMode.ANTIALIASED)
 
-    def run(poses: Tensor, intrinsics: Tensor, background: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def run(
+        poses: Tensor, intrinsics: Tensor, background: Tensor, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
         cameras = replace(scene, cam_from_world=poses, intrinsics=intrinsics).cameras
         image = render(Gaussians(*tensors), cameras, options, background=background)
         assert image.depth is not None
         return image.rgb, image.alpha, image.depth
 
-    tensors = (scene.cam_from_world, scene.intrinsics, scene.background, *scene.gaussians.tensors().values())
+    tensors = (
+        scene.cam_from_world,
+        scene.intrinsics,
+        scene.background,
+        *scene.gaussians.tensors().values(),
+    )
     assert torch.autograd.gradcheck(run, [x.detach().clone().requires_grad_() for x in tensors])
 
 
@@ -98,9 +109,15 @@ def test_depth_of_a_half_transparent_wall() -> None:
     gaussians, scene = half_transparent_wall(z=4.0)
     found = {}
     for kind in ("accumulated", "expected"):
-        found[kind] = render(gaussians, scene.cameras, RenderOptions(depth=kind), background=torch.ones(3)).depth
-    torch.testing.assert_close(found["accumulated"], torch.full((1, 29, 37), 2.0).double(), rtol=1e-6, atol=0)
-    torch.testing.assert_close(found["expected"], torch.full((1, 29, 37), 4.0).double(), rtol=1e-6, atol=0)
+        found[kind] = render(
+            gaussians, scene.cameras, RenderOptions(depth=kind), background=torch.ones(3)
+        ).depth
+    torch.testing.assert_close(
+        found["accumulated"], torch.full((1, 29, 37), 2.0).double(), rtol=1e-6, atol=0
+    )
+    torch.testing.assert_close(
+        found["expected"], torch.full((1, 29, 37), 4.0).double(), rtol=1e-6, atol=0
+    )
 
 
 def test_depth_where_nothing_is_drawn_is_zero_with_a_finite_gradient() -> None:
@@ -112,7 +129,9 @@ def test_depth_where_nothing_is_drawn_is_zero_with_a_finite_gradient() -> None:
     assert image.alpha[0, -1, -1] == image.depth[0, -1, -1] == 0
     image.depth.sum().backward()
     assert all(
-        x.grad is not None and x.grad.isfinite().all() for x in gaussians.tensors().values() if x is not gaussians.sh
+        x.grad is not None and x.grad.isfinite().all()
+        for x in gaussians.tensors().values()
+        if x is not gaussians.sh
     )
 
 
@@ -124,7 +143,8 @@ def test_alpha_of_a_half_transparent_wall() -> None:
 
 def test_one_background_serves_every_view() -> None:
     scene = random_scene()
-    one, gaussians = scene.background[0], scene.gaussians
+    one = scene.background[0]
+    gaussians = scene.gaussians
     shared = render(gaussians, scene.cameras, background=one).rgb
     each = render(gaussians, scene.cameras, background=torch.stack([one, one])).rgb
     assert torch.equal(shared, each)
@@ -151,7 +171,9 @@ def test_sh_degree_limits_the_terms(degree: int) -> None:
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
     scene = random_scene()
-    halves = leaves(Gaussians(**{name: x.to(dtype) for name, x in scene.gaussians.tensors().items()}))
+    halves = leaves(
+        Gaussians(**{name: x.to(dtype) for name, x in scene.gaussians.tensors().items()})
+    )
     floats = Gaussians(**{name: x.detach().float() for name, x in halves.tensors().items()})
     image = render(halves, scene.cameras.to(dtype=torch.float32))
     assert image.rgb.dtype == torch.float32
@@ -195,7 +217,8 @@ def test_probe_collects_the_densification_signal() -> None:
 
 @pytest.mark.parametrize("shaded", [False, True])
 def test_sensitivity_of_a_half_transparent_wall(shaded: bool) -> None:
-    """dI/dG = o (c - B) with opacity 0.5, channels of 0.7 before a background of 0.3: (0.5 * 3 * 0.4)^2 per pixel."""
+    """dI/dG = o (c - B) with opacity 0.5, channels of 0.7 before a background of 0.3: (0.5 * 3 *
+    0.4)^2 per pixel."""
     gaussians, scene = half_transparent_wall()
     color = torch.full((1, 1, 3), 0.7, dtype=torch.float64)
     if not shaded:
@@ -207,7 +230,9 @@ def test_sensitivity_of_a_half_transparent_wall(shaded: bool) -> None:
         shader=(lambda drawn, cameras, radii: color) if shaded else None,
     )
     pixels = scene.cameras.width * scene.cameras.height
-    torch.testing.assert_close(found, torch.full((1, 1), 0.36 * pixels, dtype=torch.float64), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        found, torch.full((1, 1), 0.36 * pixels, dtype=torch.float64), rtol=1e-9, atol=0
+    )
 
 
 @pytest.mark.parametrize("mode", RasterizeMode)
@@ -232,7 +257,8 @@ def test_world_and_camera_moved_together_see_the_same() -> None:
         quats=turned,
         cam_from_world=scene.cam_from_world @ torch.linalg.inv(motion),
     )
-    ours, truth = render(moved.gaussians, moved.cameras), render(scene.gaussians, scene.cameras)
+    ours = render(moved.gaussians, moved.cameras)
+    truth = render(scene.gaussians, scene.cameras)
     torch.testing.assert_close(ours.rgb, truth.rgb, rtol=1e-9, atol=1e-11)
 
 
@@ -244,7 +270,9 @@ def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
     for n in (1, 2, 8):
         set_threads(n)
         gaussians = leaves(scene.gaussians)
-        image = render(gaussians, scene.cameras, RenderOptions(depth="expected"), background=scene.background)
+        image = render(
+            gaussians, scene.cameras, RenderOptions(depth="expected"), background=scene.background
+        )
         total = (image.rgb * weights(image.rgb)).sum() + image.alpha.sum()
         found.append([image.rgb, image.alpha, image.depth])
         found[-1] += torch.autograd.grad(total, list(gaussians.tensors().values()))
@@ -271,7 +299,9 @@ def test_no_gaussians_leave_the_background() -> None:
 def compiled_and_plain(scene: Scene, options: RenderOptions) -> list[list[Tensor]]:
     """Image and gradients of ``render``, compiled and not."""
 
-    def run(means: Tensor, quats: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor) -> Rendering:
+    def run(
+        means: Tensor, quats: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor
+    ) -> Rendering:
         gaussians = Gaussians(means, quats, log_scales, logits, sh)
         return render(gaussians, scene.cameras, options, background=scene.background)
 
@@ -285,11 +315,13 @@ def compiled_and_plain(scene: Scene, options: RenderOptions) -> list[list[Tensor
 
 
 def test_compiles_into_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of tile entries depends on the data: torch must be told to expect that. The check for NaN cannot be
-    part of a graph (it may raise), hence ``trust``."""
+    """The number of tile entries depends on the data: torch must be told to expect that. The check
+    for NaN cannot be part of a graph (it may raise), hence ``trust``."""
     monkeypatch.setattr("torch._dynamo.config.capture_dynamic_output_shape_ops", True)
     scene = random_scene()
-    compiled, plain = compiled_and_plain(scene, RenderOptions(nonfinite="trust", mode=RasterizeMode.ANTIALIASED))
+    compiled, plain = compiled_and_plain(
+        scene, RenderOptions(nonfinite="trust", mode=RasterizeMode.ANTIALIASED)
+    )
     for x, y in zip(compiled, plain, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-14)
 
@@ -300,7 +332,10 @@ VERBS = [render, contributions, sensitivities]
 NO_ROTATIONS = {
     "mirrored": (torch.diag(torch.tensor([1.0, 1.0, -1.0])), "is mirrored"),
     "scaled": (2 * torch.eye(3), "differs from a rotation by 3"),
-    "sheared": (torch.tensor([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "differs from a rotation by 0.1"),
+    "sheared": (
+        torch.tensor([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        "differs from a rotation by 0.1",
+    ),
     "zero": (torch.zeros(3, 3), "differs from a rotation by 1"),
 }
 
@@ -311,17 +346,23 @@ def test_a_pose_that_is_no_rotation_is_refused(verb: Callable[..., object], faul
     scene = random_scene()
     matrix, reason = NO_ROTATIONS[fault]
     scene.cam_from_world[1, :3, :3] = matrix.to(scene.cam_from_world)
-    with pytest.raises(DyngsError, match=rf"cam_from_world: the matrix of camera 1 {reason}") as caught:
+    with pytest.raises(
+        DyngsError, match=rf"cam_from_world: the matrix of camera 1 {reason}"
+    ) as caught:
         verb(scene.gaussians, scene.cameras)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("focal", [0.0, -20.0, 1e-7, 1e13])
-def test_focal_lengths_that_show_nothing_are_refused(verb: Callable[..., object], focal: float) -> None:
+def test_focal_lengths_that_show_nothing_are_refused(
+    verb: Callable[..., object], focal: float
+) -> None:
     scene = random_scene()
     scene.intrinsics[1, 1, 1] = focal
-    with pytest.raises(DyngsError, match=r"intrinsics: focal lengths must be positive.*camera 1 has"):
+    with pytest.raises(
+        DyngsError, match=r"intrinsics: focal lengths must be positive.*camera 1 has"
+    ):
         verb(scene.gaussians, scene.cameras)
 
 
@@ -329,7 +370,9 @@ def test_focal_lengths_that_show_nothing_are_refused(verb: Callable[..., object]
 def test_every_verb_names_what_is_not_finite(verb: Callable[..., object]) -> None:
     scene = random_scene()
     scene.means[3, 1] = math.nan
-    with pytest.raises(DyngsError, match=r"means holds 1 NaN or infinite value\(s\) in 1 of 20 rows"):
+    with pytest.raises(
+        DyngsError, match=r"means holds 1 NaN or infinite value\(s\) in 1 of 20 rows"
+    ):
         verb(scene.gaussians, scene.cameras)
     skipped = verb(scene.gaussians, scene.cameras, RenderOptions(nonfinite="skip"))
     found = skipped.rgb if isinstance(skipped, Rendering) else skipped
@@ -348,7 +391,9 @@ def test_background_and_probe_of_another_shape_are_refused(shape: tuple[int, ...
 
 def test_a_rendering_in_another_precision() -> None:
     scene = random_scene()
-    found = render(scene.gaussians, scene.cameras, RenderOptions(depth="expected")).to(dtype=torch.float32)
+    found = render(scene.gaussians, scene.cameras, RenderOptions(depth="expected")).to(
+        dtype=torch.float32
+    )
     assert found.rgb.dtype == found.transmittance.dtype == torch.float32
     assert found.depth is not None
     assert found.depth.dtype == torch.float32
@@ -358,5 +403,7 @@ def test_a_rendering_in_another_precision() -> None:
 @pytest.mark.parametrize("verb", VERBS)
 def test_cameras_on_another_device_are_refused(verb: Callable[..., object]) -> None:
     scene = random_scene()
-    with pytest.raises(DyngsError, match=r"the cameras are on meta, the Gaussians on cpu; move one of them"):
+    with pytest.raises(
+        DyngsError, match=r"the cameras are on meta, the Gaussians on cpu; move one of them"
+    ):
         verb(scene.gaussians, scene.cameras.to(device="meta"))

@@ -54,10 +54,13 @@ def names_with(scene: GaussianScene, role: Role) -> set[str]:
 
 
 def leaves(gaussians: Gaussians) -> Gaussians:
-    return Gaussians(**{name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()})
+    return Gaussians(
+        **{name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()}
+    )
 
 
-# --- what is stored ---------------------------------------------------------------------------------------------------
+# --- what is stored
+# ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("drawing", [False, True], ids=["state", "drawing state"])
@@ -65,7 +68,9 @@ def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
     """To the bit, but for skinning weights whose corrections are stored within them."""
     scene = scene_of_kind(kind)
     state = scene.drawing_state() if drawing else scene.state()
-    found = replace(restored(kind, state), colour=network_of(part_of(tensors_of(state), "model.colour")))
+    found = replace(
+        restored(kind, state), colour=network_of(part_of(tensors_of(state), "model.colour"))
+    )
     assert type(found) is type(scene)
     assert found.times == scene.times
     assert torch.equal(found.rows, scene.rows)
@@ -87,7 +92,9 @@ def test_what_is_stored_is_stored_again_alike(kind: str) -> None:
 def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
     """Also after an edit."""
     scene = scene_of_kind(kind)
-    copied = TopologyEdit(torch.tensor([8, 1, 1, 5, 0]), torch.tensor([False, False, True, False, False]))
+    copied = TopologyEdit(
+        torch.tensor([8, 1, 1, 5, 0]), torch.tensor([False, False, True, False, False])
+    )
     for one in (scene, scene.edited(copied), scene.part("moving"), scene.part("still")):
         for name, x in one.state().items():
             assert isinstance(x.role, Role), name
@@ -95,9 +102,16 @@ def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
                 assert len(x.tensor) == len(one), name
             if x.role is Role.PER_MOVING:
                 assert len(x.tensor) == one.num_moving, name
-    assert {f"gaussians.{name}" for name in scene.gaussians.tensors()} <= names_with(scene, Role.PER_GAUSSIAN)
-    assert (kind in ("control_nodes", "windowed", "free")) == bool(names_with(scene, Role.PER_MOVING))
-    assert scene.drawing_state().keys() == scene.state().keys() - names_with(scene, Role.TRAINING) - WITHIN_OTHERS
+    assert {f"gaussians.{name}" for name in scene.gaussians.tensors()} <= names_with(
+        scene, Role.PER_GAUSSIAN
+    )
+    assert (kind in ("control_nodes", "windowed", "free")) == bool(
+        names_with(scene, Role.PER_MOVING)
+    )
+    assert (
+        scene.drawing_state().keys()
+        == scene.state().keys() - names_with(scene, Role.TRAINING) - WITHIN_OTHERS
+    )
     assert all(not x.tensor.requires_grad for x in scene.state().values())
 
 
@@ -105,12 +119,15 @@ WITHIN_OTHERS = {"model.learned.weights"}
 """Stored within other tensors where a scene is stored for drawing alone."""
 
 
-# --- parts ------------------------------------------------------------------------------------------------------------
+# --- parts
+# ------------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=15, deadline=None)
 @given(
-    st.sampled_from(KINDS), st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=14), st.sampled_from(TIMES)
+    st.sampled_from(KINDS),
+    st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=14),
+    st.sampled_from(TIMES),
 )
 def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
     kind: str, rows: list[tuple[int, bool]], time: float | None
@@ -118,7 +135,9 @@ def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
     scene = scene_of_kind(kind)
     source = torch.tensor([row for row, _ in rows], dtype=torch.long)
     before = scene.at(time)
-    edited = scene.edited(TopologyEdit(source, torch.tensor([new for _, new in rows], dtype=torch.bool)))
+    edited = scene.edited(
+        TopologyEdit(source, torch.tensor([new for _, new in rows], dtype=torch.bool))
+    )
     assert len(edited) == len(rows)
     assert edited.times == scene.times
     assert_alike(edited.unmasked().at(time), scene.unmasked().at(time).select(source))
@@ -131,7 +150,8 @@ def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
 def test_a_selection_is_an_edit_that_copies_nothing(kind: str) -> None:
     scene = scene_of_kind(kind)
     chosen = torch.arange(len(scene)) % 3 == 1
-    by_bools, by_index = scene.select(chosen), scene.select(torch.nonzero(chosen)[:, 0])
+    by_bools = scene.select(chosen)
+    by_index = scene.select(torch.nonzero(chosen)[:, 0])
     for time in TIMES:
         assert_alike(by_bools.at(time), by_index.at(time), atol=0.0)
         assert_alike(by_bools.unmasked().at(time), scene.unmasked().at(time).select(chosen))
@@ -139,7 +159,8 @@ def test_a_selection_is_an_edit_that_copies_nothing(kind: str) -> None:
 
 def test_what_moves_and_what_is_still_make_the_scene(kind: str) -> None:
     scene = scene_of_kind(kind)
-    moving, still = scene.part("moving"), scene.part("still")
+    moving = scene.part("moving")
+    still = scene.part("still")
     moves = torch.zeros(len(scene), dtype=torch.bool)
     moves[scene.rows] = True
     assert (len(moving), len(still)) == (int(moves.sum()), int((~moves).sum()))
@@ -161,7 +182,8 @@ def test_rows_are_those_that_move(kind: str) -> None:
     assert torch.isin(scene.offset_rows, scene.rows).all()
 
 
-# --- times ------------------------------------------------------------------------------------------------------------
+# --- times
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_times_are_clamped_and_must_be_numbers(kind: str) -> None:
@@ -174,7 +196,8 @@ def test_times_are_clamped_and_must_be_numbers(kind: str) -> None:
         scene.time_step(float("nan"))
 
 
-# --- drawing ----------------------------------------------------------------------------------------------------------
+# --- drawing
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_moment_may_be_drawn_again(kind: str) -> None:
@@ -187,7 +210,8 @@ def test_a_moment_may_be_drawn_again(kind: str) -> None:
 
 
 def test_the_background_is_that_of_the_scene_unless_another_is_given(kind: str) -> None:
-    scene, red = scene_of_kind(kind), torch.tensor([1.0, 0.0, 0.0])
+    scene = scene_of_kind(kind)
+    red = torch.tensor([1.0, 0.0, 0.0])
     given_later = scene.render(onlooker(), 0.5, background=red).rgb
     assert torch.equal(replace(scene, background=red).render(onlooker(), 0.5).rgb, given_later)
     assert not torch.equal(given_later.detach(), image(scene, 0.5))
@@ -218,7 +242,8 @@ def test_a_changed_scene_is_drawn_as_it_is_now(kind: str) -> None:
     assert_alike(scene.at(0.37), restored(kind, scene.state()).at(0.37), atol=0.0)
 
 
-# --- devices ----------------------------------------------------------------------------------------------------------
+# --- devices
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_on_its_own_device_it_stays_as_it_is(kind: str) -> None:
@@ -236,14 +261,23 @@ def test_all_that_is_computed_with_moves_to_a_device(kind: str) -> None:
     moved = scene_of_kind(kind).to("meta")
     on_cpu = {name for name, x in moved.state().items() if x.tensor.device.type == "cpu"}
     assert on_cpu <= {
-        *("model.times", "model.clip.times", "model.parents", "model.field.numbers", "model.colour.sees"),
+        *(
+            "model.times",
+            "model.clip.times",
+            "model.parents",
+            "model.field.numbers",
+            "model.colour.sees",
+        ),
         *("model.masks.times", "model.masks.count"),
     }
-    assert all(x.tensor.device.type == "meta" for name, x in moved.state().items() if name not in on_cpu)
+    assert all(
+        x.tensor.device.type == "meta" for name, x in moved.state().items() if name not in on_cpu
+    )
     assert moved.rows.device.type == "meta"
 
 
-# --- training ---------------------------------------------------------------------------------------------------------
+# --- training
+# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("model", ["static", *FIELDS])
@@ -266,7 +300,10 @@ def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
     behind = trainer.model.scene.background
     for time in (0.0, 0.37):
         with torch.no_grad():
-            drawn = [scene.render(view.cameras, time, background=behind).rgb for scene in (loaded, trainer.model.scene)]
+            drawn = [
+                scene.render(view.cameras, time, background=behind).rgb
+                for scene in (loaded, trainer.model.scene)
+            ]
         assert torch.equal(*drawn)
         in_training = trainer.model.training.time_step(
             trainer.model.scene, replace(view, time=time), config.train.steps
@@ -281,8 +318,11 @@ def test_a_person_is_trained_as_it_is_played() -> None:
     for frame, time in enumerate(scene.times):
         view = Image("view", onlooker(), torch.zeros(28, 36, 3), None, None, time, frame)
         moment = training.time_step(scene, view, 10)
-        torch.testing.assert_close(moment.gaussians.means.detach(), scene.at(time).means, rtol=0, atol=1e-5)
-        # Axes of discs may be others, their images not; what is played has its poses as axis-angle vectors.
+        torch.testing.assert_close(
+            moment.gaussians.means.detach(), scene.at(time).means, rtol=0, atol=1e-5
+        )
+        # Axes of discs may be others, their images not; what is played has its poses as axis-angle
+        # vectors.
         drawn = scene.render(onlooker(), moment).rgb.detach()
         torch.testing.assert_close(drawn, image(scene, time), rtol=0, atol=1e-4)
         assert set(moment.penalties) >= {"offset", "pose"}

@@ -1,4 +1,5 @@
-"""Schedules: exactly the published numbers at 30,000 steps, and sensible ones at any other length."""
+"""Schedules: exactly the published numbers at 30,000 steps, and sensible ones at any other
+length."""
 
 from __future__ import annotations
 
@@ -45,9 +46,17 @@ def test_at_30000_steps_it_is_the_published_one() -> None:
     assert changes == list(range(600, 15_000, 100))
     assert schedule.resets == (3000, 6000, 9000, 12_000)
     assert schedule.prune_scale_after == 3000
-    assert densify_schedule(DefaultStrategy(), 30_000, white_background=True).resets == (500, 3000, 6000, 9000, 12_000)
+    assert densify_schedule(DefaultStrategy(), 30_000, white_background=True).resets == (
+        500,
+        3000,
+        6000,
+        9000,
+        12_000,
+    )
     mcmc = densify_schedule(McmcStrategy(), 30_000, white_background=True)
-    assert [step for step in range(30_001) if mcmc.densifies_at(step)] == list(range(600, 25_000, 100))
+    assert [step for step in range(30_001) if mcmc.densifies_at(step)] == list(
+        range(600, 25_000, 100)
+    )
     assert mcmc.resets == ()
     assert growth_per_change(30_000) == 0.05
     assert filter_steps(DefaultStrategy(), 30_000) == range(15_000, 29_901, 100)
@@ -68,7 +77,10 @@ def test_without_resets_nothing_is_lowered_or_too_large() -> None:
     schedule = densify_schedule(DefaultStrategy(reset_every=None), 5000, white_background=True)
     assert schedule.resets == ()
     assert schedule.prune_scale_after == 5000
-    assert densify_schedule(DefaultStrategy(reset_every=10**6), 5000, white_background=True).resets == ()
+    assert (
+        densify_schedule(DefaultStrategy(reset_every=10**6), 5000, white_background=True).resets
+        == ()
+    )
 
 
 def test_short_runs() -> None:
@@ -78,7 +90,9 @@ def test_short_runs() -> None:
     assert densify_schedule(DefaultStrategy(), 10, white_background=True).resets == ()
 
 
-@pytest.mark.parametrize(("steps", "every"), [(1, 1), (500, 25), (1000, 50), (2000, 100), (30_000, 100)])
+@pytest.mark.parametrize(
+    ("steps", "every"), [(1, 1), (500, 25), (1000, 50), (2000, 100), (30_000, 100)]
+)
 def test_short_runs_change_as_often(steps: int, every: int) -> None:
     for strategy in (DefaultStrategy(), McmcStrategy()):
         assert densify_schedule(strategy, steps, white_background=False).every == every
@@ -88,20 +102,34 @@ def test_short_runs_change_as_often(steps: int, every: int) -> None:
 
 def test_short_runs_densify_from_a_lower_gradient_on() -> None:
     strategy = DefaultStrategy()
-    assert grad_threshold(strategy, 30_000) == grad_threshold(strategy, 60_000) == strategy.grad_threshold
+    assert (
+        grad_threshold(strategy, 30_000)
+        == grad_threshold(strategy, 60_000)
+        == strategy.grad_threshold
+    )
     thresholds = [grad_threshold(strategy, steps) for steps in (500, 2000, 7000, 29_999)]
     assert thresholds == sorted(thresholds)
     assert thresholds[0] > 0.25 * strategy.grad_threshold
 
 
-def _config(steps: int, optim: OptimConfig | None = None, model: SceneModel | None = None) -> Config:
-    train, optim = TrainConfig(steps=steps), optim or OptimConfig()
-    return Config(data=DataConfig(root=Path("capture")), model=model or StaticModel(), optim=optim, train=train)
+def _config(
+    steps: int, optim: OptimConfig | None = None, model: SceneModel | None = None
+) -> Config:
+    train = TrainConfig(steps=steps)
+    optim = optim or OptimConfig()
+    return Config(
+        data=DataConfig(root=Path("capture")),
+        model=model or StaticModel(),
+        optim=optim,
+        train=train,
+    )
 
 
 def test_rates_of_a_static_scene_fit_the_length() -> None:
     """Those published at their length and beyond, higher ones in a shorter run, positions most."""
-    factors = [rate_factors(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)]
+    factors = [
+        rate_factors(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)
+    ]
     assert factors == sorted(factors, reverse=True)
     assert factors[0] == factors[1] == pytest.approx((60 ** (1 / 2), 60 ** (1 / 3)))
     assert factors[-2:] == [(1, 1), (1, 1)]
@@ -119,7 +147,11 @@ def test_given_rates_are_multiplied_too() -> None:
     given = OptimConfig(lr_means=1.0, lr_quats=0.5, rate_factor=3)
     assert learning_rates(_config(30_000)) == OptimConfig(rate_factor=1)
     short = learning_rates(_config(700, given))
-    assert (short.lr_means, short.lr_quats, short.lr_opacities) == (3, 1.5, 3 * OptimConfig().lr_opacities)
+    assert (short.lr_means, short.lr_quats, short.lr_opacities) == (
+        3,
+        1.5,
+        3 * OptimConfig().lr_opacities,
+    )
     as_published = given.model_copy(update={"rate_factor": 1.0})
     assert learning_rates(_config(700, as_published)) == as_published
 
@@ -134,7 +166,9 @@ def test_means_rate_is_log_linear_times_the_extent() -> None:
 @pytest.mark.parametrize(("steps", "every"), [(30_000, 1000), (7000, 233), (2000, 67), (10, 1)])
 def test_sh_degree_rises_at_the_scaled_steps(steps: int, every: int) -> None:
     options = TrainConfig(steps=steps)
-    degrees = [active_sh_degree(options, step, 3) for step in (1, every, 2 * every, 3 * every, 9 * every)]
+    degrees = [
+        active_sh_degree(options, step, 3) for step in (1, every, 2 * every, 3 * every, 9 * every)
+    ]
     assert degrees == ([0, 1, 2, 3, 3] if every > 1 else [1, 1, 2, 3, 3])
     assert active_sh_degree(options, steps, 0) == 0
 
@@ -159,22 +193,34 @@ def test_the_filter_is_refreshed_after_densification_only() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(1, 30_000), st.floats(0, 1), st.floats(0, 1))
-def test_phases_of_a_dynamic_model_come_in_order(steps: int, coarse: float, time_window_full_at: float) -> None:
-    """Coarse, fine, all times, splits; each within the run, and never is there none before motion begins."""
+def test_phases_of_a_dynamic_model_come_in_order(
+    steps: int, coarse: float, time_window_full_at: float
+) -> None:
+    """Coarse, fine, all times, splits; each within the run, and never is there none before motion
+    begins."""
     model = DynamicModel(motion_from=coarse, time_window_full_at=time_window_full_at)
     schedule = deform_schedule(model, Rates(steps))
     assert schedule.rates.steps == steps
     assert 1 <= schedule.fine <= schedule.full <= steps
     assert all(schedule.full < split <= steps for split in schedule.splits)
     assert list(schedule.splits) == sorted(set(schedule.splits))
-    assert deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), Rates(steps)).splits == ()
+    assert (
+        deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), Rates(steps)).splits
+        == ()
+    )
 
 
 def test_phases_of_runs_of_usual_lengths() -> None:
     """Splits come after a tenth, three tenths and a half of the steps that see all times."""
-    schedule = deform_schedule(DynamicModel(motion_from=0.13, time_window_full_at=0.4), Rates(20_000))
+    schedule = deform_schedule(
+        DynamicModel(motion_from=0.13, time_window_full_at=0.4), Rates(20_000)
+    )
     assert (schedule.fine, schedule.full, schedule.splits) == (2600, 8000, (9200, 11_600, 14_000))
-    assert deform_schedule(DynamicModel(time_window_full_at=0.69), Rates(1000)).splits == (721, 783, 845)
+    assert deform_schedule(DynamicModel(time_window_full_at=0.69), Rates(1000)).splits == (
+        721,
+        783,
+        845,
+    )
     assert deform_schedule(DynamicModel(), Rates(1)).fine == 1
 
 
@@ -186,11 +232,18 @@ def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("coarsest", "expected"), [(1, {1}), (2, {2, 1}), (8, {8, 4, 2, 1})], ids=["never", "one level", "three levels"]
+    ("coarsest", "expected"),
+    [(1, {1}), (2, {2, 1}), (8, {8, 4, 2, 1})],
+    ids=["never", "one level", "three levels"],
 )
 def test_images_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None:
     options = TrainConfig.model_validate(
-        {"steps": 1000, "initial_downscale": coarsest, "resolution_grows_from": 0.3, "resolution_full_at": 0.6}
+        {
+            "steps": 1000,
+            "initial_downscale": coarsest,
+            "resolution_grows_from": 0.3,
+            "resolution_full_at": 0.6,
+        }
     )
     divisors = [image_divisor(options, step) for step in range(1, 1001)]
     assert set(divisors) == expected
@@ -204,13 +257,16 @@ def test_images_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None
 def test_images_may_sharpen_at_once() -> None:
     """Also where the last halving is asked for before the first."""
     for to in (0.5, 0.2):
-        options = TrainConfig(steps=10, initial_downscale=4, resolution_grows_from=0.5, resolution_full_at=to)
+        options = TrainConfig(
+            steps=10, initial_downscale=4, resolution_grows_from=0.5, resolution_full_at=to
+        )
         assert [image_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6
 
 
 @given(st.integers(1, 1000), st.floats(0, 1))
 def test_rates_fall_once_over_training(steps: int, fraction: float) -> None:
-    rates, since = Rates(steps), int(fraction * (steps - 1))
+    rates = Rates(steps)
+    since = int(fraction * (steps - 1))
     progress = [rates.progress(step, since) for step in range(steps + 20)]
     assert progress == sorted(progress)
     assert progress[: since + 1] == [0] * (since + 1)
@@ -224,5 +280,7 @@ def test_a_stage_goes_back_and_falls_again() -> None:
     assert rates.progress(1001) == pytest.approx(0.3 + 0.7 / 200)
     assert rates.progress(1100) == pytest.approx(0.65)
     assert rates.progress(1200) == rates.progress(5000) == 1
-    assert rates.progress(1100, since=300) == pytest.approx(0.5), "rates that fall from step 300 on are half-way"
+    assert rates.progress(1100, since=300) == pytest.approx(0.5), (
+        "rates that fall from step 300 on are half-way"
+    )
     assert rates.progress(1001, since=600) == 0, "they do not rise above their first value"

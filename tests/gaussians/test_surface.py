@@ -30,21 +30,28 @@ BOX = LOW, HIGH
 def ball(opacity: float = 6.0) -> StaticScene:
     """Small discs of the surface, red where x > 0, else blue."""
     k = torch.arange(COUNT) + 0.5
-    height, angle = 1 - 2 * k / COUNT, k * math.pi * (1 + 5**0.5)
+    height = 1 - 2 * k / COUNT
+    angle = k * math.pi * (1 + 5**0.5)
     across = (1 - height.square()).sqrt()
     ways = torch.stack([across * angle.cos(), across * angle.sin(), height], 1)
     colours = torch.where(ways[:, :1] > 0, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
-    quats = torch.cat([1 + ways[:, 2:], -ways[:, 1:2], ways[:, :1], torch.zeros(COUNT, 1)], 1)  # z to the normal
+    # z to the normal
+    quats = torch.cat([1 + ways[:, 2:], -ways[:, 1:2], ways[:, :1], torch.zeros(COUNT, 1)], 1)
     scales = torch.tensor([0.03, 0.03, 0.002]).log().repeat(COUNT, 1)
     sh = ((colours - 0.5) / SH_C0)[:, None]
-    return StaticScene(gaussians=Gaussians(RADIUS * ways, quats, scales, torch.full((COUNT,), opacity), sh))
+    return StaticScene(
+        gaussians=Gaussians(RADIUS * ways, quats, scales, torch.full((COUNT,), opacity), sh)
+    )
 
 
 def cameras() -> list[Cameras]:
     """Those of the ball with four times as many pixels along a side."""
     larger = torch.tensor([4.0, 4.0, 1.0])[:, None]
     seen = [one.camera for one in views()]
-    return [Cameras(one.cam_from_world, one.intrinsics * larger, 4 * one.width, 4 * one.height) for one in seen]
+    return [
+        Cameras(one.cam_from_world, one.intrinsics * larger, 4 * one.width, 4 * one.height)
+        for one in seen
+    ]
 
 
 @cache
@@ -79,7 +86,8 @@ def test_the_surface_is_the_same_in_any_unit(factor: float) -> None:
     found = surface_of(scene, moved, (factor * LOW, factor * HIGH), cells=30)
     np.testing.assert_array_equal(found.faces, surface().faces)
     np.testing.assert_allclose(found.vertices / factor, surface().vertices, rtol=0, atol=1e-3)
-    box, own = opaque_box(scene.gaussians), opaque_box(whole.gaussians)
+    box = opaque_box(scene.gaussians)
+    own = opaque_box(whole.gaussians)
     torch.testing.assert_close(torch.stack(box) / factor, torch.stack(own))
 
 

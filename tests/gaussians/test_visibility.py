@@ -27,7 +27,8 @@ def test_packing_loses_nothing(count: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("time", "interval"), [(-1.0, 0), (0.0, 0), (0.1, 0), (0.25, 1), (0.49, 1), (0.5, 2), (0.9, 2), (1.0, 2), (7.0, 2)]
+    ("time", "interval"),
+    [(-1.0, 0), (0.0, 0), (0.1, 0), (0.25, 1), (0.49, 1), (0.5, 2), (0.9, 2), (1.0, 2), (7.0, 2)],
 )
 def test_a_time_lies_between_two_key_times(time: float, interval: int) -> None:
     assert some_masks()[0].interval(time) == interval
@@ -58,7 +59,8 @@ def test_through_a_checkpoint() -> None:
 
 
 def test_matched_finds_the_common_ones_in_both() -> None:
-    rows, active = torch.tensor([1, 4, 5, 8]), torch.tensor([0, 4, 6, 8])
+    rows = torch.tensor([1, 4, 5, 8])
+    active = torch.tensor([0, 4, 6, 8])
     asked, places = matched(rows, active, 9)
     assert torch.equal(rows[asked], torch.tensor([4, 8]))
     assert torch.equal(active[places], torch.tensor([4, 8]))

@@ -1,4 +1,5 @@
-"""The stereo network in training and at work: the same bytes, exact resuming, scenes for other commands, refusals."""
+"""The stereo network in training and at work: the same bytes, exact resuming, scenes for other
+commands, refusals."""
 
 from __future__ import annotations
 
@@ -48,15 +49,19 @@ def person_of(folder: Path) -> Path:
 
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_path: Path) -> None:
-    """Resumed between the two stages: of what is learned in the second alone there are no moments yet."""
+    """Resumed between the two stages: of what is learned in the second alone there are no moments
+    yet."""
     middle, last = checkpoint_paths(run)
     config = stereo_config(folder, tmp_path / "parts")
     resumed = train(config, resume_from=stopped(config, 2))
     assert checkpoint_paths(resumed)[-1].read_bytes() == last.read_bytes()
-    before, after = load_checkpoint(middle), load_checkpoint(last)
+    before = load_checkpoint(middle)
+    after = load_checkpoint(last)
     assert not any(name.startswith("optimizer.exp_avg.heads") for name in before.tensors)
     assert any(name.startswith("optimizer.exp_avg.heads") for name in after.tensors)
-    assert not torch.equal(before.tensors["model.network.heads.bias"], after.tensors["model.network.heads.bias"])
+    assert not torch.equal(
+        before.tensors["model.network.heads.bias"], after.tensors["model.network.heads.bias"]
+    )
 
 
 def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:
@@ -80,7 +85,8 @@ def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_prediction_is_a_run_of_a_static_scene(run: Path, folder: Path, tmp_path: Path) -> None:
-    """Which is drawn, measured and trained on like any other; the same views give the same bytes."""
+    """Which is drawn, measured and trained on like any other; the same views give the same
+    bytes."""
     person = person_of(folder)
     made = predict(run, person, tmp_path / "two", ("f000_c03.png", "f000_c05.png"))
     found = load_run(made.run_dir)
@@ -92,12 +98,15 @@ def test_a_prediction_is_a_run_of_a_static_scene(run: Path, folder: Path, tmp_pa
     assert torch.equal(load_run(again.run_dir).scene.gaussians.means, found.scene.gaussians.means)
     report = evaluate_run(made.run_dir, "train", threads=1)
     assert report.psnr > 5
-    longer = found.config.model_copy(update={"train": found.config.train.model_copy(update={"steps": 2})})
+    longer = found.config.model_copy(
+        update={"train": found.config.train.model_copy(update={"steps": 2})}
+    )
     assert load_run(train(longer, resume_from=made.run_dir)).step == 2
 
 
 def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) -> None:
-    """Between two views the surface of these two is drawn, as if there were no others; so it is after storing."""
+    """Between two views the surface of these two is drawn, as if there were no others; so it is
+    after storing."""
     person = person_of(folder)
     all_round = predict(run, person, tmp_path / "12", 12)
     assert len(all_round.views) == 12
@@ -106,38 +115,58 @@ def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) 
     assert found.sides is not None
     assert len(found.sides.toward) == 12
     side = 3
-    views = [v for x in read_capture(DataConfig(root=person)).splits.values() for v in x if v.name in all_round.views]
-    pair = neighbours("p", views, [[v.name for v in views].index(name) for name in all_round.views])[side]
+    views = [
+        v
+        for x in read_capture(DataConfig(root=person)).splits.values()
+        for v in x
+        if v.name in all_round.views
+    ]
+    pair = neighbours(
+        "p", views, [[v.name for v in views].index(name) for name in all_round.views]
+    )[side]
     names = (views[pair.left].name, views[pair.right].name)
     two = load_run(predict(run, person, tmp_path / "2", names).run_dir).scene
-    eye, middle = (2 * found.sides.toward[side] + found.sides.middle).numpy(), found.sides.middle.numpy()
+    eye = (2 * found.sides.toward[side] + found.sides.middle).numpy()
+    middle = found.sides.middle.numpy()
     between = cameras_at(look_at(eye, middle, UP)[None]).to(dtype=torch.float32)
     assert float(two.render(between).alpha.mean()) > 0.01
     torch.testing.assert_close(found.render(between).rgb, two.render(between).rgb)
 
 
-def changed(person: Path, out: Path, change: Callable[[list[dict[str, Any]]], list[dict[str, Any]]]) -> Path:
+def changed(
+    person: Path, out: Path, change: Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
+) -> Path:
     """A copy of the capture with other frames."""
     shutil.copytree(person, out)
     whole = json.loads((out / "transforms_train.json").read_text())
-    (out / "transforms_train.json").write_text(json.dumps(whole | {"frames": change(whole["frames"])}))
+    (out / "transforms_train.json").write_text(
+        json.dumps(whole | {"frames": change(whole["frames"])})
+    )
     return out
 
 
-def test_one_moment_of_several_is_what_its_run_is_trained_on(run: Path, folder: Path, tmp_path: Path) -> None:
+def test_one_moment_of_several_is_what_its_run_is_trained_on(
+    run: Path, folder: Path, tmp_path: Path
+) -> None:
     person = changed(
         person_of(folder),
         tmp_path / "moving",
-        lambda frames: [frame | {"frame": i % 2, "time": float(i % 2)} for i, frame in enumerate(frames)],
+        lambda frames: [
+            frame | {"frame": i % 2, "time": float(i % 2)} for i, frame in enumerate(frames)
+        ],
     )
     (person / "body_train.npz").unlink()
     data = DataConfig(root=person)
-    found: Predictor = predictor(stereo_config(folder, tmp_path), load_checkpoint(checkpoint_paths(run)[-1]), data)
+    found: Predictor = predictor(
+        stereo_config(folder, tmp_path), load_checkpoint(checkpoint_paths(run)[-1]), data
+    )
     later = [i for i, view in enumerate(found.views) if view.frame == 1][:2]
     assert found.run_config(later).data.frames == "1:2"
     made = predict(run, person, tmp_path / "out", tuple(found.views[i].name for i in later))
     assert load_run(made.run_dir).scene.is_static
-    assert evaluate_run(made.run_dir, "train", threads=1).num_views == 10, "two of twelve are held out for testing"
+    assert evaluate_run(made.run_dir, "train", threads=1).num_views == 10, (
+        "two of twelve are held out for testing"
+    )
 
 
 def without_depth(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -147,11 +176,16 @@ def without_depth(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda frames: frames[::3], "p: no view stands between two others that are at most 50 degrees apart"),
+        (
+            lambda frames: frames[::3],
+            "p: no view stands between two others that are at most 50 degrees apart",
+        ),
         (without_depth, "p: has no depth maps, from which depth is learned"),
     ],
 )
-def test_what_cannot_be_trained_on_is_refused(folder: Path, tmp_path: Path, change: Any, message: str) -> None:
+def test_what_cannot_be_trained_on_is_refused(
+    folder: Path, tmp_path: Path, change: Any, message: str
+) -> None:
     changed(person_of(folder), tmp_path / "set" / "p", change)
     with pytest.raises(DyngsError, match=message):
         learner(stereo_config(tmp_path / "set", tmp_path), torch.Generator())
@@ -165,17 +199,31 @@ def test_steps_on_the_images_are_refused(run: Path, folder: Path, tmp_path: Path
 
 
 def test_published_weights_predict_somebody_unknown(tmp_path: Path) -> None:
-    """In the box of the person on white, from the middle between two views; 26.3 dB when this was written."""
-    weights = Path(__file__).parents[2] / "packaging" / "weights" / "dyngs_people_weights" / "gps.safetensors"
+    """In the box of the person on white, from the middle between two views; 26.3 dB when this was
+    written."""
+    weights = (
+        Path(__file__).parents[2]
+        / "packaging"
+        / "weights"
+        / "dyngs_people_weights"
+        / "gps.safetensors"
+    )
     if not weights.is_file():
         pytest.skip("no published weights here: they come with the repository alone")
-    person = captures_in(DataConfig(root=write_people(tmp_path / "set", PeopleOptions(1, 192, seed=7))))[0].root
+    person = captures_in(
+        DataConfig(root=write_people(tmp_path / "set", PeopleOptions(1, 192, seed=7)))
+    )[0].root
     made = predict(weights, person, tmp_path / "two", ("f000_c03.png", "f000_c05.png"))
     views = read_capture(DataConfig(root=person)).splits["train"]
-    image = ImageLoader(tuple(view for view in views if "c04" in view.name), DataConfig(root=person))[0]
-    drawn, truth = load_run(made.run_dir).scene.render(image.cameras).rgb[0], image.composite(torch.ones(3))
+    image = ImageLoader(
+        tuple(view for view in views if "c04" in view.name), DataConfig(root=person)
+    )[0]
+    drawn = load_run(made.run_dir).scene.render(image.cameras).rgb[0]
+    truth = image.composite(torch.ones(3))
     assert image.alpha is not None
-    rows, columns = (slice(int(x.min()), int(x.max()) + 1) for x in image.alpha.nonzero(as_tuple=True))
+    rows, columns = (
+        slice(int(x.min()), int(x.max()) + 1) for x in image.alpha.nonzero(as_tuple=True)
+    )
     found = psnr(drawn[rows, columns].clamp(0, 1), truth[rows, columns])
     assert found > 24.5
 

@@ -13,8 +13,11 @@ from dyngs.errors import DyngsError
 from dyngs.gps.pairs import Pair, around, fault, lessons, neighbours, well_spread
 
 
-def view_at(degrees: float, height: float = 1.0, frame: int = 0, toward: tuple[float, ...] = (0, 1.0, 0)) -> View:
-    """3 m from the vertical through ``toward``, in the azimuth of ``degrees`` from +z to +x, OpenCV axes."""
+def view_at(
+    degrees: float, height: float = 1.0, frame: int = 0, toward: tuple[float, ...] = (0, 1.0, 0)
+) -> View:
+    """3 m from the vertical through ``toward``, in the azimuth of ``degrees`` from +z to +x, OpenCV
+    axes."""
     turn = np.radians(degrees)
     center = np.array([3 * np.sin(turn), height, 3 * np.cos(turn)])
     forward = np.array(toward) - center
@@ -36,7 +39,8 @@ def names(views: list[View], pairs: list[Pair]) -> list[tuple[str, str]]:
 
 
 def test_two_views_are_a_pair_in_any_order() -> None:
-    """The one that has the other on its right is left: seen from outside, azimuths grow to the right."""
+    """The one that has the other on its right is left: seen from outside, azimuths grow to the
+    right."""
     for chosen in ([1, 2], [2, 1]):
         assert names(RING, neighbours("ann", RING, chosen)) == [("f0_0", "f0_45")]
 
@@ -75,7 +79,9 @@ def test_what_does_not_suit_is_told(one: View, other: View, message: str) -> Non
 
 
 def test_one_view_is_not_enough() -> None:
-    with pytest.raises(DyngsError, match="ann: depth comes from two neighbouring views at least, not one"):
+    with pytest.raises(
+        DyngsError, match="ann: depth comes from two neighbouring views at least, not one"
+    ):
         neighbours("ann", RING, [0])
 
 
@@ -95,7 +101,9 @@ def test_views_are_chosen_around_the_ring() -> None:
     assert len(neighbours("ann", dense, well_spread(dense, 12))) == 12
     later = [replace(view, frame=1, name=f"later_{view.name}") for view in dense]
     assert {dense[i % 36].frame for i in well_spread([*dense[:5], *later], 9)} == {0}
-    assert all(i >= 5 for i in well_spread([*dense[:5], *later], 9)), "of the moment that most views show"
+    assert all(i >= 5 for i in well_spread([*dense[:5], *later], 9)), (
+        "of the moment that most views show"
+    )
 
 
 def test_lessons_have_views_in_between() -> None:

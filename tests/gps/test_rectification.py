@@ -1,4 +1,5 @@
-"""Rectified views against known answers: rows correspond, true depth gives back points, faults are told."""
+"""Rectified views against known answers: rows correspond, true depth gives back points, faults are
+told."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def test_rows_correspond(pair: RectifiedPair) -> None:
         assert (column - (columns - side * offsets))[solid].abs().max() < 2e-3
         expected = 0.5 + 0.4 * torch.sin(3 * points)
         inner = solid
-        assert (pair.rgb[own].permute(1, 2, 0) - expected)[inner].abs().max() < 0.03, "bilinear, at 96 px"
+        assert (pair.rgb[own].permute(1, 2, 0) - expected)[inner].abs().max() < 0.03, (
+            "bilinear, at 96 px"
+        )
 
 
 def test_windows_are_around_the_person(pair: RectifiedPair) -> None:
@@ -57,7 +60,9 @@ def test_windows_are_around_the_person(pair: RectifiedPair) -> None:
     for alpha in pair.alpha[:, 0]:
         rows, columns = ((alpha > 0.5).any(side).nonzero() for side in (1, 0))
         assert 58 <= rows.max() - rows.min() <= 66
-        assert min(rows.min(), height - 1 - rows.max(), columns.min(), width - 1 - columns.max()) >= 3
+        assert (
+            min(rows.min(), height - 1 - rows.max(), columns.min(), width - 1 - columns.max()) >= 3
+        )
 
 
 def test_depth_maps_become_true_offsets(pair: RectifiedPair) -> None:
@@ -67,7 +72,9 @@ def test_depth_maps_become_true_offsets(pair: RectifiedPair) -> None:
     assert known.sum() > 1000
     error = (pair.offsets - exact)[known]
     assert error.abs().median() < 0.02
-    assert error.abs().quantile(0.9) < 0.5, "at the outline, where depth is steep, that of the nearest pixel"
+    assert error.abs().quantile(0.9) < 0.5, (
+        "at the outline, where depth is steep, that of the nearest pixel"
+    )
     without = rectified(*(replace(ball(pose_at(x)), depth=None) for x in (0, 30)), 64)
     assert without.offsets is None
 
@@ -80,13 +87,20 @@ def test_large_images_are_shrunk_before() -> None:
 
 
 def test_views_that_cannot_show_the_same_are_refused() -> None:
-    left, right = ball(pose_at(0)), ball(pose_at(30), name="b")
+    left = ball(pose_at(0))
+    right = ball(pose_at(30), name="b")
     camera = right.cameras
     longer = camera.intrinsics * torch.tensor([[1.4], [1.4], [1.0]])
-    with pytest.raises(DyngsError, match="a and b: by their cameras the person begins or ends at other heights"):
+    with pytest.raises(
+        DyngsError, match="a and b: by their cameras the person begins or ends at other heights"
+    ):
         rectified(left, replace(right, cameras=replace(camera, intrinsics=longer)), 64)
     with pytest.raises(DyngsError, match="lies behind the cameras"):
-        rectified(replace(left, cameras=aside(left.cameras, 25)), replace(right, cameras=aside(camera, -25)), 64)
+        rectified(
+            replace(left, cameras=aside(left.cameras, 25)),
+            replace(right, cameras=aside(camera, -25)),
+            64,
+        )
     for alpha in (None, torch.zeros(SIZE, SIZE)):
         with pytest.raises(DyngsError, match="b: shows no silhouette"):
             rectified(left, replace(right, alpha=alpha), 64)
@@ -94,7 +108,13 @@ def test_views_that_cannot_show_the_same_are_refused() -> None:
 
 def test_points_beside_the_person_are_outside() -> None:
     image = ball(pose_at(40))
-    points = torch.stack([CENTER, CENTER + torch.tensor([0.0, 0.9 * RADIUS, 0.0]), CENTER + torch.tensor([0, 0.75, 0])])
+    points = torch.stack(
+        [
+            CENTER,
+            CENTER + torch.tensor([0.0, 0.9 * RADIUS, 0.0]),
+            CENTER + torch.tensor([0, 0.75, 0]),
+        ]
+    )
     assert is_inside(image, points).tolist() == [True, True, False]
     assert is_inside(image, torch.tensor([[0.0, 50.0, 0.0], [20.0, 1.0, 20.0]])).all(), (
         "not in the image: nothing is known"
@@ -103,8 +123,11 @@ def test_points_beside_the_person_are_outside() -> None:
 
 def aside(camera: Cameras, degrees: float) -> Cameras:
     """Turned about its vertical, while it shows the same."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    turn = torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]], dtype=torch.float32)
+    c = np.cos(np.radians(degrees))
+    s = np.sin(np.radians(degrees))
+    turn = torch.tensor(
+        [[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]], dtype=torch.float32
+    )
     return replace(camera, cam_from_world=(turn @ camera.cam_from_world[0])[None])
 
 
@@ -120,11 +143,16 @@ def test_a_crop_is_the_same_part_of_the_view() -> None:
     first, second = (
         (
             image.cameras.intrinsics[0]
-            @ (image.cameras.cam_from_world[0, :3, :3] @ CENTER + image.cameras.cam_from_world[0, :3, 3])
+            @ (
+                image.cameras.cam_from_world[0, :3, :3] @ CENTER
+                + image.cameras.cam_from_world[0, :3, 3]
+            )
         )
         for image in (whole, part)
     )
     moved = first[:2] / first[2] - second[:2] / second[2]
     row, column = (int(x) for x in moved.round().flip(0))
     height, width = part.alpha.shape
-    assert torch.equal(whole.rgb_premultiplied[row : row + height, column : column + width], part.rgb_premultiplied)
+    assert torch.equal(
+        whole.rgb_premultiplied[row : row + height, column : column + width], part.rgb_premultiplied
+    )

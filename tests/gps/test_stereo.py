@@ -6,7 +6,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.gps.stereo import NUM_OFFSETS, QUARTER, RANGE, Encoder, StereoNetwork, offsets_of, refined, sweep
+from dyngs.gps.stereo import (
+    NUM_OFFSETS,
+    QUARTER,
+    RANGE,
+    Encoder,
+    StereoNetwork,
+    offsets_of,
+    refined,
+    sweep,
+)
 from dyngs.models.convolution import begin_weights
 
 WIDTHS = (8, 16, 16)
@@ -14,7 +23,8 @@ SHIFT = torch.tensor(200.0)
 
 
 def plane(offset: int) -> tuple[Tensor, Tensor]:
-    """Colours and alpha (2, ..., 64, 128) of two views of a plane at ``offset`` pixels; between columns 16 and 112."""
+    """Colours and alpha (2, ..., 64, 128) of two views of a plane at ``offset`` pixels; between
+    columns 16 and 112."""
     noise = torch.rand(3, 32, 160, generator=torch.Generator().manual_seed(0))
     pattern = torch.nn.functional.interpolate(noise[None], scale_factor=2)[0]
     left = pattern[:, :, 96:224]
@@ -29,7 +39,10 @@ def test_offsets_are_even_and_cover_the_range() -> None:
     assert len(found) == NUM_OFFSETS
     assert all(x % 2 == 0 for x in found)
     assert found == sorted(set(found))
-    assert (found[0], found[-1]) == (pytest.approx(RANGE[0] * 200, abs=1), pytest.approx(RANGE[1] * 200, abs=1))
+    assert (found[0], found[-1]) == (
+        pytest.approx(RANGE[0] * 200, abs=1),
+        pytest.approx(RANGE[1] * 200, abs=1),
+    )
 
 
 @pytest.mark.parametrize("index", [4, 20, 40])
@@ -45,31 +58,43 @@ def test_colours_agree_at_the_true_offset_in_both_views(index: int) -> None:
 
 
 def test_what_the_other_view_shows_beside_the_person_is_known() -> None:
-    """At the left edge of the left view a nearer surface would be seen beside the person in the right one."""
+    """At the left edge of the left view a nearer surface would be seen beside the person in the
+    right one."""
     offsets = offsets_of(SHIFT)
     rgb, alpha = plane(0)
-    beside = sweep(rgb, alpha, offsets)[:, NUM_OFFSETS:, 8, 5]  # of columns 20 to 23 of 128, and two on either side
+    # of columns 20 to 23 of 128, and two on either side
+    beside = sweep(rgb, alpha, offsets)[:, NUM_OFFSETS:, 8, 5]
     for side, found in zip((1, -1), beside, strict=True):
         shown = [{16 <= column - side * x < 112 for column in range(18, 26)} for x in offsets]
-        assert {bool(y < 0.01) for y, known in zip(found, shown, strict=True) if known == {True}} == {True}
-        assert {bool(y > 0.99) for y, known in zip(found, shown, strict=True) if known == {False}} == {True}
+        assert {
+            bool(y < 0.01) for y, known in zip(found, shown, strict=True) if known == {True}
+        } == {True}
+        assert {
+            bool(y > 0.99) for y, known in zip(found, shown, strict=True) if known == {False}
+        } == {True}
 
 
 def test_the_untrained_network_finds_what_is_plain() -> None:
     torch.manual_seed(0)
-    encoder, stereo, offsets = Encoder(4, WIDTHS), StereoNetwork(WIDTHS), offsets_of(SHIFT)
+    encoder = Encoder(4, WIDTHS)
+    stereo = StereoNetwork(WIDTHS)
+    offsets = offsets_of(SHIFT)
     for x in (*stereo.change.parameters(), *stereo.weights.parameters()):
         torch.nn.init.zeros_(x)
     rgb, alpha = plane(offsets[25])
     with torch.no_grad():
-        found, _ = stereo(encoder(torch.rand(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha)
+        found, _ = stereo(
+            encoder(torch.rand(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha
+        )
     for x in found:
         assert (x[..., 48:80] - offsets[25]).abs().max() < 1
 
 
 def test_upsampled_values_are_means_of_those_inside() -> None:
-    """Of nine; one weight of the middle gives the value itself; untrained, what is next to a pixel counts most."""
-    coarse, everywhere = torch.arange(12.0).view(1, 1, 3, 4), torch.ones(1, 1, 3, 4)
+    """Of nine; one weight of the middle gives the value itself; untrained, what is next to a pixel
+    counts most."""
+    coarse = torch.arange(12.0).view(1, 1, 3, 4)
+    everywhere = torch.ones(1, 1, 3, 4)
     weights = torch.zeros(1, 9 * QUARTER**2, 3, 4)
     soft = refined(coarse, weights, everywhere)
     assert soft.shape == (1, 1, 12, 16)
@@ -77,7 +102,9 @@ def test_upsampled_values_are_means_of_those_inside() -> None:
     weights.view(1, 9, QUARTER, QUARTER, 3, 4)[:, 4] = 50.0
     fine = refined(coarse, weights, everywhere)
     torch.testing.assert_close(fine, coarse.repeat_interleave(4, 2).repeat_interleave(4, 3))
-    assert (refined(torch.full_like(coarse, 3.0), torch.randn(1, 144, 3, 4), everywhere) - 3).abs().max() < 1e-5
+    assert (
+        refined(torch.full_like(coarse, 3.0), torch.randn(1, 144, 3, 4), everywhere) - 3
+    ).abs().max() < 1e-5
     inside = (torch.arange(4) < 2).float().expand(1, 1, 3, 4)
     wild = torch.where(inside > 0, 3.0, 1e3)
     assert (refined(wild, torch.randn(1, 144, 3, 4), inside)[..., :8] - 3).abs().max() < 1e-4
@@ -85,10 +112,14 @@ def test_upsampled_values_are_means_of_those_inside() -> None:
 
 def test_every_weight_gets_a_gradient() -> None:
     torch.manual_seed(0)
-    encoder, stereo, offsets = Encoder(4, WIDTHS), StereoNetwork(WIDTHS), offsets_of(SHIFT)
+    encoder = Encoder(4, WIDTHS)
+    stereo = StereoNetwork(WIDTHS)
+    offsets = offsets_of(SHIFT)
     begin_weights(stereo, torch.Generator().manual_seed(0))
     rgb, alpha = plane(0)
-    found, features = stereo(encoder(torch.randn(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha)
+    found, features = stereo(
+        encoder(torch.randn(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha
+    )
     assert [x.shape for x in found] == [(2, 1, 64, 128)] * 2
     assert features.shape == (2, 16, 8, 16)
     (sum(x.square().mean() for x in found) + features.square().mean()).backward()

@@ -1,4 +1,5 @@
-"""Gaussians of pixels: where true depth puts them, how large they may be, and gradients through everything."""
+"""Gaussians of pixels: where true depth puts them, how large they may be, and gradients through
+everything."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
 
 
 def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -> None:
-    """A surface beside that of the ball; where the true one is hidden from the other view nothing is wrong with it."""
+    """A surface beside that of the ball; where the true one is hidden from the other view nothing
+    is wrong with it."""
     offsets = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
     raw = torch.zeros(2, 8, *offsets.shape[2:])
     right, wrong = (gaussians_of(pair, Surface([offsets + d], raw)).opacities for d in (0.0, 15.0))
@@ -47,7 +49,8 @@ def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -
 
 
 def test_scales_and_depth_are_limited(pair: RectifiedPair) -> None:
-    """Whatever the network says, no Gaussian is wider than the largest, and none lies behind a camera."""
+    """Whatever the network says, no Gaussian is wider than the largest, and none lies behind a
+    camera."""
     shape = pair.alpha.shape
     wild = Surface([torch.full(shape, -1e4)], torch.full((2, 8, *shape[2:]), 50.0))
     found = gaussians_of(pair, wild)
@@ -61,20 +64,31 @@ def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
     """Of the depth from its error, and of everything from what the Gaussians are."""
     network = GpsNetwork(MODEL, torch.Generator().manual_seed(0))
     torch.nn.init.normal_(network.heads.weight, generator=torch.Generator().manual_seed(1))
-    torch.nn.init.normal_(network.stereo.change.weight, std=0.1, generator=torch.Generator().manual_seed(2))
+    torch.nn.init.normal_(
+        network.stereo.change.weight, std=0.1, generator=torch.Generator().manual_seed(2)
+    )
     surface = network(pair, with_gaussians=False)
     assert surface.raw is None
     offset_loss(pair, surface.offsets, 0.9).backward()
-    given = {name for name, x in network.named_parameters() if x.grad is not None and float(x.grad.abs().sum()) > 0}
+    given = {
+        name
+        for name, x in network.named_parameters()
+        if x.grad is not None and float(x.grad.abs().sum()) > 0
+    }
     assert {name.partition(".")[0] for name in given} == {"encoder", "stereo"}
     network.zero_grad()
     found = gaussians_of(pair, network(pair))
     sum(x.square().mean() for x in found.tensors().values()).backward()
-    assert [name for name, x in network.named_parameters() if x.grad is None or not float(x.grad.abs().sum()) > 0] == []
+    assert [
+        name
+        for name, x in network.named_parameters()
+        if x.grad is None or not float(x.grad.abs().sum()) > 0
+    ] == []
 
 
 def test_the_error_of_offsets(pair: RectifiedPair) -> None:
-    """0 for the truth; of the last iteration as it is, of those before less; what is not known does not count."""
+    """0 for the truth; of the last iteration as it is, of those before less; what is not known does
+    not count."""
     assert pair.offsets is not None
     truth = pair.offsets.nan_to_num(0.0)
     assert offset_loss(pair, [truth], 0.9) == 0

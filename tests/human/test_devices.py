@@ -13,7 +13,13 @@ from synthetic_bodies import model, write_npz
 
 from dyngs.human.avatar.anchors import skinning_weights, texel_gaussians
 from dyngs.human.avatar.neighbours import nearest_neighbours
-from dyngs.human.avatar.posing import Skeleton, frame_pose, pose_blend_shapes, pose_gaussians, rest_offsets
+from dyngs.human.avatar.posing import (
+    Skeleton,
+    frame_pose,
+    pose_blend_shapes,
+    pose_gaussians,
+    rest_offsets,
+)
 from dyngs.human.motion.motion import motion_clip
 from dyngs.human.motion.placement import place_like, place_on_floor, rest_clip
 from dyngs.human.prediction.network import AtlasNetwork
@@ -23,18 +29,29 @@ from dyngs.human.template.body_reader import read_body
 
 def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:
     """With a default device without data, everything is computed where the inputs are."""
-    body, motion = read_body(write_npz(tmp_path / "x.npz", model("smplx"))), random_motion(3)
+    body = read_body(write_npz(tmp_path / "x.npz", model("smplx")))
+    motion = random_motion(3)
     generator = torch.Generator().manual_seed(0)
     with torch.device("meta"):
         gaussians, anchors = texel_gaussians(atlas_texels(body, 16), (0.0, 0.02), 1)
         clip = motion_clip(place_on_floor(motion, body))
-        clip = place_like(clip, rest_clip(clip, body.joints, body.parents), body.joints, body.parents)
-        pose, weights = frame_pose(clip.at(0.3), 0), skinning_weights(anchors, len(body.joints))
+        clip = place_like(
+            clip, rest_clip(clip, body.joints, body.parents), body.joints, body.parents
+        )
+        pose = frame_pose(clip.at(0.3), 0)
+        weights = skinning_weights(anchors, len(body.joints))
         offsets = rest_offsets(anchors, pose, pose_blend_shapes(body))
-        found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets)
+        found = pose_gaussians(
+            gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets
+        )
         near = nearest_neighbours(found.means)
         network = AtlasNetwork(2, 1, (8,), generator)
-    for tensor in (*found.tensors().values(), *anchors.tensors().values(), near, *network.parameters()):
+    for tensor in (
+        *found.tensors().values(),
+        *anchors.tensors().values(),
+        near,
+        *network.parameters(),
+    ):
         assert tensor.device.type == "cpu"
 
 

@@ -16,13 +16,22 @@ DISTANCE, RADIUS = 3.0, 0.3
 def sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles, anticlockwise from outside, of a fine sphere."""
     rings, steps = 40, 80
-    angles = np.linspace(0, np.pi, rings + 1)[:, None], np.linspace(0, 2 * np.pi, steps, endpoint=False)[None]
-    around, ring = np.ones_like(angles[1]), np.sin(angles[0])
-    x, y, z = ring * np.cos(angles[1]), np.cos(angles[0]) * around, ring * np.sin(angles[1])
+    angles = (
+        np.linspace(0, np.pi, rings + 1)[:, None],
+        np.linspace(0, 2 * np.pi, steps, endpoint=False)[None],
+    )
+    around = np.ones_like(angles[1])
+    ring = np.sin(angles[0])
+    x = ring * np.cos(angles[1])
+    y = np.cos(angles[0]) * around
+    z = ring * np.sin(angles[1])
     vertices = radius * np.stack([x, y, z], -1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(rings), np.arange(steps), indexing="ij")
-    a, b = i * steps + j, i * steps + (j + 1) % steps
-    faces = np.concatenate([np.stack([a, b, b + steps], -1), np.stack([a, b + steps, a + steps], -1)])
+    a = i * steps + j
+    b = i * steps + (j + 1) % steps
+    faces = np.concatenate(
+        [np.stack([a, b, b + steps], -1), np.stack([a, b + steps, a + steps], -1)]
+    )
     return vertices, faces.reshape(-1, 3)
 
 
@@ -33,18 +42,24 @@ def camera() -> Cameras:
 
 
 def true_depths(radius: float, sign: float) -> torch.Tensor:
-    """Where rays through pixel centres meet a sphere at the origin first (-1) or last (1), z in m."""
+    """Where rays through pixel centres meet a sphere at the origin first (-1) or last (1), z in
+    m."""
     y, x = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
     local = torch.stack([(x - 16) / 100, (y - 12) / 100, torch.ones_like(x)], -1).double()
-    a, b, c = local.square().sum(-1), -2 * DISTANCE * local[..., 2], DISTANCE**2 - radius**2
+    a = local.square().sum(-1)
+    b = -2 * DISTANCE * local[..., 2]
+    c = DISTANCE**2 - radius**2
     root = b.square() - 4 * a * c
-    return torch.where(root > 0, (-b + sign * root.clamp_min(0).sqrt()) / (2 * a), torch.inf).float()
+    return torch.where(
+        root > 0, (-b + sign * root.clamp_min(0).sqrt()) / (2 * a), torch.inf
+    ).float()
 
 
 @pytest.mark.parametrize("last", [False, True])
 def test_a_sphere_is_met_first_and_last(last: bool) -> None:
     vertices, faces = sphere(RADIUS)
-    found, expected = depths(vertices, faces, camera(), last=last), true_depths(RADIUS, 1.0 if last else -1.0)
+    found = depths(vertices, faces, camera(), last=last)
+    expected = true_depths(RADIUS, 1.0 if last else -1.0)
     both = found.isfinite() & expected.isfinite()
     assert int((found.isfinite() != expected.isfinite()).sum()) < 0.1 * int(both.sum())
     torch.testing.assert_close(found[both], expected[both], atol=0.02, rtol=0)
@@ -63,7 +78,9 @@ def test_nothing_is_seen_behind_the_camera() -> None:
 
 def test_boundaries_of_a_ball_are_balls() -> None:
     vertices, faces = sphere(RADIUS)
-    body = Body(torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy()))
+    body = Body(
+        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
+    )
     found = Boundaries(body).interval(camera())
     middle = found.begin[12, 16], found.body[12, 16], found.end[12, 16]
     expected = (DISTANCE - RADIUS - OUTWARDS, DISTANCE - RADIUS, DISTANCE - RADIUS + INWARDS)
@@ -72,13 +89,19 @@ def test_boundaries_of_a_ball_are_balls() -> None:
     assert bool(outside.any())
     expected_end = true_depths(RADIUS + OUTWARDS, 1.0)
     sure = outside & expected_end.isfinite() & true_depths(RADIUS, 1.0).isinf()
-    assert float((found.end - expected_end)[sure].abs().median()) < 5e-3, "what misses the body comes out again"
+    assert float((found.end - expected_end)[sure].abs().median()) < 5e-3, (
+        "what misses the body comes out again"
+    )
 
 
 def test_heights_above_a_ball_are_distances_to_it() -> None:
     vertices, faces = sphere(RADIUS)
-    body = Body(torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy()))
-    direction = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    body = Body(
+        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
+    )
+    direction = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
     heights = torch.linspace(-0.5 * RADIUS, RADIUS, 50)
     found = Boundaries(body).height((RADIUS + heights)[:, None] * direction)
     torch.testing.assert_close(found, heights, atol=0.02, rtol=0.02)
@@ -88,7 +111,9 @@ def test_heights_above_a_ball_are_distances_to_it() -> None:
 def test_a_thin_body_ends_behind_its_front() -> None:
     """Eroded by more than its radius it is inside out, and its back would come first."""
     vertices, faces = sphere(0.03)
-    body = Body(torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy()))
+    body = Body(
+        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
+    )
     found = Boundaries(body).interval(camera())
     assert float(found.end[12, 16]) > float(found.body[12, 16])
 

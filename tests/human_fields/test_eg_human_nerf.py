@@ -11,7 +11,13 @@ from tiny_field_people import NETWORKS, SIZES, field_config
 
 from dyngs.errors import DyngsError
 from dyngs.human_fields.boundaries import Boundaries
-from dyngs.human_fields.eg_human_nerf import LIMIT, EgHumanNerf, expected_surface, interpolated, opacities
+from dyngs.human_fields.eg_human_nerf import (
+    LIMIT,
+    EgHumanNerf,
+    expected_surface,
+    interpolated,
+    opacities,
+)
 from dyngs.human_fields.keys import EgHumanNerfModel
 from dyngs.human_fields.network import Known
 from dyngs.human_fields.people import Person, metric, sources_of, window
@@ -56,20 +62,27 @@ def test_a_surface_hides_what_is_behind_it_and_nothing_else_is_opaque() -> None:
     through = (1 - hit).cumprod(1)
     assert float(through[0, -1]) < 1e-3
     assert float(through[0, 16]) > 0.97, "2 cm before it"
-    assert float(hit[0, 20]) == pytest.approx(1 - 1 / (1 + 2.718281828) / (2.718281828 / (1 + 2.718281828)), abs=1e-2)
+    assert float(hit[0, 20]) == pytest.approx(
+        1 - 1 / (1 + 2.718281828) / (2.718281828 / (1 + 2.718281828)), abs=1e-2
+    )
     missed = opacities(at, torch.full_like(at, LIMIT), torch.tensor(400.0))
     assert float((1 - missed).prod()) > 0.99
 
 
 def test_an_untrained_network_shows_the_body(person: Person) -> None:
-    """Its samples lie around it, a window is the part of the whole but for the refinement, and weights are learned."""
+    """Its samples lie around it, a window is the part of the whole but for the refinement, and
+    weights are learned."""
     network = network_with()
     body, scale = person.body_in(person.views[0])
     camera = metric(person.images[1].cameras, scale)
     with torch.no_grad():
         whole = network.picture(known(network, person), camera)
-        part = network.picture(known(network, person), metric(window(person.images[1], 8, 10, 16).cameras, scale))
-    torch.testing.assert_close(part.transmittance, whole.transmittance[10:26, 8:24], atol=1e-4, rtol=1e-3)
+        part = network.picture(
+            known(network, person), metric(window(person.images[1], 8, 10, 16).cameras, scale)
+        )
+    torch.testing.assert_close(
+        part.transmittance, whole.transmittance[10:26, 8:24], atol=1e-4, rtol=1e-3
+    )
     seen = Boundaries(body).depth(camera)
     alpha = 1 - whole.transmittance
     assert float(alpha[seen.isfinite()].mean()) > 0.8
@@ -79,44 +92,68 @@ def test_an_untrained_network_shows_the_body(person: Person) -> None:
 
 
 def test_all_weights_are_learned_alike(person: Person) -> None:
-    network, image = network_with(), window(person.images[1], 12, 4, 16)
+    network = network_with()
+    image = window(person.images[1], 12, 4, 16)
     _, scale = person.body_in(person.views[0])
     grads = []
     for _ in range(2):
         picture = network.picture(
             known(network, person), metric(image.cameras, scale), torch.Generator().manual_seed(1)
         )
-        total = picture.colour.square().sum() + picture.transmittance.sum() + network.penalty(picture, image, scale)
+        total = (
+            picture.colour.square().sum()
+            + picture.transmittance.sum()
+            + network.penalty(picture, image, scale)
+        )
         grads.append(torch.autograd.grad(total, list(network.parameters())))
     assert all(torch.equal(a, b) for a, b in zip(*grads, strict=True))
     assert all(bool(x.isfinite().all()) for x in grads[0])
-    still = [name for (name, _), x in zip(network.named_parameters(), grads[0], strict=True) if not bool(x.any())]
-    assert set(still) <= {"attention.layers.1.bias", "blend.layers.2.bias"}, "a softmax does not see them"
+    still = [
+        name
+        for (name, _), x in zip(network.named_parameters(), grads[0], strict=True)
+        if not bool(x.any())
+    ]
+    assert set(still) <= {"attention.layers.1.bias", "blend.layers.2.bias"}, (
+        "a softmax does not see them"
+    )
 
 
 def test_distances_are_compared_with_depth_maps(person: Person) -> None:
-    """None is off where samples say the truth, of rays that meet somebody and of those that miss."""
-    network, image = network_with(srdf_weight=1.0), window(person.images[1], 12, 4, 16)
+    """None is off where samples say the truth, of rays that meet somebody and of those that
+    miss."""
+    network = network_with(srdf_weight=1.0)
+    image = window(person.images[1], 12, 4, 16)
     _, scale = person.body_in(person.views[0])
     picture = network.picture(known(network, person), metric(image.cameras, scale))
     off = float(network.penalty(picture, image, scale).detach())
     assert image.depth is not None
     assert image.alpha is not None
     local = torch.linalg.inv(image.cameras.intrinsics[0]) @ torch.stack(
-        [*reversed(torch.meshgrid(torch.arange(16) + 0.5, torch.arange(16) + 0.5, indexing="ij")), torch.ones(16, 16)]
+        [
+            *reversed(
+                torch.meshgrid(torch.arange(16) + 0.5, torch.arange(16) + 0.5, indexing="ij")
+            ),
+            torch.ones(16, 16),
+        ]
     ).flatten(1)
     lengths = local.norm(dim=0)
     true = []
     for samples in picture.samples:
         surface = (image.depth.flatten() / scale * lengths)[samples.rays][:, None]
         meets = image.alpha.flatten()[samples.rays][:, None] > 0.5
-        true.append(replace(samples, signed=torch.where(meets, surface - samples.at, LIMIT).clamp(-LIMIT, LIMIT)))
+        true.append(
+            replace(
+                samples, signed=torch.where(meets, surface - samples.at, LIMIT).clamp(-LIMIT, LIMIT)
+            )
+        )
     told = float(network.penalty(replace(picture, samples=true), image, scale))
     assert told < 1e-4 < off
     assert float(network_with(srdf_weight=0).penalty(picture, image, scale)) == 0
 
 
-@pytest.mark.parametrize("keys", [{"boundaries": False}, {"visibility": False}, {"srdf_weight": 0.0}])
+@pytest.mark.parametrize(
+    "keys", [{"boundaries": False}, {"visibility": False}, {"srdf_weight": 0.0}]
+)
 def test_parts_can_be_left_out(folder: Path, tmp_path: Path, keys: dict[str, object]) -> None:
     config = field_config("eg_human_nerf", folder, tmp_path / "run")
     model = config.model.model_copy(update=keys)
@@ -125,7 +162,9 @@ def test_parts_can_be_left_out(folder: Path, tmp_path: Path, keys: dict[str, obj
     assert trainer.bad_gradients == 0
 
 
-def test_depth_maps_are_needed_for_distances(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depth_maps_are_needed_for_distances(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from dyngs.human_fields import learner
 
     def without_depth(*given: object) -> Person:
@@ -135,5 +174,8 @@ def test_depth_maps_are_needed_for_distances(folder: Path, tmp_path: Path, monke
 
     first = learner.person_of
     monkeypatch.setattr(learner, "person_of", without_depth)
-    with pytest.raises(DyngsError, match=r"has no depth maps, from which eg_human_nerf learns .* model\.srdf_weight=0"):
+    with pytest.raises(
+        DyngsError,
+        match=r"has no depth maps, from which eg_human_nerf learns .* model\.srdf_weight=0",
+    ):
         network_trainer(field_config("eg_human_nerf", folder, tmp_path / "run"))

@@ -20,12 +20,15 @@ FOCAL, WIDTH, HEIGHT = 20.0, 32, 24
 
 
 def seen() -> Seen:
-    """Two cameras 4 m before and behind the origin; red is the column, green the row, px, times alpha 0.5."""
+    """Two cameras 4 m before and behind the origin; red is the column, green the row, px, times
+    alpha 0.5."""
     poses = torch.eye(4).repeat(2, 1, 1)
     poses[1, :3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
     poses[:, 2, 3] = 4.0
     k = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).repeat(2, 1, 1)
-    rows, columns = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    rows, columns = torch.meshgrid(
+        torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij"
+    )
     half = torch.full_like(rows, 0.5)
     rgba = torch.stack([0.5 * columns, 0.5 * rows, 0 * rows, half]).repeat(2, 1, 1, 1)
     return Seen(Sources(rgba, poses, k), rgba[:, :3, ::4, ::4], rgba[:, :2, ::2, ::2])
@@ -53,13 +56,17 @@ def test_mean_and_variance_are_weighted() -> None:
     torch.testing.assert_close(mean_and_variance(values, torch.full((3, 5), 1 / 3)), expected)
     one = torch.zeros(3, 5)
     one[1] = 1
-    torch.testing.assert_close(mean_and_variance(values, one), torch.cat([values[1], torch.zeros(5, 2)], -1))
+    torch.testing.assert_close(
+        mean_and_variance(values, one), torch.cat([values[1], torch.zeros(5, 2)], -1)
+    )
 
 
 def test_hidden_images_do_not_count_where_another_does() -> None:
     colours = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(0))
     logits = torch.tensor([[0.0] * 4, [1.0] * 4, [5.0] * 4])
-    hidden = torch.tensor([[False, True, True, False], [True, True, False, False], [True, True, True, False]])
+    hidden = torch.tensor(
+        [[False, True, True, False], [True, True, False, False], [True, True, True, False]]
+    )
     found = blended(logits, colours, hidden)
     torch.testing.assert_close(found[0], colours[0, 0])
     torch.testing.assert_close(found[2], colours[1, 2])
@@ -70,7 +77,11 @@ def test_hidden_images_do_not_count_where_another_does() -> None:
 
 def test_directions_are_compared() -> None:
     directions = torch.tensor([[0.0, 0.0, 1.0]])
-    found = between(directions, torch.zeros(1, 3), torch.tensor([[0.0, 0.0, -2.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]]))
+    found = between(
+        directions,
+        torch.zeros(1, 3),
+        torch.tensor([[0.0, 0.0, -2.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]]),
+    )
     torch.testing.assert_close(found[:, 0, 3], torch.tensor([1.0, 0.0, -1.0]))
     torch.testing.assert_close(found[1, 0, :3], torch.tensor([0.0, 1.0, 1.0]) / 2**0.5)
     assert bool((found[0, 0, :3] == 0).all())
@@ -83,7 +94,8 @@ def reference(network: Perceptron, x: Tensor) -> Tensor:
 
 
 def test_networks_begin_the_same_and_are_perceptrons() -> None:
-    one, other = Perceptron(5, 8, 3), Perceptron(5, 8, 3)
+    one = Perceptron(5, 8, 3)
+    other = Perceptron(5, 8, 3)
     for network in (one, other):
         begin(network, torch.Generator().manual_seed(4))
     x = torch.rand(2, 7, 5, generator=torch.Generator().manual_seed(0))

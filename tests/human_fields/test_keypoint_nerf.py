@@ -10,7 +10,14 @@ import torch
 
 from dyngs.human.template.joints import JOINT_PARENTS
 from dyngs.human_fields.features import Seen
-from dyngs.human_fields.keypoint_nerf import CODE, REACH, KeypointNerf, from_bones, hull, spatial_code
+from dyngs.human_fields.keypoint_nerf import (
+    CODE,
+    REACH,
+    KeypointNerf,
+    from_bones,
+    hull,
+    spatial_code,
+)
 from dyngs.human_fields.keys import KeypointNerfModel
 from dyngs.human_fields.network import Known
 from dyngs.human_fields.people import Body, Person, Sources, metric, sources_of, window
@@ -42,12 +49,19 @@ def test_the_code_is_that_of_the_paper(person: Person) -> None:
     assert found.shape == (3, 5, CODE)
     for view in range(3):
         pose = sources.cam_from_world[view].double()
-        depths = [(x.double() @ pose[:3, :3].T + pose[:3, 3])[:, 2] for x in (points, body.key_points)]
+        depths = [
+            (x.double() @ pose[:3, :3].T + pose[:3, 3])[:, 2] for x in (points, body.key_points)
+        ]
         for m in range(5):
             for j in range(22):
                 dz = float(depths[0][m] - depths[1][j])
-                near = math.exp(-float((points[m] - body.key_points[j]).double().square().sum()) / (2 * REACH**2))
-                waves = [f(math.pi * 2**octave * dz) for octave in range(3) for f in (math.sin, math.cos)]
+                near = math.exp(
+                    -float((points[m] - body.key_points[j]).double().square().sum())
+                    / (2 * REACH**2)
+                )
+                waves = [
+                    f(math.pi * 2**octave * dz) for octave in range(3) for f in (math.sin, math.cos)
+                ]
                 expected = torch.tensor([near * x for x in (dz, *waves)])
                 torch.testing.assert_close(found[view, m, j::22], expected, atol=2e-5, rtol=0)
 
@@ -62,7 +76,9 @@ def test_bones_are_segments(person: Person) -> None:
     torch.testing.assert_close(from_bones(points, body.key_points), expected, atol=2e-3, rtol=0)
 
 
-def test_the_cells_hold_the_body_and_nothing_far_away(network: KeypointNerf, person: Person) -> None:
+def test_the_cells_hold_the_body_and_nothing_far_away(
+    network: KeypointNerf, person: Person
+) -> None:
     """What two opposite images leave open is closed by the bones."""
     for views in ((0, 2, 4), (0, 4)):
         own = known(network, person, views)
@@ -106,7 +122,9 @@ def test_all_weights_are_learned(network: KeypointNerf, person: Person) -> None:
     camera = metric(window(person.images[1], 8, 10, 16).cameras, scale)
     grads = []
     for _ in range(2):
-        picture = network.picture(network.look(sources, body), camera, torch.Generator().manual_seed(1))
+        picture = network.picture(
+            network.look(sources, body), camera, torch.Generator().manual_seed(1)
+        )
         total = picture.colour.square().sum() + picture.transmittance.sum()
         grads.append(torch.autograd.grad(total, list(network.parameters())))
     assert all(torch.equal(a, b) for a, b in zip(*grads, strict=True))

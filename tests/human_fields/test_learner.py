@@ -1,4 +1,5 @@
-"""Networks that predict fields in training and at work: the same bytes, resuming, runs for other commands, refusals."""
+"""Networks that predict fields in training and at work: the same bytes, resuming, runs for other
+commands, refusals."""
 
 from __future__ import annotations
 
@@ -25,8 +26,12 @@ KINDS = sorted(NETWORKS)
 
 
 @pytest.fixture(scope="module", params=KINDS)
-def run(request: pytest.FixtureRequest, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(field_config(request.param, folder, tmp_path_factory.mktemp("run") / request.param))
+def run(
+    request: pytest.FixtureRequest, folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    return train(
+        field_config(request.param, folder, tmp_path_factory.mktemp("run") / request.param)
+    )
 
 
 def person_of(folder: Path) -> Path:
@@ -55,31 +60,46 @@ def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> N
     assert error() < 0.985 * before
 
 
-def test_a_prediction_is_a_run(run: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_prediction_is_a_run(
+    run: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Drawn and measured like any other; not trained, and no Gaussians."""
     made = predict(run, person_of(folder), tmp_path / "three", 3)
     found = load_run(made.run_dir)
     assert isinstance(found.renderable, PredictedField)
-    assert (found.config.model.kind, found.step, found.config.data.root) == ("predicted_field", 0, person_of(folder))
+    assert (found.config.model.kind, found.step, found.config.data.root) == (
+        "predicted_field",
+        0,
+        person_of(folder),
+    )
     assert (made.steps, made.num_gaussians, len(made.views)) == (0, 0, 3)
     again = predict(run, person_of(folder), tmp_path / "again", made.views)
     state = load_run(again.run_dir).renderable.state()
-    assert all(torch.equal(x.tensor, state[name].tensor) for name, x in found.renderable.state().items())
+    assert all(
+        torch.equal(x.tensor, state[name].tensor) for name, x in found.renderable.state().items()
+    )
     report = evaluate_run(made.run_dir, "test", threads=1)
     assert report.psnr > 5
     assert report.notes == (), "nothing is left to train"
-    assert "is not made of Gaussians" in error_line(capsys, "export", str(made.run_dir), "--format", "ply")
-    assert "a predicted field is not trained" in error_line(capsys, "train", "--resume", str(made.run_dir))
+    assert "is not made of Gaussians" in error_line(
+        capsys, "export", str(made.run_dir), "--format", "ply"
+    )
+    assert "a predicted field is not trained" in error_line(
+        capsys, "train", "--resume", str(made.run_dir)
+    )
     assert "is not trained" in error_line(
         capsys, "train", f"data.root={person_of(folder)}", "model.kind=predicted_field"
     )
 
 
 def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_path: Path) -> None:
-    person, out = person_of(folder), tmp_path / "out"
+    person = person_of(folder)
+    out = tmp_path / "out"
     with pytest.raises(DyngsError, match="p000001: a field is predicted from two views at least"):
         predict(run, person, out, 1)
-    with pytest.raises(DyngsError, match=f"--steps 3: {run.name} is not trained on the images of one person"):
+    with pytest.raises(
+        DyngsError, match=f"--steps 3: {run.name} is not trained on the images of one person"
+    ):
         predict(run, person, out, 2, steps=3)
     twice = Path(shutil.copytree(person, tmp_path / "twice"))
     listed = json.loads((twice / "transforms_train.json").read_text())
@@ -110,10 +130,12 @@ def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_p
 def test_a_body_is_fitted_where_none_is_given(
     run: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By what `dyngs train human` does, too; without one nothing is guessed, and nothing written."""
+    """By what `dyngs train human` does, too; without one nothing is guessed, and nothing
+    written."""
     asked: list[Path] = []
     monkeypatch.setattr(
-        "dyngs.human_fields.learner.with_fitted_body", lambda data, **_: (asked.append(data.root), data)[1]
+        "dyngs.human_fields.learner.with_fitted_body",
+        lambda data, **_: (asked.append(data.root), data)[1],
     )
     person = Path(shutil.copytree(person_of(folder), tmp_path / "bare"))
     (person / "body_train.npz").unlink()

@@ -34,7 +34,8 @@ def test_key_points_are_the_true_ones(person: Person, folder: Path) -> None:
         true = next(x for x in (found[name] for name in found) if x.ndim >= 2 and x.shape[-1] == 3)
     true = torch.from_numpy(true.reshape(-1, 3)[:KEY_POINTS]).float()
     torch.testing.assert_close(scale * body.key_points, true, atol=1e-4, rtol=0)
-    low, high = body.vertices.amin(0), body.vertices.amax(0)
+    low = body.vertices.amin(0)
+    high = body.vertices.amax(0)
     assert 1.2 < float((high - low).max()) < 2.4
     assert scale != 1
 
@@ -72,12 +73,18 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
         torch.testing.assert_close(sources.centers[i], image.cameras.centers[0] / scale)
 
 
-@pytest.mark.parametrize(("left", "top", "corner"), [(7, 9, (9, 7)), (-5, 90, (28, 0)), (35, -2, (0, 28))])
-def test_a_window_is_moved_into_the_image(person: Person, left: int, top: int, corner: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("left", "top", "corner"), [(7, 9, (9, 7)), (-5, 90, (28, 0)), (35, -2, (0, 28))]
+)
+def test_a_window_is_moved_into_the_image(
+    person: Person, left: int, top: int, corner: tuple[int, int]
+) -> None:
     image = person.images[0]
     found = window(image, left, top, 12)
     row, column = corner
-    assert torch.equal(found.rgb_premultiplied, image.rgb_premultiplied[row : row + 12, column : column + 12])
+    assert torch.equal(
+        found.rgb_premultiplied, image.rgb_premultiplied[row : row + 12, column : column + 12]
+    )
     assert found.depth is not None
     assert image.depth is not None
     assert torch.equal(found.depth, image.depth[row : row + 12, column : column + 12])
@@ -103,15 +110,19 @@ def test_views_are_spread_around_a_moment(person: Person) -> None:
 def test_captures_that_do_not_do_are_refused(folder: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(folder / "s0000" / "p000000", tmp_path / "ann"))
     (copy / "body_train.npz").unlink()
-    with pytest.raises(DyngsError, match="ann: has no body parameters, which say where the key points are"):
+    with pytest.raises(
+        DyngsError, match="ann: has no body parameters, which say where the key points are"
+    ):
         person_of(DataConfig(root=copy), default_template())
 
 
 def test_a_body_that_is_elsewhere_is_told(person: Person) -> None:
-    """Wrong focal lengths, a camera that looks past the person or away from it, and masks that show nobody."""
+    """Wrong focal lengths, a camera that looks past the person or away from it, and masks that show
+    nobody."""
     image, (body, scale) = person.images[0], person.body_in(person.views[0])
     require_shown("ann", image, body, scale)
-    camera, turn = image.cameras, torch.eye(4)
+    camera = image.cameras
+    turn = torch.eye(4)
     assert image.alpha is not None
 
     def told(message: str, **changes: object) -> None:
@@ -121,7 +132,8 @@ def test_a_body_that_is_elsewhere_is_told(person: Person) -> None:
     long = camera.intrinsics * torch.tensor([[1.6], [1.6], [1.0]])
     told("calibration or the body is wrong", cameras=replace(camera, intrinsics=long))
     for degrees, message in ((20, "px from where the body is"), (180, "lies behind the camera")):
-        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        c = np.cos(np.radians(degrees))
+        s = np.sin(np.radians(degrees))
         turn[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
         told(message, cameras=replace(camera, cam_from_world=turn @ camera.cam_from_world))
     told("shows no silhouette", alpha=torch.zeros_like(image.alpha))

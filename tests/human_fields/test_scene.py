@@ -13,7 +13,14 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.human_fields.keys import PredictedFieldModel
 from dyngs.human_fields.people import Person, sources_of
-from dyngs.human_fields.scene import SECTIONS, PredictedField, around_in, network_of, refusal, stored_field
+from dyngs.human_fields.scene import (
+    SECTIONS,
+    PredictedField,
+    around_in,
+    network_of,
+    refusal,
+    stored_field,
+)
 from dyngs.kinds import restored_model
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.renderable import DrawOptions
@@ -24,7 +31,9 @@ KINDS = sorted(NETWORKS)
 
 @pytest.fixture(params=KINDS)
 def scene(request: pytest.FixtureRequest, person: Person) -> PredictedField:
-    model = SECTIONS[request.param].model_validate({"kind": request.param} | SIZES | NETWORKS[request.param])
+    model = SECTIONS[request.param].model_validate(
+        {"kind": request.param} | SIZES | NETWORKS[request.param]
+    )
     body, scale = person.body_in(person.views[0])
     sources = sources_of([person.images[i] for i in (0, 2, 4)], scale)
     network = network_of(model, torch.Generator().manual_seed(0))
@@ -33,13 +42,16 @@ def scene(request: pytest.FixtureRequest, person: Person) -> PredictedField:
 
 def checkpoint_of(scene: PredictedField, **changes: torch.Tensor) -> Checkpoint:
     tensors = tensors_of(scene.state()) | {f"field.{name}": x for name, x in changes.items()}
-    return Checkpoint(CheckpointInfo(0, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors, Path("it"))
+    return Checkpoint(
+        CheckpointInfo(0, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors, Path("it")
+    )
 
 
 def test_it_is_stored_and_drawn_the_same(scene: PredictedField, person: Person) -> None:
     model = PredictedFieldModel.model_validate({"network": scene.model.kind})
     found = restored_model(checkpoint_of(scene), model)
-    camera, options = person.images[1].cameras, DrawOptions(depth="expected")
+    camera = person.images[1].cameras
+    options = DrawOptions(depth="expected")
     one, other = (x.render(camera, 0.3, options=options) for x in (scene, found))
     assert torch.equal(one.rgb, other.rgb)
     assert torch.equal(one.transmittance, other.transmittance)
@@ -77,7 +89,8 @@ def test_only_the_part_with_the_person_is_drawn(scene: PredictedField, person: P
 
 
 @pytest.mark.parametrize(
-    "name", ["numbers", "body.vertices", "body.faces", "sources.rgba", "network.encoder.fine.weight"]
+    "name",
+    ["numbers", "body.vertices", "body.faces", "sources.rgba", "network.encoder.fine.weight"],
 )
 def test_what_does_not_fit_is_refused(scene: PredictedField, name: str) -> None:
     whole = checkpoint_of(scene)

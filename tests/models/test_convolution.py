@@ -28,7 +28,10 @@ def test_upsampled_features_keep_their_place() -> None:
 
 
 def test_weights_follow_from_the_generator() -> None:
-    networks = [nn.Sequential(nn.Conv2d(3, 8, 3), nn.GroupNorm(8, 8), nn.Conv2d(8, 4, 1, bias=False)) for _ in range(2)]
+    networks = [
+        nn.Sequential(nn.Conv2d(3, 8, 3), nn.GroupNorm(8, 8), nn.Conv2d(8, 4, 1, bias=False))
+        for _ in range(2)
+    ]
     for network in networks:
         begin_weights(network, torch.Generator().manual_seed(3))
     first, second = (network.state_dict() for network in networks)

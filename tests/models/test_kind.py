@@ -1,4 +1,5 @@
-"""A kind that is not made of Gaussians goes all the way: trained, resumed, evaluated, drawn, viewed; not exported."""
+"""A kind that is not made of Gaussians goes all the way: trained, resumed, evaluated, drawn,
+viewed; not exported."""
 
 from __future__ import annotations
 
@@ -33,7 +34,9 @@ def toy() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=24, num_train=6, num_test=2, samples=1, distance=4.0))
+    write_still_capture(
+        folder, StillOptions(size=24, num_train=6, num_test=2, samples=1, distance=4.0)
+    )
     return folder
 
 
@@ -47,7 +50,9 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return dyngs.train(load_config(None, options(capture, tmp_path_factory.mktemp("runs") / "toy")))
 
 
-def test_it_learns_and_resumes_with_the_same_bytes(run: Path, capture: Path, tmp_path: Path) -> None:
+def test_it_learns_and_resumes_with_the_same_bytes(
+    run: Path, capture: Path, tmp_path: Path
+) -> None:
     middle, last = checkpoint_paths(run)
     again = dyngs.train(load_config(None, options(capture, tmp_path / "again")))
     checkpoint_paths(again)[-1].unlink()
@@ -64,8 +69,11 @@ def test_it_is_evaluated(run: Path) -> None:
 
 
 def test_it_is_drawn_to_images_and_a_video(run: Path, tmp_path: Path) -> None:
-    opened, output = open_run(run), OutputOptions(depth=True, video=tmp_path / "orbit.mp4")
-    written = write_path_images(opened, choose_path(opened, PathOptions(num_frames=3)), tmp_path, output)
+    opened = open_run(run)
+    output = OutputOptions(depth=True, video=tmp_path / "orbit.mp4")
+    written = write_path_images(
+        opened, choose_path(opened, PathOptions(num_frames=3)), tmp_path, output
+    )
     assert len(written) == 3 * 3 + 1
     assert (tmp_path / "orbit.mp4").stat().st_size > 0
     assert len(write_split_images(opened, "test", tmp_path / "views")) > 0
@@ -104,13 +112,16 @@ def test_what_needs_gaussians_refuses_it_in_a_line(
     said = capsys.readouterr().err.strip()
     assert "Gaussians" in said
     assert len(said.splitlines()) == 1
-    assert not [path for path in tmp_path.rglob("*") if path.is_file() and "lock" not in path.name], (
-        "nothing is half written"
-    )
+    assert not [
+        path for path in tmp_path.rglob("*") if path.is_file() and "lock" not in path.name
+    ], "nothing is half written"
 
 
 def test_it_keeps_to_a_time(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capture: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("dyngs.budget.time.FEWEST_STEPS", 5)  # whatever else the machine does
     run = tmp_path / "run"
@@ -122,7 +133,9 @@ def test_it_keeps_to_a_time(
     assert "train.minutes: asked 0.04" in capsys.readouterr().out
 
 
-def test_budgets_of_gaussians_are_refused(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_budgets_of_gaussians_are_refused(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for key in ("budget.max_gaussians=100", "budget.max_mb=1"):
         assert main(["train", *options(capture, tmp_path / "run"), key]) == 2
         assert key.partition("=")[0] in capsys.readouterr().err

@@ -37,7 +37,10 @@ TRAINED = {
         ],
     ),
     "human": ("person", ["model.resolution=16", "model.fit=false", "model.sh_degree=0"]),
-    "ngp": ("still", ["model.levels=4", "model.log2_rows=10", "model.log2_samples=10", "model.cells=16"]),
+    "ngp": (
+        "still",
+        ["model.levels=4", "model.log2_rows=10", "model.log2_samples=10", "model.cells=16"],
+    ),
     "nerf": ("still", ["model.width=16", "model.coarse=8", "model.fine=8", "model.rays=32"]),
     "bg_triangle": (
         "still",
@@ -47,7 +50,8 @@ TRAINED = {
 }
 """Fixture with a capture for each kind that is trained on one, and other keys of a small run."""
 NETWORKS = {"human_predictor", "gps", "keypoint_nerf", "eg_human_nerf"}
-"""Kinds that predict scenes: tests of training.prediction, gps.learner and human_fields.learner resume them."""
+"""Kinds that predict scenes: tests of training.prediction, gps.learner and human_fields.learner
+resume them."""
 PREDICTED = {"predicted_field"}
 """Kinds that are not trained: tests/human_fields/test_scene.py."""
 
@@ -63,7 +67,12 @@ def config(request: pytest.FixtureRequest) -> Config:
     """Of a small run of a kind."""
     capture, keys = TRAINED[request.param]
     root = request.getfixturevalue(capture)
-    common = [f"data.root={root}", f"model.kind={request.param}", "train.steps=6", "strategy.kind=fixed"]
+    common = [
+        f"data.root={root}",
+        f"model.kind={request.param}",
+        "train.steps=6",
+        "strategy.kind=fixed",
+    ]
     return load_config(None, [*common, *keys])
 
 
@@ -98,7 +107,8 @@ def test_every_kind_is_here() -> None:
 def test_it_is_trained_stored_and_restored(config: Config) -> None:
     """What a checkpoint holds is taken over as it is, and training goes on with the same bytes."""
     trainer = trained(config)
-    first, again = trainer.checkpoint(), build(config, restored=True)
+    first = trainer.checkpoint()
+    again = build(config, restored=True)
     assert isinstance(again, Trainer)
     again.restore(first)
     assert same(first, again.checkpoint())
@@ -112,7 +122,8 @@ def test_it_is_trained_stored_and_restored(config: Config) -> None:
 
 
 def test_its_scene_is_restored_and_drawn(config: Config, trainer: Trainer) -> None:
-    scene, own = restored_model(trainer.checkpoint(), config.model), trainer.model.scene
+    scene = restored_model(trainer.checkpoint(), config.model)
+    own = trainer.model.scene
     assert isinstance(scene, Renderable)
     assert scene.state().keys() == own.state().keys()
     assert all(torch.equal(x.tensor, scene.state()[name].tensor) for name, x in own.state().items())
@@ -128,7 +139,9 @@ def test_its_scene_is_restored_and_drawn(config: Config, trainer: Trainer) -> No
         assert drawn.depth is None
         assert torch.equal(drawn.rgb, expected.rgb)
         assert torch.equal(scene.render(view, scene.time_step(time)).rgb, drawn.rgb)
-    assert not torch.equal(scene.on_background(torch.tensor([0.2, 0.9, 0.5])).render(view).rgb, scene.render(view).rgb)
+    assert not torch.equal(
+        scene.on_background(torch.tensor([0.2, 0.9, 0.5])).render(view).rgb, scene.render(view).rgb
+    )
     with pytest.raises(DyngsError, match="not a number"):
         scene.time_step(float("nan"))
 
@@ -147,7 +160,9 @@ def test_its_scene_says_when_and_where_it_is(trainer: Trainer) -> None:
     with torch.no_grad():
         assert torch.equal(moved.render(view, 0.5).rgb, scene.render(view, 0.5).rgb)
         seen = scene.render(view, 0.0).rgb
-        assert scene.is_static == all(torch.equal(seen, scene.render(view, time).rgb) for time in (0.5, 1.0))
+        assert scene.is_static == all(
+            torch.equal(seen, scene.render(view, time).rgb) for time in (0.5, 1.0)
+        )
 
 
 def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer: Trainer) -> None:
@@ -160,18 +175,25 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer:
         require_gaussians(scene, "it")
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.section.model_fields["kind"].default in NETWORKS])
+@pytest.mark.parametrize(
+    "kind", [kind for kind in KINDS if kind.section.model_fields["kind"].default in NETWORKS]
+)
 def test_a_network_is_no_scene_but_predicts_one(kind: Kind) -> None:
     with pytest.raises(DyngsError, match="a network, not a scene"):
-        restored_model(Checkpoint(CheckpointInfo(1, 1.0, (0.0, 0.0, 0.0), "white", "classic"), {}), kind.section())
+        restored_model(
+            Checkpoint(CheckpointInfo(1, 1.0, (0.0, 0.0, 0.0), "white", "classic"), {}),
+            kind.section(),
+        )
 
 
 def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
     root = people(tmp_path, (1,)) / "p1"
-    network, mean = new_network(NET, torch.Generator().manual_seed(0)), torch.full((3, 32, 32), 0.5)
+    network = new_network(NET, torch.Generator().manual_seed(0))
+    mean = torch.full((3, 32, 32), 0.5)
     config = Config.model_validate({"data": {"root": root}, "model": NET})
     predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root), config.data)
-    one, three = predictor.predict([0]), predictor.predict([0, 3, 6])
+    one = predictor.predict([0])
+    three = predictor.predict([0, 3, 6])
     for scene in (one, three):
         assert isinstance(scene, Renderable)
         assert scene.render(camera(8, 6)).rgb.shape == (1, 6, 8, 3)

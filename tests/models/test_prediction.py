@@ -12,14 +12,22 @@ from torch import nn
 from dyngs.data.capture import View
 from dyngs.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
-from dyngs.models.prediction import load_optimizer, load_weights, named_views, optimizer_state, updated
+from dyngs.models.prediction import (
+    load_optimizer,
+    load_weights,
+    named_views,
+    optimizer_state,
+    updated,
+)
 
 
 def test_views_by_name() -> None:
     """In the order given; of the view, or of its file."""
     views = [View(f"a/{i}", Path(f"a/{i}.png"), np.eye(4), np.eye(3), 8, 8) for i in range(6)]
     assert named_views("ann", views, ["5.png", "a/2"]) == [5, 2]
-    with pytest.raises(DyngsError, match="ann: no training view is named 'nobody'; the first is 'a/0'"):
+    with pytest.raises(
+        DyngsError, match="ann: no training view is named 'nobody'; the first is 'a/0'"
+    ):
         named_views("ann", views, ["nobody"])
     with pytest.raises(DyngsError, match="named twice"):
         named_views("ann", views, ["5.png", "a/5"])
@@ -47,10 +55,14 @@ def test_what_has_had_no_gradient_has_no_moments() -> None:
     assert updated(optimizers[0], networks[0], networks[0][0](data).sum(), 1e-3)
     networks[1].load_state_dict(networks[0].state_dict())
     state = optimizer_state(optimizers[0], networks[0])
-    assert sorted(state) == [f"{key}.0.{x}" for key in ("exp_avg", "exp_avg_sq", "step") for x in ("bias", "weight")]
+    assert sorted(state) == [
+        f"{key}.0.{x}" for key in ("exp_avg", "exp_avg_sq", "step") for x in ("bias", "weight")
+    ]
     load_optimizer(optimizers[1], networks[1], state)
     for network, optimizer in zip(networks, optimizers, strict=True):
-        assert updated(optimizer, network, sum(layer(data).square().sum() for layer in network), 1e-3)
+        assert updated(
+            optimizer, network, sum(layer(data).square().sum() for layer in network), 1e-3
+        )
     assert all(torch.equal(a, b) for a, b in zip(*(n.parameters() for n in networks), strict=True))
     with pytest.raises(KeyError):
         load_optimizer(optimizers[1], networks[1], {"step.0.bias": torch.tensor(1.0)})

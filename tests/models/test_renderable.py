@@ -1,4 +1,5 @@
-"""Every kind of scene refuses the same cameras and backgrounds, with the same message, and composites alike."""
+"""Every kind of scene refuses the same cameras and backgrounds, with the same message, and
+composites alike."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ ALL = (*WITH_CAMERA_GRADIENTS, "levels", *WITHOUT_CAMERA_GRADIENTS)
 def scene_of(kind: str) -> Renderable:
     generator = torch.Generator().manual_seed(0)
     if kind == "ngp":
-        return FieldScene(NgpField.new(NgpModel(levels=3, log2_rows=8, finest=32, cells=8), SPACE, generator))
+        return FieldScene(
+            NgpField.new(NgpModel(levels=3, log2_rows=8, finest=32, cells=8), SPACE, generator)
+        )
     if kind == "nerf":
         return FieldScene(NerfField.new(NerfModel(width=8, coarse=4, fine=4), SPACE, generator))
     if kind == "triangles":
@@ -53,7 +56,9 @@ def scene_of(kind: str) -> Renderable:
         return StaticScene(gaussians=Gaussians.joined(parts), sides=Sides.joined(parts, eyes))
     if kind in NETWORKS:
         model = SECTIONS[kind].model_validate({"kind": kind} | SIZES | NETWORKS[kind])
-        images = Sources(torch.ones(3, 4, 16, 16), torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3))
+        images = Sources(
+            torch.ones(3, 4, 16, 16), torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3)
+        )
         body = Body(torch.zeros(4, 3), torch.zeros(3, 3), torch.zeros(1, 3, dtype=torch.long))
         return PredictedField(model, network_of(model, generator), images, body, 1.0)
     return scene_of_kind(kind)
@@ -66,22 +71,38 @@ def scene(request: pytest.FixtureRequest) -> Renderable:
 
 def two_cameras() -> Cameras:
     one = onlooker()
-    return Cameras(one.cam_from_world.repeat(2, 1, 1), one.intrinsics.repeat(2, 1, 1), one.width, one.height)
+    return Cameras(
+        one.cam_from_world.repeat(2, 1, 1), one.intrinsics.repeat(2, 1, 1), one.width, one.height
+    )
 
 
 @pytest.mark.parametrize(
     ("where", "value", "problem"),
     [
-        (("pose", 0, 3), float("nan"), r"cam_from_world holds 1 NaN or infinite value\(s\) in 1 of 2 rows"),
+        (
+            ("pose", 0, 3),
+            float("nan"),
+            r"cam_from_world holds 1 NaN or infinite value\(s\) in 1 of 2 rows",
+        ),
         (("pose", 1, 1), float("inf"), r"cam_from_world holds 1 NaN or infinite value"),
         (("pose", 0, 0), 2.0, "the matrix of camera 1 "),
         (("lens", 0, 0), float("inf"), r"intrinsics holds 1 NaN or infinite value"),
         (("lens", 1, 2), float("nan"), r"intrinsics holds 1 NaN or infinite value"),
-        (("lens", 0, 0), 0.0, "intrinsics: focal lengths must be positive, .*but camera 1 has 0 and 30"),
-        (("lens", 1, 1), -30.0, "intrinsics: focal lengths must be positive, .*but camera 1 has 30 and -30"),
+        (
+            ("lens", 0, 0),
+            0.0,
+            "intrinsics: focal lengths must be positive, .*but camera 1 has 0 and 30",
+        ),
+        (
+            ("lens", 1, 1),
+            -30.0,
+            "intrinsics: focal lengths must be positive, .*but camera 1 has 30 and -30",
+        ),
     ],
 )
-def test_cameras_that_cannot_exist(scene: Renderable, where: tuple[str, int, int], value: float, problem: str) -> None:
+def test_cameras_that_cannot_exist(
+    scene: Renderable, where: tuple[str, int, int], value: float, problem: str
+) -> None:
     cameras = two_cameras()
     which, row, column = where
     (cameras.cam_from_world if which == "pose" else cameras.intrinsics)[1, row, column] = value
@@ -107,7 +128,9 @@ def test_backgrounds_that_do_not_fit(scene: Renderable, background: Tensor, prob
 
 def test_no_cameras(scene: Renderable) -> None:
     cameras = two_cameras()
-    none = replace(cameras, cam_from_world=cameras.cam_from_world[:0], intrinsics=cameras.intrinsics[:0])
+    none = replace(
+        cameras, cam_from_world=cameras.cam_from_world[:0], intrinsics=cameras.intrinsics[:0]
+    )
     with pytest.raises(DyngsError, match="cameras: there is none to render from"):
         scene.render(none)
 
@@ -115,7 +138,8 @@ def test_no_cameras(scene: Renderable) -> None:
 @pytest.mark.parametrize("kind", [kind for kind in ALL if kind not in NETWORKS])
 def test_a_background_for_each_view(kind: str) -> None:
     """As each view alone before its own; cameras of double precision are drawn, too."""
-    scene, cameras = scene_of(kind), two_cameras()
+    scene = scene_of(kind)
+    cameras = two_cameras()
     colours = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.25]])
     with torch.no_grad():
         both = scene.render(cameras.to(dtype=torch.float64), background=colours)
@@ -137,8 +161,11 @@ def watched(cameras: Cameras, which: str) -> Cameras:
 @pytest.mark.parametrize("which", ["cam_from_world", "intrinsics"])
 @pytest.mark.parametrize("kind", WITHOUT_CAMERA_GRADIENTS)
 def test_gradients_by_cameras_are_refused_where_there_are_none(kind: str, which: str) -> None:
-    scene, cameras = scene_of(kind), watched(two_cameras(), which)
-    with pytest.raises(DyngsError, match="only scenes of Gaussians have gradients by poses and intrinsics"):
+    scene = scene_of(kind)
+    cameras = watched(two_cameras(), which)
+    with pytest.raises(
+        DyngsError, match="only scenes of Gaussians have gradients by poses and intrinsics"
+    ):
         scene.render(cameras)
     if kind not in NETWORKS:
         with torch.no_grad():

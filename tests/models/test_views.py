@@ -36,7 +36,8 @@ def image(rgb: torch.Tensor, alpha: torch.Tensor | None, mask: torch.Tensor | No
 
 
 def half_opaque(level: float, num_alike: int) -> Image:
-    """8 x 10 px, the lower half empty; of the 40 opaque ones ``num_alike`` have ``level``, the others are dark red."""
+    """8 x 10 px, the lower half empty; of the 40 opaque ones ``num_alike`` have ``level``, the
+    others are dark red."""
     rgb = torch.tensor([0.4, 0.0, 0.0]).repeat(8, 10, 1)
     rgb.view(-1, 3)[:num_alike] = level
     alpha = torch.ones(8, 10)
@@ -55,7 +56,8 @@ def test_the_share_of_pixels_that_look_like_the_background_is_counted() -> None:
 
 
 def test_what_is_masked_or_half_transparent_does_not_count() -> None:
-    white, shown = torch.ones(3), half_opaque(1.0, 20)
+    white = torch.ones(3)
+    shown = half_opaque(1.0, 20)
     mask = torch.ones(8, 10)
     mask[:2] = 0.0
     assert share_alike([image(shown.rgb_premultiplied, shown.alpha, mask)], white) == 0.0

@@ -12,23 +12,37 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.adam import AdamUpdate, adam_step_, adam_steps_, adam_steps_op, seen_rows, seen_rows_op
+from dyngs.ops.adam import (
+    AdamUpdate,
+    adam_step_,
+    adam_steps_,
+    adam_steps_op,
+    seen_rows,
+    seen_rows_op,
+)
 
-# Rows shorter and longer than a vector, tails, several blocks of 2048 floats, and one row longer than a block.
+# Rows shorter and longer than a vector, tails, several blocks of 2048 floats, and one row longer
+# than a block.
 SHAPES = [(1,), (700,), (5000,), (701, 3), (1, 4), (90, 15, 3), (130, 16, 3), (3, 2500)]
 
 
-def make_state(shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0) -> tuple[Tensor, ...]:
+def make_state(
+    shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0
+) -> tuple[Tensor, ...]:
     """A parameter, its gradient, and moments as they are in the middle of a training."""
     generator = torch.Generator().manual_seed(seed)
-    param, grad, exp_avg, exp_avg_sq = (torch.randn(shape, generator=generator, dtype=dtype) for _ in range(4))
+    param, grad, exp_avg, exp_avg_sq = (
+        torch.randn(shape, generator=generator, dtype=dtype) for _ in range(4)
+    )
     return param, grad, exp_avg, exp_avg_sq.abs()
 
 
 def assert_within(actual: Tensor, expected: Tensor, allowed: Tensor) -> None:
     """No element is further off than ``allowed``, which says for each how much rounding can do."""
     excess = (actual.double() - expected.double()).abs() - allowed
-    assert excess.numel() == 0 or excess.max() <= 0, f"{excess.max():.3g} more than rounding explains"
+    assert excess.numel() == 0 or excess.max() <= 0, (
+        f"{excess.max():.3g} more than rounding explains"
+    )
 
 
 def train(param: Tensor, lr: float | Tensor, steps: int, eps: float) -> Tensor:
@@ -37,7 +51,9 @@ def train(param: Tensor, lr: float | Tensor, steps: int, eps: float) -> Tensor:
     param = param.clone()
     moments = torch.zeros_like(param), torch.zeros_like(param)
     for step in range(1, steps + 1):
-        grad = 10.0 ** (-step % 7) * torch.randn(param.shape, generator=generator, dtype=param.dtype)
+        grad = 10.0 ** (-step % 7) * torch.randn(
+            param.shape, generator=generator, dtype=param.dtype
+        )
         assert adam_step_(param, grad, *moments, lr=lr, step=step, eps=eps) == 0
     return param
 
@@ -47,7 +63,9 @@ def train_with_torch(param: Tensor, lr: float, steps: int, eps: float) -> Tensor
     param = param.clone()
     optimizer = torch.optim.Adam([param], lr=lr, eps=eps, foreach=False)
     for step in range(1, steps + 1):
-        param.grad = 10.0 ** (-step % 7) * torch.randn(param.shape, generator=generator, dtype=param.dtype)
+        param.grad = 10.0 ** (-step % 7) * torch.randn(
+            param.shape, generator=generator, dtype=param.dtype
+        )
         optimizer.step()
     return param
 
@@ -58,8 +76,8 @@ def test_equals_torch_over_50_steps(shape: tuple[int, ...], dtype: torch.dtype) 
     param = make_state(shape, dtype)[0]
     expected = train_with_torch(param, 0.01, 50, 1e-15)
     moved = train(param, 0.01, 50, 1e-15)
-    # Each of 50 steps rounds the value in both, and a step of at most 0.01 (1 - beta1) / sqrt(1 - beta2) = 0.032 twelve
-    # times in each (see below).
+    # Each of 50 steps rounds the value in both, and a step of at most 0.01 (1 - beta1) / sqrt(1 -
+    # beta2) = 0.032 twelve times in each (see below).
     unit = torch.finfo(dtype).eps
     assert_within(moved, expected, 50 * unit * (param.double().abs() + 0.5 + 12 * 0.032))
 
@@ -83,24 +101,38 @@ def test_column_rates_equal_one_optimizer_per_column(shape: tuple[int, ...]) -> 
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=25, deadline=None)
-def test_only_the_rows_asked_for_change(shape: tuple[int, ...], fraction: float, step: int, seed: int) -> None:
+def test_only_the_rows_asked_for_change(
+    shape: tuple[int, ...], fraction: float, step: int, seed: int
+) -> None:
     param, grad, exp_avg, exp_avg_sq = make_state(shape, seed=seed)
     rows = torch.rand(shape[0], generator=torch.Generator().manual_seed(seed)) < fraction
     before = [param, exp_avg, exp_avg_sq]
     everywhere, chosen = ([x.clone() for x in before] for _ in range(2))
     adam_step_(everywhere[0], grad, *everywhere[1:], lr=0.1, step=step)
     assert adam_step_(chosen[0], grad, *chosen[1:], lr=0.1, step=step, rows=rows) == 0
-    # The same update, but vectors and tails may contract to fused multiply-adds differently: each of both results has
-    # its own roundings of half a unit. The first moment: 3 of |m| + |g|. The second, a sum of positives: 4 of itself.
-    # The step: those 3, half of those 4, and 7 of its own; the value: one of |p|, and one of the step.
+    # The same update, but vectors and tails may contract to fused multiply-adds differently: each
+    # of both results has its own roundings of half a unit. The first moment: 3 of |m| + |g|. The
+    # second, a sum of positives: 4 of itself. The step: those 3, half of those 4, and 7 of its own;
+    # the value: one of |p|, and one of the step.
     unit = torch.finfo(torch.float32).eps
     p, g, m, v = (x.double() for x in (param, grad, exp_avg, exp_avg_sq))
-    reach = 0.1 / (1 - 0.9**step) * (m.abs() + g.abs()) / ((0.999 * v + 0.001 * g * g) / (1 - 0.999**step)).sqrt()
-    allowed = [unit * (p.abs() + 13 * reach), unit * 3 * (m.abs() + g.abs()), unit * 4 * (v + g * g)]
+    reach = (
+        0.1
+        / (1 - 0.9**step)
+        * (m.abs() + g.abs())
+        / ((0.999 * v + 0.001 * g * g) / (1 - 0.999**step)).sqrt()
+    )
+    allowed = [
+        unit * (p.abs() + 13 * reach),
+        unit * 3 * (m.abs() + g.abs()),
+        unit * 4 * (v + g * g),
+    ]
     for old, full, partial, most in zip(before, everywhere, chosen, allowed, strict=True):
         assert torch.equal(partial[~rows], old[~rows])
         assert_within(partial[rows], full[rows], most[rows])
-    assert not rows.any() or not all(torch.equal(new[rows], old[rows]) for new, old in zip(chosen, before, strict=True))
+    assert not rows.any() or not all(
+        torch.equal(new[rows], old[rows]) for new, old in zip(chosen, before, strict=True)
+    )
 
 
 @pytest.mark.parametrize("shape", [(50,), (701, 3), (130, 16, 3)])
@@ -119,7 +151,12 @@ def test_rows_with_non_finite_gradient_are_left_out_and_counted(
         assert after.isfinite().all()
         assert torch.equal(after[[3, 7, 20]], before[[3, 7, 20]])
         assert not torch.equal(after[4], before[4])
-    assert adam_step_(*(x.clone() for x in (param, grad, exp_avg, exp_avg_sq)), lr=0.1, step=5, rows=rows) == 2
+    assert (
+        adam_step_(
+            *(x.clone() for x in (param, grad, exp_avg, exp_avg_sq)), lr=0.1, step=5, rows=rows
+        )
+        == 2
+    )
 
 
 @pytest.mark.parametrize("shape", [(50,), (701, 3), (130, 16, 3)])
@@ -132,7 +169,9 @@ def test_gradients_too_large_to_square_are_left_out_and_counted(
     param, grad, exp_avg, exp_avg_sq = make_state(shape)
     rows = torch.ones(shape[0], dtype=torch.bool) if choice else None
     largest = torch.tensor(2.0**63).nextafter(torch.tensor(0.0))
-    grad.view(shape[0], -1)[[3, 7, 20, 21], 0] = sign * torch.tensor([2.0**63, 2e19, 3e38, float(largest)])
+    grad.view(shape[0], -1)[[3, 7, 20, 21], 0] = sign * torch.tensor(
+        [2.0**63, 2e19, 3e38, float(largest)]
+    )
     state = [param.clone(), exp_avg.clone(), exp_avg_sq.clone()]
     assert adam_step_(state[0], grad, *state[1:], lr=0.1, step=5, rows=rows) == 3
     for before, after in zip((param, exp_avg, exp_avg_sq), state, strict=True):
@@ -140,7 +179,12 @@ def test_gradients_too_large_to_square_are_left_out_and_counted(
         assert torch.equal(after[[3, 7, 20]], before[[3, 7, 20]])
     moved = state[0].clone()
     for step in range(6, 12):  # the row that took in the largest gradient comes back
-        assert adam_step_(state[0], torch.full_like(grad, 2.0**62), *state[1:], lr=0.1, step=step, rows=rows) == 0
+        assert (
+            adam_step_(
+                state[0], torch.full_like(grad, 2.0**62), *state[1:], lr=0.1, step=step, rows=rows
+            )
+            == 0
+        )
     assert not torch.equal(state[0][21], moved[21])
     assert all(x.isfinite().all() for x in state)
 
@@ -175,7 +219,9 @@ def test_any_number_of_threads_gives_the_same_bytes() -> None:
 def test_zero_gradient_from_rest_does_not_move() -> None:
     # 0 / (0 + eps): an eps below float32's range would make this NaN.
     param = torch.ones(40, 3)
-    adam_step_(param, torch.zeros(40, 3), torch.zeros(40, 3), torch.zeros(40, 3), lr=0.1, step=1, eps=1e-15)
+    adam_step_(
+        param, torch.zeros(40, 3), torch.zeros(40, 3), torch.zeros(40, 3), lr=0.1, step=1, eps=1e-15
+    )
     assert torch.equal(param, torch.ones(40, 3))
 
 
@@ -190,7 +236,12 @@ def test_parameter_that_requires_grad_and_strided_gradient() -> None:
 
 def test_no_rows() -> None:
     empty = torch.zeros(0, 3)
-    assert adam_step_(empty, empty, empty, empty, lr=0.1, step=1, rows=torch.zeros(0, dtype=torch.bool)) == 0
+    assert (
+        adam_step_(
+            empty, empty, empty, empty, lr=0.1, step=1, rows=torch.zeros(0, dtype=torch.bool)
+        )
+        == 0
+    )
     assert seen_rows(empty).shape == (0,)
 
 
@@ -222,7 +273,8 @@ def test_arguments_that_do_not_fit() -> None:
     for lr in (math.nan, torch.tensor([0.1, math.inf, 0.1])):
         with pytest.raises(DyngsError, match="lr must be finite"):
             adam_step_(param, grad, exp_avg, exp_avg_sq, lr=lr, step=1)
-    for eps in (0.0, -1e-8, 1e-46, math.nan):  # 1e-46 is 0 in float32, and 0 / 0 at the first gradient of 0
+    for eps in (0.0, -1e-8, 1e-46, math.nan):
+        # 1e-46 is 0 in float32, and 0 / 0 at the first gradient of 0
         with pytest.raises(DyngsError, match="eps must"):
             adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1, eps=eps)
     for betas in ((1.0, 0.9), (0.9, -0.1), (math.nan, 0.9)):
@@ -233,18 +285,25 @@ def test_arguments_that_do_not_fit() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_several_at_once_are_as_each_alone(dtype: torch.dtype) -> None:
     rows = torch.arange(701) % 3 == 0
-    together, alone = ([make_state(shape, dtype, seed) for seed, shape in enumerate(SHAPES)] for _ in range(2))
+    together, alone = (
+        [make_state(shape, dtype, seed) for seed, shape in enumerate(SHAPES)] for _ in range(2)
+    )
     for state in (together, alone):
         state[3][1][6, 0] = math.nan
     found = adam_steps_(
-        [AdamUpdate(*x, 0.1, rows if len(x[0]) == 701 else None) for x in together], step=3, betas=(0.8, 0.99)
+        [AdamUpdate(*x, 0.1, rows if len(x[0]) == 701 else None) for x in together],
+        step=3,
+        betas=(0.8, 0.99),
     )
     skipped = [
-        adam_step_(*x, lr=0.1, step=3, betas=(0.8, 0.99), rows=rows if len(x[0]) == 701 else None) for x in alone
+        adam_step_(*x, lr=0.1, step=3, betas=(0.8, 0.99), rows=rows if len(x[0]) == 701 else None)
+        for x in alone
     ]
     assert found == sum(skipped) == 1
     for one, other in zip(together, alone, strict=True):
-        assert all(torch.equal(x, y) for x, y in zip(one, other, strict=True) if not x.isnan().any())
+        assert all(
+            torch.equal(x, y) for x, y in zip(one, other, strict=True) if not x.isnan().any()
+        )
 
 
 def test_nothing_is_updated_where_one_does_not_fit() -> None:
@@ -262,7 +321,9 @@ def test_is_a_well_behaved_torch_op(masked: bool) -> None:
     rates = torch.full((3,), 0.1)
     other = [x.clone() for x in make_state((8,))]
     lists = [[x, y] for x, y in zip((param, grad, exp_avg, exp_avg_sq), other, strict=True)]
-    torch.library.opcheck(adam_steps_op, (*lists, [rates, rates[:1]], [rows, None], [0.9, 0.999], 1e-15, 3))
+    torch.library.opcheck(
+        adam_steps_op, (*lists, [rates, rates[:1]], [rows, None], [0.9, 0.999], 1e-15, 3)
+    )
     torch.library.opcheck(seen_rows_op, (grad,))
 
 

@@ -1,4 +1,5 @@
-"""Options in range, finite tensors, and sizes that kernels and memory can hold: errors say what, where and how much."""
+"""Options in range, finite tensors, and sizes that kernels and memory can hold: errors say what,
+where and how much."""
 
 from __future__ import annotations
 
@@ -71,7 +72,13 @@ def test_options_out_of_range_are_refused_by_name(kind: type, name: str, value: 
     "options",
     [
         {"near": 0, "far": math.inf, "eps2d": 0, "alpha_min": 0, "transmittance_min": 0},
-        {"alpha_max": 0.999, "sh_degree": 0, "mode": "antialiased", "depth": "expected", "nonfinite": "skip"},
+        {
+            "alpha_max": 0.999,
+            "sh_degree": 0,
+            "mode": "antialiased",
+            "depth": "expected",
+            "nonfinite": "skip",
+        },
     ],
 )
 def test_the_ends_of_the_ranges_are_allowed(options: dict[str, Any]) -> None:
@@ -86,9 +93,18 @@ def test_largest_alpha_leaves_something_in_float32() -> None:
 
 def test_messages_say_what_is_wanted_and_what_was_given() -> None:
     for check, message in (
-        (lambda: check_number("size", math.nan, 0), "size must be a number of at least 0 and finite, got nan"),
-        (lambda: check_number("share", 2, 0, 1), "share must be a number of at least 0 and at most 1, got 2"),
-        (lambda: check_count("degree", 7, 0, 4), "degree must be a whole number from 0 to 4, got 7"),
+        (
+            lambda: check_number("size", math.nan, 0),
+            "size must be a number of at least 0 and finite, got nan",
+        ),
+        (
+            lambda: check_number("share", 2, 0, 1),
+            "share must be a number of at least 0 and at most 1, got 2",
+        ),
+        (
+            lambda: check_count("degree", 7, 0, 4),
+            "degree must be a whole number from 0 to 4, got 7",
+        ),
         (lambda: check_choice("mode", "x", ("a", "b")), "mode must be one of a, b, got 'x'"),
         (lambda: check_near_and_far(2, 1), "far must lie beyond near, got near 2 and far 1"),
     ):
@@ -107,7 +123,9 @@ DTYPES = [torch.float32, torch.float64]
     places=st.sets(st.tuples(st.integers(0, 49), st.integers(0, 2)), max_size=9),
     bad=st.sampled_from(BAD),
 )
-def test_counts_elements_and_rows(dtype: torch.dtype, places: set[tuple[int, int]], bad: float) -> None:
+def test_counts_elements_and_rows(
+    dtype: torch.dtype, places: set[tuple[int, int]], bad: float
+) -> None:
     x = torch.randn(50, 3, dtype=dtype)
     for row, column in places:
         x[row, column] = bad
@@ -115,7 +133,9 @@ def test_counts_elements_and_rows(dtype: torch.dtype, places: set[tuple[int, int
     assert torch.nonzero(~finite_rows([x]))[:, 0].tolist() == sorted(rows)
     if not places:
         return check_finite({"means": x})
-    with pytest.raises(DyngsError, match=rf"^means holds {len(places)} NaN .* in {len(rows)} of 50 rows"):
+    with pytest.raises(
+        DyngsError, match=rf"^means holds {len(places)} NaN .* in {len(rows)} of 50 rows"
+    ):
         check_finite({"fine": torch.zeros(3), "means": x})
     return None
 
@@ -124,7 +144,11 @@ def test_counts_elements_and_rows(dtype: torch.dtype, places: set[tuple[int, int
 def test_extreme_but_finite_numbers_pass(dtype: torch.dtype) -> None:
     info = torch.finfo(dtype)
     check_finite(
-        {"x": torch.tensor([info.max, -info.max, info.tiny, info.smallest_normal / 4, 0.0, -0.0], dtype=dtype)}
+        {
+            "x": torch.tensor(
+                [info.max, -info.max, info.tiny, info.smallest_normal / 4, 0.0, -0.0], dtype=dtype
+            )
+        }
     )
 
 
@@ -138,7 +162,8 @@ def test_sees_strided_and_large_tensors() -> None:
 
 
 def test_rows_are_finite_only_if_they_are_in_every_tensor() -> None:
-    one, two = torch.zeros(3, 2), torch.zeros(3)
+    one = torch.zeros(3, 2)
+    two = torch.zeros(3)
     one[0, 1], two[2] = float("nan"), float("inf")
     assert finite_rows([one, two]).tolist() == [False, True, False]
 
@@ -183,7 +208,13 @@ def test_sides_that_cannot_be_are_refused(side: int) -> None:
 
 
 def test_the_kernels_refuse_them_too() -> None:
-    for width, height, threads in ((0, 5, 1), (5, MAX_SIDE + 1, 1), (5, 5, 0), (5, 5, -3), (5, 5, 10**9)):
+    for width, height, threads in (
+        (0, 5, 1),
+        (5, MAX_SIDE + 1, 1),
+        (5, 5, 0),
+        (5, 5, -3),
+        (5, 5, 10**9),
+    ):
         with pytest.raises(ValueError, match=r"is .*, expected 1 to"):
             core.BlendSettings(width, height, 0.0, 0.99, 0.0, threads)
         with pytest.raises(ValueError, match=r"is .*, expected 1 to"):
@@ -193,12 +224,14 @@ def test_the_kernels_refuse_them_too() -> None:
 def test_a_image_larger_than_memory_is_refused() -> None:
     side = MAX_SIDE
     with pytest.raises(
-        DyngsError, match=r"^render refused: .* 8388608x8388608 px have tiles .* GB of memory are available"
+        DyngsError,
+        match=r"^render refused: .* 8388608x8388608 px have tiles .* GB of memory are available",
     ):
         bin_tiles(veils(), torch.ones(1, 1), (side, side))
     nothing = bin_tiles(veils(), torch.zeros(1, 1), (16, 16))
     with pytest.raises(
-        DyngsError, match=r"^render refused: 1 image\(s\) .* 3 channels take 1407374.9 GB; .* available"
+        DyngsError,
+        match=r"^render refused: 1 image\(s\) .* 3 channels take 1407374.9 GB; .* available",
     ):
         rasterize(veils(), torch.ones(1, 1), torch.ones(1, 1, 3), (side, side), entries=nothing)
 
@@ -206,19 +239,23 @@ def test_a_image_larger_than_memory_is_refused() -> None:
 def test_pairs_beyond_counting_are_refused_soon() -> None:
     """A million veils on 8 million tiles: 8e12 pairs, of which some are counted."""
     count = 10**6
-    with pytest.raises(DyngsError, match=r"meet at least \d+ tiles, more than the limit of 2147483647"):
+    with pytest.raises(
+        DyngsError, match=r"meet at least \d+ tiles, more than the limit of 2147483647"
+    ):
         bin_tiles(veils(count), torch.ones(1, count), (2**14, 2**17))
 
 
 def test_memory_that_is_there_is_not_asked_for() -> None:
     check_memory(10**6, "this", torch.empty(0))
     with pytest.raises(
-        DyngsError, match=r"^render refused: this take 1000000000.0 GB; \d+\.\d GB of memory are available"
+        DyngsError,
+        match=r"^render refused: this take 1000000000.0 GB; \d+\.\d GB of memory are available",
     ):
         check_memory(10**18, "this", torch.empty(0))
 
 
-# --- what the system says ---------------------------------------------------------------------------------------------
+# --- what the system says
+# ---------------------------------------------------------------------------------------------
 
 
 def system(folder: Path, files: dict[str, str]) -> str:
@@ -235,7 +272,11 @@ def test_memory_of_the_machine(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("limit", ["max", "9223372036854771712", "99999999999999999999"])
 def test_control_groups_without_a_limit(tmp_path: Path, limit: str) -> None:
-    files = {"proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/memory.max": limit, "sys/fs/cgroup/a/memory.current": "5"}
+    files = {
+        "proc/self/cgroup": "0::/a\n",
+        "sys/fs/cgroup/a/memory.max": limit,
+        "sys/fs/cgroup/a/memory.current": "5",
+    }
     assert core.available_memory(system(tmp_path, files)) == 8_192_000_000
 
 
@@ -268,7 +309,8 @@ def test_nothing_is_known_of_the_system(tmp_path: Path) -> None:
     assert core.available_memory(str(tmp_path)) == 2**63 - 1
 
 
-# --- in a process with little memory ----------------------------------------------------------------------------------
+# --- in a process with little memory
+# ----------------------------------------------------------------------------------
 
 CHILD = """
 import resource, torch
@@ -307,23 +349,31 @@ print(float(draw(3, 64)))
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_AS")
 def test_what_memory_does_not_hold_is_refused() -> None:
-    """Pairs, an image, gradients, and scratch memory that threads used to allocate; after which all is well."""
+    """Pairs, an image, gradients, and scratch memory that threads used to allocate; after which all
+    is well."""
     path = os.pathsep.join([str(Path(dyngs.__file__).parents[1]), *(p for p in sys.path if p)])
     environment = os.environ | {"PYTHONPATH": path}
-    run = subprocess.run([sys.executable, "-c", CHILD], env=environment, capture_output=True, text=True, timeout=300)
+    run = subprocess.run(
+        [sys.executable, "-c", CHILD], env=environment, capture_output=True, text=True, timeout=300
+    )
     assert run.returncode == 0, run.stderr[-2000:]
     pairs, image, gradients, scratch, drawn = run.stdout.splitlines()
-    left, remedy = r"\d\.\d\d?\d? GB of memory are available", "lower the resolution, the scales or the number of views"
+    left, remedy = (
+        r"\d\.\d\d?\d? GB of memory are available",
+        "lower the resolution, the scales or the number of views",
+    )
     assert re.fullmatch(
         r"render refused: 2000 Gaussians in 1 view\(s\) of 4096x4096 px meet 131072000 tiles, "
         rf"whose lists take 2\.6 GB; {left}; {remedy}",
         pairs,
     )
     assert re.fullmatch(
-        rf"render refused: 1 image\(s\) of 8192x8192 px with 3 channels take 1\.3 GB; {left}; {remedy}", image
+        rf"render refused: 1 image\(s\) of 8192x8192 px with 3 channels take 1\.3 GB; {left}; {remedy}",
+        image,
     )
     assert re.fullmatch(
-        rf"render refused: the gradients of 4915200 \(Gaussian, tile\) pairs take 0\.2 GB; {left}; {remedy}", gradients
+        rf"render refused: the gradients of 4915200 \(Gaussian, tile\) pairs take 0\.2 GB; {left}; {remedy}",
+        gradients,
     )
     assert re.fullmatch(r"out of memory: \d\.\d* GB are available; ask for less at once", scratch)
     assert float(drawn) > 0

@@ -1,4 +1,5 @@
-"""What computes: the choice, and for a GPU that cannot be used one line with the reason and what to do."""
+"""What computes: the choice, and for a GPU that cannot be used one line with the reason and what to
+do."""
 
 from __future__ import annotations
 
@@ -19,7 +20,16 @@ from torch import Tensor
 import dyngs
 from dyngs.errors import DyngsError
 from dyngs.ops import device
-from dyngs.ops.device import ReadBack, Upload, deterministic, device_for, findings, sent, why_no_gpu, why_on_cpu
+from dyngs.ops.device import (
+    ReadBack,
+    Upload,
+    deterministic,
+    device_for,
+    findings,
+    sent,
+    why_no_gpu,
+    why_on_cpu,
+)
 
 
 @pytest.fixture
@@ -63,7 +73,9 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
 
 def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.version, "cuda", None)
-    assert re.search(r"device cuda: this torch \(.*\) is built without CUDA: install a torch for CUDA", refused())
+    assert re.search(
+        r"device cuda: this torch \(.*\) is built without CUDA: install a torch for CUDA", refused()
+    )
     assert findings()["GPU"] == "none"
 
 
@@ -74,7 +86,10 @@ def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
             "The NVIDIA driver on your system is too old (found version 11040). Please update your GPU driver",
             r"too old \(found version 11040\): update the driver of the GPU, or install a torch for an older CUDA",
         ),
-        ("Found no NVIDIA driver on your system. Please check that you have one", r"no driver of NVIDIA is there"),
+        (
+            "Found no NVIDIA driver on your system. Please check that you have one",
+            r"no driver of NVIDIA is there",
+        ),
         ("something else\nand more", r"torch finds no GPU \(something else\): see `nvidia-smi`"),
     ],
 )
@@ -95,7 +110,10 @@ def test_no_gpu_though_cuda_starts(machine: pytest.MonkeyPatch) -> None:
 
 def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
-    assert "built without its kernels for GPUs: install dyngs with `pip install . -C cmake.define" in refused()
+    assert (
+        "built without its kernels for GPUs: install dyngs with `pip install . -C cmake.define"
+        in refused()
+    )
     assert findings()["kernels for GPUs"] == "not built"
 
 
@@ -111,7 +129,10 @@ def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:
 def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     core = SimpleNamespace(runtime_version=lambda: 13000, driver_version=lambda: 12040)
     machine.setattr(device, "cuda_core", lambda: core)
-    assert "built with CUDA 13.0, but the driver knows 12.4 at most: update the driver, or build" in refused()
+    assert (
+        "built with CUDA 13.0, but the driver knows 12.4 at most: update the driver, or build"
+        in refused()
+    )
 
 
 def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
@@ -138,7 +159,11 @@ def test_on_a_gpu_torch_is_told_to_repeat_itself(monkeypatch: pytest.MonkeyPatch
     """And only there, only inside, and only if that is wanted."""
     told: list[tuple[bool, bool]] = []
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
-    monkeypatch.setattr(torch, "use_deterministic_algorithms", lambda mode, warn_only: told.append((mode, warn_only)))
+    monkeypatch.setattr(
+        torch,
+        "use_deterministic_algorithms",
+        lambda mode, warn_only: told.append((mode, warn_only)),
+    )
     for name, wanted in (("cpu", True), ("cuda", False)):
         with deterministic(torch.device(name), wanted):
             assert told == []
@@ -175,7 +200,9 @@ print(before, taken, faults(4))
 def test_blocks_are_reused_without_page_faults() -> None:
     environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
     command = [sys.executable, "-c", PROGRAM]
-    output = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+    output = subprocess.run(
+        command, capture_output=True, text=True, check=True, env=environment
+    ).stdout
     before, taken, after = output.split()
     assert taken == "True"
     assert int(after) < int(before) / 10
@@ -199,7 +226,8 @@ def test_arrays_come_as_they_are() -> None:
 
 
 class MadeUpGpu:
-    """What torch.cuda has of streams and events, for tensors whose device is said to be a GPU; notes all calls."""
+    """What torch.cuda has of streams and events, for tensors whose device is said to be a GPU;
+    notes all calls."""
 
     def __init__(self) -> None:
         self.calls: list[str] = []
@@ -240,11 +268,20 @@ class MadeUpGpu:
 
 
 def test_a_image_is_copied_beside_the_work_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    gpu, x = MadeUpGpu(), torch.arange(3)
+    gpu = MadeUpGpu()
+    x = torch.arange(3)
     with monkeypatch.context() as patch:
         gpu.on(patch)
         upload = Upload([x], torch.device("cuda", 0))
-        assert gpu.calls == ["begin uploads", "pinned", "copied, queued", "event recorded in uploads", "end uploads"]
+        assert gpu.calls == [
+            "begin uploads",
+            "pinned",
+            "copied, queued",
+            "event recorded in uploads",
+            "end uploads",
+        ]
         gpu.calls.clear()
         assert torch.equal(upload.arrays()[0], x)
-    assert gpu.calls == ["current waits for the event", "used in current"], "and the host waits for nothing"
+    assert gpu.calls == ["current waits for the event", "used in current"], (
+        "and the host waits for nothing"
+    )

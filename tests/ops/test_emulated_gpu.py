@@ -1,4 +1,5 @@
-"""Every op on the core for CUDA GPUs, which runs here over the emulation of its kernels, beside the core for CPUs."""
+"""Every op on the core for CUDA GPUs, which runs here over the emulation of its kernels, beside the
+core for CPUs."""
 
 from __future__ import annotations
 
@@ -23,7 +24,13 @@ from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.hash_grid import HashLevels, hash_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.nodes import HEAD_SIZES, node_penalties, spline_motion
-from dyngs.ops.patches import Places, blend_patches, outline_crossings, patch_values, visible_patches
+from dyngs.ops.patches import (
+    Places,
+    blend_patches,
+    outline_crossings,
+    patch_values,
+    visible_patches,
+)
 from dyngs.ops.perceptron import GPU_LAYERS, GPU_WIDTH, Layer, perceptron, perceptron_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
@@ -65,7 +72,8 @@ def drawn(gaussians: Gaussians) -> Made:
     scene = single()
     leaves = {name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()}
     pose, intrinsics, background = (
-        x.detach().clone().requires_grad_() for x in (scene.cam_from_world, scene.intrinsics, scene.background)
+        x.detach().clone().requires_grad_()
+        for x in (scene.cam_from_world, scene.intrinsics, scene.background)
     )
     probe = torch.zeros(len(pose), len(gaussians), 4, requires_grad=True)
     rendering = render(
@@ -77,9 +85,19 @@ def drawn(gaussians: Gaussians) -> Made:
     )
     assert rendering.depth is not None
     weights = torch.rand(rendering.rgb.shape, generator=torch.Generator().manual_seed(1))
-    loss = (weights * rendering.rgb).sum() + (weights[..., 0] * rendering.depth).sum() + rendering.alpha.sum()
+    loss = (
+        (weights * rendering.rgb).sum()
+        + (weights[..., 0] * rendering.depth).sum()
+        + rendering.alpha.sum()
+    )
     sources = [*leaves.values(), pose, intrinsics, background, probe]
-    return [rendering.rgb, rendering.depth, rendering.alpha, rendering.radii, *torch.autograd.grad(loss, sources)]
+    return [
+        rendering.rgb,
+        rendering.depth,
+        rendering.alpha,
+        rendering.radii,
+        *torch.autograd.grad(loss, sources),
+    ]
 
 
 def tallied() -> Made:
@@ -87,7 +105,11 @@ def tallied() -> Made:
     projection = project(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras)
     opacities = scene.opacities.expand(len(scene.cam_from_world), -1)
     colors = torch.rand(*opacities.shape, 3, generator=torch.Generator().manual_seed(0))
-    return [tally(projection, opacities, scene.size, kind, colors=colors) for kind in Tally if kind != Tally.LANES]
+    return [
+        tally(projection, opacities, scene.size, kind, colors=colors)
+        for kind in Tally
+        if kind != Tally.LANES
+    ]
 
 
 def compared() -> Made:
@@ -104,35 +126,51 @@ def compared() -> Made:
 
 
 def updated() -> Made:
-    """Three steps of Adam on rows of which some are not asked for and some have no usable gradient."""
+    """Three steps of Adam on rows of which some are not asked for and some have no usable
+    gradient."""
     generator = torch.Generator().manual_seed(0)
     param, grad = (torch.randn(40, 2, 3, generator=generator) for _ in range(2))
-    grad[5, 1, 1], grad[7, 0, 0], grad[9] = float("nan"), 1e30, 0
+    grad[5, 1, 1] = float("nan")
+    grad[7, 0, 0] = 1e30
+    grad[9] = 0
     moments = torch.zeros_like(param), torch.zeros_like(param)
     rows = torch.rand(40, generator=generator) < 0.7
     rates = torch.linspace(0.01, 0.02, 6)
     skipped = [adam_step_(param, grad, *moments, lr=rates, step=step, rows=rows) for step in (1, 2)]
     skipped.append(adam_step_(param, grad, *moments, lr=0.01, step=3))
-    return [param, *moments, torch.tensor(skipped), seen_rows(grad), count_nonfinite_op([grad, param])]
+    return [
+        param,
+        *moments,
+        torch.tensor(skipped),
+        seen_rows(grad),
+        count_nonfinite_op([grad, param]),
+    ]
 
 
 def moved() -> Made:
     tensors = [x.clone() for x in single().gaussians.tensors().values()]
     generator = torch.Generator().manual_seed(0)
-    offsets = [0.1 * torch.randn(5, *shape, generator=generator) for shape in ((3,), (4,), (3,), (), (3,))]
+    offsets = [
+        0.1 * torch.randn(5, *shape, generator=generator) for shape in ((3,), (4,), (3,), (), (3,))
+    ]
     add_offsets_(tensors, torch.tensor([3, 1, 0, 11, 7]), offsets)
     add_offsets_(tensors, None, (offsets[0], None, None, offsets[3], None))
     return tensors
 
 
 def controlled() -> Made:
-    """Nodes at a time and their penalties, with gradients by the splines; and those by offsets of rows."""
+    """Nodes at a time and their penalties, with gradients by the splines; and those by offsets of
+    rows."""
     generator = torch.Generator().manual_seed(0)
-    heads: list[Tensor | None] = [torch.randn(6, 7, size, generator=generator).requires_grad_() for size in HEAD_SIZES]
+    heads: list[Tensor | None] = [
+        torch.randn(6, 7, size, generator=generator).requires_grad_() for size in HEAD_SIZES
+    ]
     leaves = [x for x in heads if x is not None]
     motion, values = spline_motion(heads, 0.4)
     near = torch.tensor([1, 2, 3, 4, 5, 0])[:, None]
-    penalties = node_penalties(torch.randn(6, 3, generator=generator), torch.full((6,), 1.3), near, motion, leaves[0])
+    penalties = node_penalties(
+        torch.randn(6, 3, generator=generator), torch.full((6,), 1.3), near, motion, leaves[0]
+    )
     total = motion.square().sum() + values.square().sum() + penalties.sum()
     tensors = list(single().gaussians.tensors().values())
     grads, own = offset_gradients(tensors, torch.tensor([3, 1]), 2, tensors[1], torch.ones(2, 4))
@@ -141,16 +179,22 @@ def controlled() -> Made:
 
 
 def shaded() -> Made:
-    """Inputs of a colour network, of a body at rest with all that there is, and of a scene with the least."""
-    scene, rows = single(), torch.tensor([4, 0, 9])
+    """Inputs of a colour network, of a body at rest with all that there is, and of a scene with the
+    least."""
+    scene = single()
+    rows = torch.tensor([4, 0, 9])
     box = torch.tensor([[0.0, 0.1, 0.2], [1.0, 2.0, 3.0]])
     base = torch.rand(3, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     rest = (scene.means.flip(0), torch.eye(3).roll(1, 0))
-    eye, logs = torch.tensor([0.0, 0.0, -4.0]), scene.scales.log()
+    eye = torch.tensor([0.0, 0.0, -4.0])
+    logs = scene.scales.log()
     full = Sight(scene.means, scene.quats, logs, rows, eye, box, rest, time=0.3)
     least = Sight(scene.means, scene.quats, logs, rows, eye, box, normals=False)
     found = [shading_inputs(each, base) for each in (full, least)]
-    return [*found, *torch.autograd.grad(sum((x.square().sum() for x in found), torch.zeros(())), base)]
+    return [
+        *found,
+        *torch.autograd.grad(sum((x.square().sum() for x in found), torch.zeros(())), base),
+    ]
 
 
 def looked_up() -> Made:
@@ -165,17 +209,22 @@ def looked_up() -> Made:
     coords = (2.2 * torch.rand(50, 3, generator=generator) - 1.1).requires_grad_()
     features = hexplane_features(coords, 0.4, levels)
     penalty = plane_penalty(levels, (0.1, 0.2, 0.3))
-    without = plane_penalty([PlaneLevel(x.space.detach(), x.time.detach()) for x in levels], (0.1, 0.2, 0.3))
+    without = plane_penalty(
+        [PlaneLevel(x.space.detach(), x.time.detach()) for x in levels], (0.1, 0.2, 0.3)
+    )
     by_features = torch.autograd.grad(features.square().sum(), [coords, *planes])
     return [features, penalty, without, *by_features, *torch.autograd.grad(3 * penalty, planes)]
 
 
 def skinned() -> Made:
     generator = torch.Generator().manual_seed(0)
-    points, positions = torch.randn(60, 3, generator=generator).requires_grad_(), torch.randn(9, 3, generator=generator)
+    points = torch.randn(60, 3, generator=generator).requires_grad_()
+    positions = torch.randn(9, 3, generator=generator)
     motion, values = (torch.randn(9, size, generator=generator).requires_grad_() for size in (7, 5))
     followed = torch.randint(9, (60, 4), generator=generator)
-    offset, blended = blend_skinning(points, positions, torch.full((9,), 1.3), followed, motion, values)
+    offset, blended = blend_skinning(
+        points, positions, torch.full((9,), 1.3), followed, motion, values
+    )
     loss = offset.square().sum() + blended.sin().sum()
     return [offset, blended, *torch.autograd.grad(loss, [points, motion, values])]
 
@@ -195,38 +244,64 @@ def posed() -> Made:
 
 
 def decoded() -> Made:
-    """Outputs of networks without and with a skip, and gradients with and without those by the rows."""
+    """Outputs of networks without and with a skip, and gradients with and without those by the
+    rows."""
     generator = torch.Generator().manual_seed(0)
     found = []
     for widths, skip in (((7, 3), None), ((7, 20, 33, 20, 5), 2)):
         ins = [w + (widths[0] if i == skip else 0) for i, w in enumerate(widths[:-1])]
-        weights = [0.4 * torch.randn(b, a, generator=generator) for a, b in zip(ins, widths[1:], strict=True)]
+        weights = [
+            0.4 * torch.randn(b, a, generator=generator)
+            for a, b in zip(ins, widths[1:], strict=True)
+        ]
         biases = [0.4 * torch.randn(b, generator=generator) for b in widths[1:]]
-        layers = [Layer(w.requires_grad_(), b.requires_grad_()) for w, b in zip(weights, biases, strict=True)]
+        layers = [
+            Layer(w.requires_grad_(), b.requires_grad_())
+            for w, b in zip(weights, biases, strict=True)
+        ]
         x = torch.randn(150, widths[0], generator=generator).requires_grad_()
         y = perceptron(x, layers, skip=skip)
         found += [y, *torch.autograd.grad(y.square().sum(), [x, *weights, *biases])]
         found += torch.autograd.grad(perceptron(x.detach(), layers, skip=skip).sin().sum(), weights)
-        found.append(perceptron(x.detach()[:0], [Layer(v.weight.detach(), v.bias.detach()) for v in layers], skip=skip))
+        found.append(
+            perceptron(
+                x.detach()[:0],
+                [Layer(v.weight.detach(), v.bias.detach()) for v in layers],
+                skip=skip,
+            )
+        )
     return found
 
 
 def seen_along() -> Made:
-    """Samples of rays through occupied cells, their features in a hash grid, and what is seen, with gradients."""
+    """Samples of rays through occupied cells, their features in a hash grid, and what is seen, with
+    gradients."""
     generator = torch.Generator().manual_seed(0)
-    space, levels = Space((0.1, 0.2, -0.1), 1.0, 2, 8), HashLevels.geometric(3, 4, 24, 64)
+    space = Space((0.1, 0.2, -0.1), 1.0, 2, 8)
+    levels = HashLevels.geometric(3, 4, 24, 64)
     origins = 3 * torch.nn.functional.normalize(torch.randn(40, 3, generator=generator))
     aims = 0.6 * torch.randn(40, 3, generator=generator)
     occupied = torch.rand(space.shape, generator=generator) < 0.4
     rays = Rays(origins, torch.nn.functional.normalize(aims - origins))
-    samples = march(rays, torch.rand(40, generator=generator), space, occupied, Steps(0.05, 0.05, 0.01))
+    samples = march(
+        rays, torch.rand(40, generator=generator), space, occupied, Steps(0.05, 0.05, 0.01)
+    )
     table = torch.randn(levels.num_rows, 4, generator=generator).requires_grad_()
     features = hash_features(samples.coords, table, levels)
-    densities, colours = features[:, 0].exp(), features[:, 1:4].sigmoid()
+    densities = features[:, 0].exp()
+    colours = features[:, 1:4].sigmoid()
     which, offsets = reached(densities, samples, 0.1)
     seen = composite(densities, colours, samples, 0.01)
     loss = seen.colour.square().sum() + seen.transmittance.square().sum() + seen.depth.sum()
-    arrays = [samples.offsets, samples.rays, samples.starts, samples.ends, samples.coords, which, offsets]
+    arrays = [
+        samples.offsets,
+        samples.rays,
+        samples.starts,
+        samples.ends,
+        samples.coords,
+        which,
+        offsets,
+    ]
     found = [seen.colour, seen.transmittance, seen.depth, seen.weights]
     return [*arrays, features, *found, *torch.autograd.grad(loss, table)]
 
@@ -235,7 +310,9 @@ def curved() -> Made:
     """Two views of bent triangles, with gradients by control points and colours."""
     generator = torch.Generator().manual_seed(0)
     points = (
-        torch.rand(6, 1, 3, generator=generator) - 0.5 + 0.3 * torch.randn(6, 6, 3, generator=generator)
+        torch.rand(6, 1, 3, generator=generator)
+        - 0.5
+        + 0.3 * torch.randn(6, 6, 3, generator=generator)
     ).requires_grad_()
     colours = torch.rand(6, 6, 3, generator=generator).requires_grad_()
     pose = torch.eye(4).repeat(2, 1, 1)
@@ -243,7 +320,8 @@ def curved() -> Made:
     inner = torch.tensor([[25.0, 0, 12], [0, 25, 10], [0, 0, 1]]).repeat(2, 1, 1)
     cameras = Cameras(pose, inner, 24, 20)
     places = Places.of(*visible_patches(points, cameras, 0.2))
-    shown, crossings = patch_values(colours, places.ids, places.uv), outline_crossings(points, cameras, places)
+    shown = patch_values(colours, places.ids, places.uv)
+    crossings = outline_crossings(points, cameras, places)
     at = patch_values(points, places.ids, places.uv)
     image, through = blend_patches(at[:, :2].contiguous(), shown, crossings, places)
     loss = image.square().sum() + (through * crossings[:, 0]).sum()
@@ -272,15 +350,27 @@ def test_it_says_what_the_cpu_says(gpu: Callable, name: str) -> None:
     """Values and gradients, to float32: sums of some hundred numbers in another order."""
     expected = CASES[name]()
     with gpu():
-        found, again = CASES[name](), CASES[name]()
+        found = CASES[name]()
+        again = CASES[name]()
     assert len(found) == len(expected)
     for i, (a, b, c) in enumerate(zip(found, expected, again, strict=True)):
         assert a.dtype == b.dtype
-        scale = float(b.detach().abs().nan_to_num().max()) if b.is_floating_point() and b.numel() else 1.0
-        torch.testing.assert_close(
-            a, b, rtol=1e-4, atol=2e-5 * max(scale, 1e-6), equal_nan=True, msg=lambda m, i=i: f"{name}, result {i}: {m}"
+        scale = (
+            float(b.detach().abs().nan_to_num().max())
+            if b.is_floating_point() and b.numel()
+            else 1.0
         )
-        assert torch.equal(a.nan_to_num(), c.nan_to_num()), f"{name}, result {i}: other bytes when repeated"
+        torch.testing.assert_close(
+            a,
+            b,
+            rtol=1e-4,
+            atol=2e-5 * max(scale, 1e-6),
+            equal_nan=True,
+            msg=lambda m, i=i: f"{name}, result {i}: {m}",
+        )
+        assert torch.equal(a.nan_to_num(), c.nan_to_num()), (
+            f"{name}, result {i}: other bytes when repeated"
+        )
 
 
 def test_only_the_number_of_tile_entries_is_read_back(gpu: Callable) -> None:
@@ -292,7 +382,9 @@ def test_only_the_number_of_tile_entries_is_read_back(gpu: Callable) -> None:
         assert reads == {"render": 1, "tally": 3}.get(name, 0), name
 
 
-def test_lent_memory_is_new_wherever_other_arrays_lay_before(gpu: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lent_memory_is_new_wherever_other_arrays_lay_before(
+    gpu: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Torch lends memory of arrays that are gone; the emulation must not take it for theirs."""
     pool = torch.zeros(1 << 20, dtype=torch.uint8)
     with gpu() as module:
@@ -325,7 +417,9 @@ def test_too_many_tile_entries_are_refused_as_on_the_cpu(gpu: Callable) -> None:
 
     def refused() -> str:
         with pytest.raises(DyngsError, match=message) as caught:
-            rasterize(projection, opacities, colors, scene.size, options=BlendOptions(max_entries=3))
+            rasterize(
+                projection, opacities, colors, scene.size, options=BlendOptions(max_entries=3)
+            )
         return str(caught.value)
 
     expected = refused()
@@ -349,5 +443,7 @@ def test_the_limits_of_networks_are_those_of_the_kernel(gpu: Callable) -> None:
 def test_arrays_of_the_wrong_size_are_refused(gpu: Callable) -> None:
     with gpu() as module, pytest.raises(ValueError, match="count has 2 elements, expected 1"):
         module.count_nonfinite(
-            native.array(torch.zeros(3)), native.array(torch.zeros(2, dtype=torch.int32)), native.num_threads()
+            native.array(torch.zeros(3)),
+            native.array(torch.zeros(2, dtype=torch.int32)),
+            native.num_threads(),
         )

@@ -31,9 +31,13 @@ def colours(scene: Scene, degree: int, function: Callable = evaluate_harmonics) 
     return function(scene.means, scene.cameras.centers, scene.sh, all_visible(scene), degree)
 
 
-def slopes(scene: Scene, degree: int, function: Callable = evaluate_harmonics) -> tuple[Tensor, ...]:
+def slopes(
+    scene: Scene, degree: int, function: Callable = evaluate_harmonics
+) -> tuple[Tensor, ...]:
     """With respect to means, camera centres and coefficients."""
-    tensors = [x.detach().clone().requires_grad_() for x in (scene.means, scene.cameras.centers, scene.sh)]
+    tensors = [
+        x.detach().clone().requires_grad_() for x in (scene.means, scene.cameras.centers, scene.sh)
+    ]
     means, centers, sh = tensors
     colors = function(means, centers, sh, all_visible(scene), degree)
     # terms of degree 0 have no direction: 0 * x keeps them in the graph of the reference
@@ -46,9 +50,12 @@ def slopes(scene: Scene, degree: int, function: Callable = evaluate_harmonics) -
 def test_equals_the_reference(degree: int, stored: int | None) -> None:
     """rtol 1e-9: both float64, polynomials against a recursion."""
     scene = random_scene(n=35, views=3, seed=degree, degree=stored or degree)
-    ours, truth = colours(scene, degree), colours(scene, degree, reference.evaluate_harmonics)
+    ours = colours(scene, degree)
+    truth = colours(scene, degree, reference.evaluate_harmonics)
     torch.testing.assert_close(ours, truth, rtol=1e-9, atol=1e-13)
-    for x, y in zip(slopes(scene, degree), slopes(scene, degree, reference.evaluate_harmonics), strict=True):
+    for x, y in zip(
+        slopes(scene, degree), slopes(scene, degree, reference.evaluate_harmonics), strict=True
+    ):
         torch.testing.assert_close(x, y, rtol=1e-9, atol=1e-12)
 
 
@@ -85,7 +92,8 @@ def test_higher_stored_terms_are_ignored() -> None:
     scene = random_scene(degree=3)
     other = scene.sh.clone()
     other[:, 4:] = 1e6
-    centers, radii = scene.cameras.centers, all_visible(scene)
+    centers = scene.cameras.centers
+    radii = all_visible(scene)
     assert torch.equal(evaluate_harmonics(scene.means, centers, other, radii, 1), colours(scene, 1))
     assert not slopes(scene, 1)[2][:, 4:].any()
 
@@ -127,13 +135,21 @@ def test_degree_must_be_stored(degree: int) -> None:
 
 
 def test_opcheck(scene: Scene) -> None:
-    means, centers, sh = (x.requires_grad_() for x in (scene.means, scene.cameras.centers, scene.sh))
+    means, centers, sh = (
+        x.requires_grad_() for x in (scene.means, scene.cameras.centers, scene.sh)
+    )
     torch.library.opcheck(harmonics_op, (means, centers, sh, all_visible(scene), 1))
 
 
 def test_opcheck_backward(scene: Scene) -> None:
     colors = colours(scene, 1)
-    args = ([scene.means, scene.cameras.centers, scene.sh, all_visible(scene)], colors, weights(colors), 1, True)
+    args = (
+        [scene.means, scene.cameras.centers, scene.sh, all_visible(scene)],
+        colors,
+        weights(colors),
+        1,
+        True,
+    )
     torch.library.opcheck(harmonics_backward_op, args)
 
 
@@ -150,11 +166,17 @@ def test_dimmed_colours_are_that_part_of_what_they_were_and_a_few_teach() -> Non
 
     def directly(sh: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
         shift = (left - 1)[:, None] * (0.5 / SH_C0)
-        return torch.cat([(sh * left[:, None, None])[:, :1] + shift[:, None], sh[:, 1:] * left[:, None, None]], dim=1)
+        return torch.cat(
+            [(sh * left[:, None, None])[:, :1] + shift[:, None], sh[:, 1:] * left[:, None, None]],
+            dim=1,
+        )
 
     weights = torch.randn(5, 4, 3, generator=generator, dtype=torch.float64)
     leaf = left.requires_grad_()
-    ours, theirs = (torch.autograd.grad((f(sh, leaf) * weights).sum(), (sh, leaf)) for f in (all_teach, directly))
+    ours, theirs = (
+        torch.autograd.grad((f(sh, leaf) * weights).sum(), (sh, leaf))
+        for f in (all_teach, directly)
+    )
     for x, y in zip(ours, theirs, strict=True):
         torch.testing.assert_close(x, y)
     few = left.detach()[::2].clone().requires_grad_()
@@ -166,7 +188,9 @@ def test_dimmed_colours_are_that_part_of_what_they_were_and_a_few_teach() -> Non
 def test_lit_colours_are_those_of_the_formula_and_so_are_gradients(terms: int) -> None:
     generator = torch.Generator().manual_seed(0)
     shapes = (6, terms, 3), (6, 3, 3), (6, 3), (8, 3)
-    inputs = [torch.randn(x, generator=generator, dtype=torch.float64, requires_grad=True) for x in shapes]
+    inputs = [
+        torch.randn(x, generator=generator, dtype=torch.float64, requires_grad=True) for x in shapes
+    ]
     sh, linear, normals, factors = (x.detach() for x in inputs)
     facing = torch.nn.functional.normalize((linear @ normals[..., None])[..., 0], dim=1)
     light = 1 + light_harmonics(facing) @ factors
@@ -178,7 +202,8 @@ def test_lit_colours_are_those_of_the_formula_and_so_are_gradients(terms: int) -
 
 def test_what_has_no_normal_stays_finite() -> None:
     inputs = [
-        x.requires_grad_() for x in (torch.ones(1, 1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.ones(8, 3))
+        x.requires_grad_()
+        for x in (torch.ones(1, 1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.ones(8, 3))
     ]
     found = lit(*inputs)
     assert bool(found.isfinite().all())

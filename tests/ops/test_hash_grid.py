@@ -1,4 +1,5 @@
-"""Hash grids against their formula in float64, and their promises: same bits on any threads, what lies outside."""
+"""Hash grids against their formula in float64, and their promises: same bits on any threads, what
+lies outside."""
 
 from __future__ import annotations
 
@@ -32,7 +33,9 @@ def some(count: int, seed: int = 0) -> torch.Tensor:
 
 def table_of(levels: HashLevels, features: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(1)
-    return torch.randn(levels.num_rows, features, generator=generator, dtype=torch.float64).requires_grad_()
+    return torch.randn(
+        levels.num_rows, features, generator=generator, dtype=torch.float64
+    ).requires_grad_()
 
 
 def test_levels_are_the_published_ones() -> None:
@@ -51,12 +54,18 @@ def test_levels_are_the_published_ones() -> None:
     shape=st.tuples(st.integers(1, 4), st.integers(2, 6), st.integers(6, 30), st.integers(3, 8)),
 )
 @settings(max_examples=40, deadline=None)
-def test_double_equals_the_formula(features: int, count: int, shape: tuple[int, int, int, int]) -> None:
+def test_double_equals_the_formula(
+    features: int, count: int, shape: tuple[int, int, int, int]
+) -> None:
     number, coarsest, finest, log2_rows = shape
     levels = HashLevels.geometric(number, coarsest, finest, 1 << log2_rows)
-    coords, table = some(count, count), table_of(levels, features)
-    found, expected = hash_features(coords, table, levels), reference_features(coords, table, levels)
-    weights = torch.randn(found.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    coords = some(count, count)
+    table = table_of(levels, features)
+    found = hash_features(coords, table, levels)
+    expected = reference_features(coords, table, levels)
+    weights = torch.randn(
+        found.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    )
     assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
     by_kernel, by_formula = (torch.autograd.grad(x, table, weights)[0] for x in (found, expected))
     assert torch.allclose(by_kernel, by_formula, rtol=1e-12, atol=1e-12)
@@ -64,7 +73,8 @@ def test_double_equals_the_formula(features: int, count: int, shape: tuple[int, 
 
 def test_gradients_are_those_of_finite_differences() -> None:
     levels = HashLevels.geometric(2, 2, 4, 8)
-    coords, table = some(6), table_of(levels, 2)
+    coords = some(6)
+    table = table_of(levels, 2)
     sizes = list(levels.scales), list(levels.sizes), list(levels.rows)
     assert torch.autograd.gradcheck(lambda x: hash_grid_op(coords, x, *sizes), (table,))
 
@@ -72,27 +82,35 @@ def test_gradients_are_those_of_finite_differences() -> None:
 @pytest.mark.parametrize("features", [2, 4])
 def test_the_same_bytes_on_any_number_of_threads(features: int) -> None:
     """More threads than levels share the rows of a level between them."""
-    coords, table = some(5000).float(), table_of(LEVELS, features).detach().float().requires_grad_()
+    coords = some(5000).float()
+    table = table_of(LEVELS, features).detach().float().requires_grad_()
     weights = torch.randn(5000, 4 * features, generator=torch.Generator().manual_seed(3))
     results = []
     for threads in (1, 2, 7):
         with kernel_threads(threads):
             found = hash_features(coords, table, LEVELS)
             results.append((found.detach(), torch.autograd.grad(found, table, weights)[0]))
-    assert all(torch.equal(a, b) for one in results[1:] for a, b in zip(one, results[0], strict=True))
+    assert all(
+        torch.equal(a, b) for one in results[1:] for a, b in zip(one, results[0], strict=True)
+    )
 
 
 def test_single_precision_is_close() -> None:
-    coords, table = some(200), table_of(LEVELS, 4).detach()
-    exact, single = hash_features(coords, table, LEVELS), hash_features(coords.float(), table.float(), LEVELS)
+    coords = some(200)
+    table = table_of(LEVELS, 4).detach()
+    exact = hash_features(coords, table, LEVELS)
+    single = hash_features(coords.float(), table.float(), LEVELS)
     # weights are off by 24 cells times the rounding of a coordinate
     assert (single.double() - exact).abs().max() < 1e-4
 
 
 def test_known_features_have_the_gradient_of_a_look_up() -> None:
-    coords, table = some(40), table_of(LEVELS, 2)
+    coords = some(40)
+    table = table_of(LEVELS, 2)
     which = torch.tensor([3, 17, 39])
-    known = known_features(hash_features(coords, table, LEVELS).detach(), which, coords[which], table, LEVELS)
+    known = known_features(
+        hash_features(coords, table, LEVELS).detach(), which, coords[which], table, LEVELS
+    )
     again = hash_features(coords[which], table, LEVELS)
     assert torch.equal(known, again)
     (one,), (other,) = (torch.autograd.grad(x.square().sum(), table) for x in (known, again))
@@ -110,12 +128,15 @@ def test_a_coordinate_that_is_no_number_shows(bad: float) -> None:
 def test_nan_in_a_row_reaches_only_points_beside_it() -> None:
     table = table_of(LEVELS, 1).detach()
     table[0] = math.nan  # the lowest corner of the coarsest level
-    found = hash_features(torch.tensor([[0.0, 0, 0], [0.9, 0.9, 0.9]], dtype=torch.float64), table, LEVELS)
+    found = hash_features(
+        torch.tensor([[0.0, 0, 0], [0.9, 0.9, 0.9]], dtype=torch.float64), table, LEVELS
+    )
     assert found.isfinite().all(1).tolist() == [False, True]
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    coords, table = some(4), table_of(LEVELS, 2)
+    coords = some(4)
+    table = table_of(LEVELS, 2)
     for points, rows, message in (
         (coords[:, :2], table, r"\(M, 3\)"),
         (coords, table[1:], "table must be"),
@@ -128,9 +149,12 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 def test_the_ops_are_registered_as_torch_wants_them() -> None:
-    coords, table = some(6), table_of(LEVELS, 2)
+    coords = some(6)
+    table = table_of(LEVELS, 2)
     sizes = list(LEVELS.scales), list(LEVELS.sizes), list(LEVELS.rows)
     features = hash_features(coords, table, LEVELS).detach()
     torch.library.opcheck(hash_grid_op, (coords, table, *sizes))
     torch.library.opcheck(hash_grid_backward_op, (coords, table.detach(), features, *sizes))
-    torch.library.opcheck(known_features_op, (features, torch.tensor([1, 4]), coords[[1, 4]], table, *sizes))
+    torch.library.opcheck(
+        known_features_op, (features, torch.tensor([1, 4]), coords[[1, 4]], table, *sizes)
+    )

@@ -13,8 +13,9 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.ops.loss import _ssim_map, l1_ssim_loss, l1_ssim_op, reference_l1_ssim, ssim
 
-# Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its gradient; the images
-# have contrast everywhere, so nothing cancels after that. Of 3,300 draws none had more than 4 units.
+# Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its
+# gradient; the images have contrast everywhere, so nothing cancels after that. Of 3,300 draws none
+# had more than 4 units.
 TOLERANCE = 44 * 0.5 * torch.finfo(torch.float32).eps
 
 
@@ -35,10 +36,16 @@ def value_and_gradient(function, rendered: Tensor, *args) -> tuple[float, Tensor
     return loss.item(), leaf.grad
 
 
-def assert_equals_reference(rendered: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None) -> None:
+def assert_equals_reference(
+    rendered: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None
+) -> None:
     value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, ssim_weight, mask)
     expected, expected_gradient = value_and_gradient(
-        reference_l1_ssim, rendered.double(), target.double(), ssim_weight, None if mask is None else mask.double()
+        reference_l1_ssim,
+        rendered.double(),
+        target.double(),
+        ssim_weight,
+        None if mask is None else mask.double(),
     )
     assert value == pytest.approx(expected, abs=TOLERANCE)
     largest = expected_gradient.abs().max()
@@ -53,14 +60,18 @@ def assert_equals_reference(rendered: Tensor, target: Tensor, ssim_weight: float
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=25, deadline=None)
-def test_equals_float64_reference(height: int, width: int, ssim_weight: float, masked: bool, seed: int) -> None:
+def test_equals_float64_reference(
+    height: int, width: int, ssim_weight: float, masked: bool, seed: int
+) -> None:
     rendered, target, mask = make_images(height, width, seed)
     mask[0, 0] = 1.0  # an all-zero mask has no gradient to compare with; it has its own test
     assert_equals_reference(rendered, target, ssim_weight, mask if masked else None)
 
 
 # Sizes on both sides of the native tile (96 rows, 256 pixels) and of its vectors.
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 8192), (96, 256), (97, 257), (193, 515), (400, 1)])
+@pytest.mark.parametrize(
+    ("height", "width"), [(1, 1), (1, 8192), (96, 256), (97, 257), (193, 515), (400, 1)]
+)
 def test_equals_float64_reference_across_tiles(height: int, width: int) -> None:
     rendered, target, mask = make_images(height, width)
     assert_equals_reference(rendered, target, 0.2, None)
@@ -68,12 +79,15 @@ def test_equals_float64_reference_across_tiles(height: int, width: int) -> None:
 
 
 def test_flat_bright_images_keep_their_digits() -> None:
-    # Here E[x^2] - E[x]^2 loses all digits in float32: the plain formula is off by half the value. The fused one works
-    # on x - y and has the value; its gradient still contains the variance of x + y, hence the wider tolerance.
+    # Here E[x^2] - E[x]^2 loses all digits in float32: the plain formula is off by half the value.
+    # The fused one works on x - y and has the value; its gradient still contains the variance of x
+    # + y, hence the wider tolerance.
     target = torch.ones(64, 64, 3)
     rendered = target - 1e-3 * make_images(64, 64)[0]
     value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
-    expected, expected_gradient = value_and_gradient(reference_l1_ssim, rendered.double(), target.double(), 1.0)
+    expected, expected_gradient = value_and_gradient(
+        reference_l1_ssim, rendered.double(), target.double(), 1.0
+    )
     assert value == pytest.approx(expected, rel=2e-4)
     assert (gradient - expected_gradient).abs().max() <= 5e-4 * expected_gradient.abs().max()
 
@@ -91,7 +105,9 @@ def test_reference_agrees_with_scikit_image() -> None:
         channel_axis=2,
     )
     # It averages over the pixels whose window lies inside; there the padding does not matter.
-    assert _ssim_map(rendered, target)[5:-5, 5:-5].mean().item() == pytest.approx(expected, abs=1e-12)
+    assert _ssim_map(rendered, target)[5:-5, 5:-5].mean().item() == pytest.approx(
+        expected, abs=1e-12
+    )
 
 
 def test_known_answer_of_one_pixel() -> None:
@@ -101,7 +117,9 @@ def test_known_answer_of_one_pixel() -> None:
     luminance = (2 * g * g * x * y + 1e-4) / (g * g * (x * x + y * y) + 1e-4)
     contrast = (2 * (g - g * g) * x * y + 9e-4) / ((g - g * g) * (x * x + y * y) + 9e-4)
     expected = 0.8 * (x - y) + 0.2 * (1 - luminance * contrast)
-    assert l1_ssim_loss(torch.full((1, 1, 3), x), torch.full((1, 1, 3), y)).item() == pytest.approx(expected, abs=1e-7)
+    assert l1_ssim_loss(torch.full((1, 1, 3), x), torch.full((1, 1, 3), y)).item() == pytest.approx(
+        expected, abs=1e-7
+    )
 
 
 def test_equal_images_cost_exactly_nothing() -> None:
@@ -165,13 +183,18 @@ def test_non_finite_input_gives_non_finite_loss(bad: float) -> None:
 @pytest.mark.parametrize("brightness", [1.9, 2.1, 50, 1000, 10000])
 @pytest.mark.parametrize("contrast", [1e-2, 0.2])
 def test_bright_images_keep_their_digits(brightness: float, contrast: float) -> None:
-    """1000 +- 0.1 is off by 18% where variances are taken in float32; by rounding they even fall below zero."""
+    """1000 +- 0.1 is off by 18% where variances are taken in float32; by rounding they even fall
+    below zero."""
     rendered, target, _ = (brightness + contrast * (x - 0.5) for x in make_images(60, 60))
     value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
-    expected, expected_gradient = value_and_gradient(reference_l1_ssim, rendered.double(), target.double(), 1.0)
-    # Squares of up to 4 b^2 are rounded some 16 times before a variance is left of them, which has C2 = 9e-4 beside it:
-    # in float64 on both sides, or, up to 2, in float32.
-    unit = torch.finfo(torch.float64).eps if brightness > 2 else 0.5 * torch.finfo(torch.float32).eps
+    expected, expected_gradient = value_and_gradient(
+        reference_l1_ssim, rendered.double(), target.double(), 1.0
+    )
+    # Squares of up to 4 b^2 are rounded some 16 times before a variance is left of them, which has
+    # C2 = 9e-4 beside it: in float64 on both sides, or, up to 2, in float32.
+    unit = (
+        torch.finfo(torch.float64).eps if brightness > 2 else 0.5 * torch.finfo(torch.float32).eps
+    )
     allowed = TOLERANCE + unit * 16 * 4 * brightness**2 / 9e-4
     assert value == pytest.approx(expected, rel=allowed)
     assert (gradient - expected_gradient).abs().max() <= allowed * expected_gradient.abs().max()
@@ -185,11 +208,17 @@ def test_one_large_pixel_costs_what_the_formula_says(large: float, ssim_weight: 
     for m in (None, mask.clamp_min(0.1)):
         value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, ssim_weight, m)
         expected, expected_gradient = value_and_gradient(
-            reference_l1_ssim, rendered.double(), target.double(), ssim_weight, None if m is None else m.double()
+            reference_l1_ssim,
+            rendered.double(),
+            target.double(),
+            ssim_weight,
+            None if m is None else m.double(),
         )
         assert value == pytest.approx(expected, rel=1e-6)
         assert gradient.isfinite().all()
-        assert (gradient - expected_gradient).abs().max() <= TOLERANCE * expected_gradient.abs().max()
+        assert (
+            gradient - expected_gradient
+        ).abs().max() <= TOLERANCE * expected_gradient.abs().max()
     rendered[5, 5] = 0  # its own window, but far from the large pixel of the other image
     target[100, 280, 0] = large
     assert math.isfinite(value_and_gradient(l1_ssim_loss, rendered, target, ssim_weight)[0])
@@ -232,7 +261,8 @@ def test_strided_and_half_inputs() -> None:
     assert value == expected
     assert torch.equal(gradient, expected_gradient)
 
-    half, half_target = rendered.half(), target.half()
+    half = rendered.half()
+    half_target = target.half()
     value, gradient = value_and_gradient(l1_ssim_loss, half, half_target)
     assert gradient.dtype == torch.float16
     assert value == l1_ssim_loss(half.float(), half_target.float()).item()
@@ -276,6 +306,8 @@ def test_compiles_to_one_graph() -> None:
         (torch.zeros(4, 5, 3), torch.zeros(4, 5, 3, dtype=torch.uint8), None, "floating point"),
     ],
 )
-def test_input_that_does_not_fit(rendered: Tensor, target: Tensor, mask: Tensor | None, message: str) -> None:
+def test_input_that_does_not_fit(
+    rendered: Tensor, target: Tensor, mask: Tensor | None, message: str
+) -> None:
     with pytest.raises(DyngsError, match=message):
         l1_ssim_loss(rendered, target, 0.2, mask)

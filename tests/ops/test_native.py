@@ -15,7 +15,16 @@ import torch
 
 from dyngs.errors import DyngsError
 from dyngs.ops import native
-from dyngs.ops.native import active_isa, array, built_isas, choose_isa, core, core_for, kernel_threads, num_threads
+from dyngs.ops.native import (
+    active_isa,
+    array,
+    built_isas,
+    choose_isa,
+    core,
+    core_for,
+    kernel_threads,
+    num_threads,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -55,9 +64,24 @@ def test_the_newest_that_the_processor_runs_is_chosen(
 @pytest.mark.parametrize(
     ("built", "newest", "requested", "message"),
     [
-        (("v4",), "v3", None, "dyngs was compiled for processors with AVX-512, which this one lacks; install it again"),
-        (("v3", "v4"), "v2", "v2", "dyngs was compiled for processors with AVX2, which this one lacks"),
-        (("v2", "v3", "v4"), "v3", "v4", "DYNGS_ISA=v4: here run v2, v3; unset the variable or choose one of these"),
+        (
+            ("v4",),
+            "v3",
+            None,
+            "dyngs was compiled for processors with AVX-512, which this one lacks; install it again",
+        ),
+        (
+            ("v3", "v4"),
+            "v2",
+            "v2",
+            "dyngs was compiled for processors with AVX2, which this one lacks",
+        ),
+        (
+            ("v2", "v3", "v4"),
+            "v3",
+            "v4",
+            "DYNGS_ISA=v4: here run v2, v3; unset the variable or choose one of these",
+        ),
         (("v4",), "v4", "v2", "DYNGS_ISA=v2: here run v4"),
     ],
 )
@@ -112,8 +136,13 @@ def test_float64_on_a_gpu_is_refused_in_one_line() -> None:
 
 
 def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:
-    means, quats, scales, opacities = torch.zeros(4, 3), torch.zeros(4, 4), torch.zeros(3, 3), torch.zeros(4)
-    arrays = core.GaussianArraysF32(means, quats, scales, opacities, torch.zeros(1, 4, 4), torch.zeros(1, 3, 3))
+    means = torch.zeros(4, 3)
+    quats = torch.zeros(4, 4)
+    scales = torch.zeros(3, 3)
+    opacities = torch.zeros(4)
+    arrays = core.GaussianArraysF32(
+        means, quats, scales, opacities, torch.zeros(1, 4, 4), torch.zeros(1, 3, 3)
+    )
     sizes = core.ProjectSettings(8, 8, 0.3, 0.2, 1e10, 0.0, 0.0, False, 1)
     outputs = (torch.zeros(1, 4, 2), torch.zeros(1, 4), torch.zeros(1, 4, 3), torch.zeros(1, 4))
     with pytest.raises(ValueError, match="scales has 9 elements, expected 12"):
@@ -121,10 +150,18 @@ def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:
 
 
 def test_strided_arrays_are_refused_rather_than_filled_elsewhere() -> None:
-    means, quats, scales, opacities = torch.zeros(4, 3), torch.zeros(4, 4), torch.zeros(4, 3), torch.zeros(4)
+    means = torch.zeros(4, 3)
+    quats = torch.zeros(4, 4)
+    scales = torch.zeros(4, 3)
+    opacities = torch.zeros(4)
     with pytest.raises(TypeError):
         core.GaussianArraysF32(
-            means.T.contiguous().T, quats, scales, opacities, torch.zeros(1, 4, 4), torch.zeros(1, 3, 3)
+            means.T.contiguous().T,
+            quats,
+            scales,
+            opacities,
+            torch.zeros(1, 4, 4),
+            torch.zeros(1, 3, 3),
         )
 
 
@@ -135,11 +172,14 @@ def test_formulas_need_no_library_but_the_mathematical_one() -> None:
     for header in headers:
         text = header.read_text(encoding="utf-8")
         assert set(re.findall(r"#include <(\S+)>", text)) <= allowed, header.name
-        assert all(f.startswith("math/") for f in re.findall(r'#include "(\S+)"', text)), header.name
+        assert all(f.startswith("math/") for f in re.findall(r'#include "(\S+)"', text)), (
+            header.name
+        )
         assert not re.findall(r"\bnew\b *[\w(\[]|malloc|vector_size|#pragma omp", text), header.name
 
 
-# --- after a fork -----------------------------------------------------------------------------------------------------
+# --- after a fork
+# -----------------------------------------------------------------------------------------------------
 
 FORKED = """
 import os, signal, sys, warnings
@@ -179,7 +219,8 @@ fork(draw(5000))
 
 
 def drawn_after_forks(threads: int) -> list[str]:
-    """What is said after a fork of a process without threads, and after two when it has drawn on so many."""
+    """What is said after a fork of a process without threads, and after two when it has drawn on so
+    many."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
         "OMP_NUM_THREADS": str(threads),
@@ -192,8 +233,8 @@ def drawn_after_forks(threads: int) -> list[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
 def test_a_fork_of_a_process_with_threads_draws_on_one_and_says_so() -> None:
-    """It used to wait for ever for threads that only the parent has, the second one too, as the first fork ends the
-    threads of OpenBLAS; without any, it may start some."""
+    """It used to wait for ever for threads that only the parent has, the second one too, as the
+    first fork ends the threads of OpenBLAS; without any, it may start some."""
     told = (
         "True 1 1 dyngs and torch run on one thread: this process was forked from one that had started threads, which "
         "it has not got; start processes with multiprocessing's 'spawn' method to use more"
@@ -206,11 +247,14 @@ def test_a_fork_of_a_process_of_one_thread_may_start_some() -> None:
     assert drawn_after_forks(1) == ["True 1 4"] * 3
 
 
-@pytest.mark.parametrize("counted", [(1, 1, 0, 1), (1, 2, 1, 1)], ids=["drawn after a fork", "drawn before it"])
+@pytest.mark.parametrize(
+    "counted", [(1, 1, 0, 1), (1, 2, 1, 1)], ids=["drawn after a fork", "drawn before it"]
+)
 def test_threads_are_noticed_though_a_fork_ends_those_of_openblas(
     counted: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Threads at the import, at a first fork, after it, and at a second one, before which one of OpenMP is there."""
+    """Threads at the import, at a first fork, after it, and at a second one, before which one of
+    OpenMP is there."""
     imported, at_first, after, at_second = counted
     now = [imported]
     monkeypatch.setattr(native, "_native_threads", lambda: now[-1])

@@ -41,8 +41,12 @@ def plain_motion(heads: list[Tensor | None], time: float) -> tuple[Tensor, Tenso
     place = min(max(time, 0.0), 1.0) * (POINTS - 3)
     piece = min(int(place), POINTS - 4)
     weights = torch.tensor(cubic_fractions(place - piece), dtype=torch.float64)
-    found = [None if x is None else torch.einsum("k,skd->sd", weights, x[:, piece : piece + 4]) for x in heads]
-    means, quats = found[0], found[1]
+    found = [
+        None if x is None else torch.einsum("k,skd->sd", weights, x[:, piece : piece + 4])
+        for x in heads
+    ]
+    means = found[0]
+    quats = found[1]
     assert means is not None
     turns = identity_quat(means).expand(len(means), 4) + (0 if quats is None else quats)
     return torch.cat([means, turns], 1), torch.cat([means[:, :0], *there(found[1:])], 1)
@@ -54,9 +58,12 @@ def graph() -> tuple[Tensor, Tensor, Tensor]:
     return normal(NODES, 3), 0.5 + normal(NODES).abs(), neighbours
 
 
-def plain_penalties(positions: Tensor, radii: Tensor, neighbours: Tensor, motion: Tensor, paths: Tensor) -> Tensor:
+def plain_penalties(
+    positions: Tensor, radii: Tensor, neighbours: Tensor, motion: Tensor, paths: Tensor
+) -> Tensor:
     arms = positions[neighbours] - positions[:, None]
-    shifts, quats = motion[:, :3], motion[:, None, 3:].expand(-1, arms.shape[1], -1)
+    shifts = motion[:, :3]
+    quats = motion[:, None, 3:].expand(-1, arms.shape[1], -1)
     strain = arms + shifts[neighbours] - shifts[:, None] - rotate(quats, arms)
     bends = (paths.diff(n=2, dim=1) / radii[:, None, None]).square().mean()
     return torch.stack([bends, (strain / radii[:, None, None]).square().sum(-1).mean()])
@@ -79,24 +86,35 @@ def test_motion_equals_torch(kept: int, time: float, dtype: torch.dtype, toleran
     heads = splines(kept)
     expected = with_gradients(plain_motion(heads, time), there(heads))
     heads = as_leaves(heads, dtype)
-    for x, y in zip(with_gradients(spline_motion(heads, time), there(heads)), expected, strict=True):
+    for x, y in zip(
+        with_gradients(spline_motion(heads, time), there(heads)), expected, strict=True
+    ):
         torch.testing.assert_close(x.double(), y, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 def test_penalties_equal_torch(dtype: torch.dtype, tolerance: float) -> None:
-    leaves = [normal(NODES, 7, seed=2).requires_grad_(), normal(NODES, POINTS, 3, seed=3).requires_grad_()]
+    leaves = [
+        normal(NODES, 7, seed=2).requires_grad_(),
+        normal(NODES, POINTS, 3, seed=3).requires_grad_(),
+    ]
     expected = with_gradients(plain_penalties(*graph(), *leaves), leaves)
     leaves = [x.detach().to(dtype).requires_grad_() for x in leaves]
     positions, radii, neighbours = graph()
-    found = with_gradients(node_penalties(positions.to(dtype), radii.to(dtype), neighbours, *leaves), leaves)
+    found = with_gradients(
+        node_penalties(positions.to(dtype), radii.to(dtype), neighbours, *leaves), leaves
+    )
     for x, y in zip(found, expected, strict=True):
-        torch.testing.assert_close(x.double(), y, rtol=0, atol=tolerance * max(1.0, float(y.abs().max())))
+        torch.testing.assert_close(
+            x.double(), y, rtol=0, atol=tolerance * max(1.0, float(y.abs().max()))
+        )
 
 
 def test_any_number_of_threads_gives_the_same_bytes() -> None:
-    heads, found = as_leaves(splines(count=900), torch.float32), []
-    positions, radii = normal(900, 3).float(), 1 + normal(900).abs().float()
+    heads = as_leaves(splines(count=900), torch.float32)
+    found = []
+    positions = normal(900, 3).float()
+    radii = 1 + normal(900).abs().float()
     neighbours = torch.randint(900, (900, 3), generator=torch.Generator().manual_seed(1))
     for threads in (1, 2, 5):
         with kernel_threads(threads):
@@ -110,16 +128,22 @@ def test_any_number_of_threads_gives_the_same_bytes() -> None:
 def test_a_neighbour_that_does_not_exist_is_refused() -> None:
     positions, radii, neighbours = graph()
     with pytest.raises(IndexError, match="no such node"):
-        node_penalties(positions, radii, neighbours + NODES, normal(NODES, 7), normal(NODES, POINTS, 3))
+        node_penalties(
+            positions, radii, neighbours + NODES, normal(NODES, 7), normal(NODES, POINTS, 3)
+        )
 
 
 def test_are_well_behaved_torch_ops() -> None:
-    for heads in (as_leaves(splines(count=4), torch.float32), as_leaves(splines(0b10001, count=4), torch.float32)):
+    for heads in (
+        as_leaves(splines(count=4), torch.float32),
+        as_leaves(splines(0b10001, count=4), torch.float32),
+    ):
         torch.library.opcheck(nodes_at_op, (*heads, 0.3))
         constants = [None if x is None else x.detach() for x in heads]
         width = sum(x.shape[2] for x in there(heads)[1:])
         grads = [normal(4, 7).float(), normal(4, width).float()]
         torch.library.opcheck(nodes_at_backward_op, (*constants, grads, 0.3))
     positions, radii, neighbours = (x.float() if x.is_floating_point() else x for x in graph())
-    motion, paths = normal(NODES, 7).float().requires_grad_(), normal(NODES, POINTS, 3).float().requires_grad_()
+    motion = normal(NODES, 7).float().requires_grad_()
+    paths = normal(NODES, POINTS, 3).float().requires_grad_()
     torch.library.opcheck(node_penalties_op, (positions, radii, neighbours, motion, paths))

@@ -1,4 +1,5 @@
-"""Bezier patches: values, what images show, and blending, against plain torch in float64 and known answers."""
+"""Bezier patches: values, what images show, and blending, against plain torch in float64 and known
+answers."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def camera(width: int = 24, height: int = 18, distance: float = 3.0, views: int 
     pose = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
     pose[:, 2, 3] = distance
     pose[:, 0, 3] = torch.linspace(0, 0.4, views, dtype=torch.float64) if views > 1 else 0.0
-    inner = torch.tensor([[20.0, 0, width / 2], [0, 21.0, height / 2], [0, 0, 1]], dtype=torch.float64)
+    inner = torch.tensor(
+        [[20.0, 0, width / 2], [0, 21.0, height / 2], [0, 0, 1]], dtype=torch.float64
+    )
     return Cameras(pose, inner.repeat(views, 1, 1), width, height)
 
 
@@ -62,10 +65,13 @@ def random_places(count: int, patches: int, seed: int = 1) -> tuple[Tensor, Tens
 def test_values_are_those_of_bernstein_polynomials() -> None:
     values = random_patches(5).requires_grad_()
     ids, uv = random_places(40, 5)
-    found, expected = patch_values(values, ids, uv), reference_values(values, ids, uv)
+    found = patch_values(values, ids, uv)
+    expected = reference_values(values, ids, uv)
     torch.testing.assert_close(found, expected)
     grad = torch.randn_like(found)
-    torch.testing.assert_close(*(torch.autograd.grad(x, values, grad)[0] for x in (found, expected)))
+    torch.testing.assert_close(
+        *(torch.autograd.grad(x, values, grad)[0] for x in (found, expected))
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -93,7 +99,8 @@ def test_a_lattice_is_linear_between_its_points(segments: int) -> None:
 
 
 def test_a_lattice_of_linear_values_is_them() -> None:
-    """A function that is linear on the whole patch is so on the lattice's, wherever it is looked up."""
+    """A function that is linear on the whole patch is so on the lattice's, wherever it is looked
+    up."""
     places, _ = lattice(4)
     ids, uv = random_places(50, 1)
     torch.testing.assert_close(lattice_values(places[None], ids, uv, 4), uv)
@@ -108,7 +115,8 @@ def test_faces_of_a_lattice_face_alike_and_fill_it() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_pixels_show_the_nearest_patch(seed: int) -> None:
-    points, cameras = random_patches(4, seed), camera(12, 9, 2.0, views=2)
+    points = random_patches(4, seed)
+    cameras = camera(12, 9, 2.0, views=2)
     ids, uv = visible_patches(points, cameras, 0.7, 2)
     expected, places, _ = reference_visible(points, cameras, 0.7, 2)
     torch.testing.assert_close(ids, expected)
@@ -135,14 +143,20 @@ def test_both_sides_are_shown_and_the_first_of_equals() -> None:
     ids, _ = visible_patches(torch.cat([patch, patch]), camera(), 0.2)
     assert (ids == 0).sum() > 50
     assert not (ids == 1).any()
-    torch.testing.assert_close(visible_patches(turned, camera(), 0.2)[0], visible_patches(patch, camera(), 0.2)[0])
+    torch.testing.assert_close(
+        visible_patches(turned, camera(), 0.2)[0], visible_patches(patch, camera(), 0.2)[0]
+    )
 
 
 def test_neighbours_leave_no_gap() -> None:
     corners = [(-1.0, -1.0, 0.3), (1.0, -1.0, -0.2), (1.0, 1.0, 0.1), (-1.0, 1.0, 0.0)]
-    both = torch.cat([flat(corners[0], corners[1], corners[2]), flat(corners[0], corners[2], corners[3])])
+    both = torch.cat(
+        [flat(corners[0], corners[1], corners[2]), flat(corners[0], corners[2], corners[3])]
+    )
     for width in (17, 24, 33):
-        ids, _ = visible_patches(both.float(), camera(width, width, 3.2).to(dtype=torch.float32), 0.2)
+        ids, _ = visible_patches(
+            both.float(), camera(width, width, 3.2).to(dtype=torch.float32), 0.2
+        )
         inside = ids[0, width // 3 : -(width // 3), width // 3 : -(width // 3)]
         assert (inside >= 0).all()
 
@@ -154,8 +168,10 @@ def test_what_cannot_be_drawn_is_not() -> None:
     behind = flat((-1, -1, -4), (1, -1, -4), (0, 1, -5))
     near = flat((-1, -1, -2.9), (1, -1, -2.9), (0, 1, -2.9))
     patch = flat((-1, -1, 0), (1, -1, 0), (0, 1, 0))
-    nan, infinite = patch.clone(), patch.clone()
-    nan[0, 4, 1], infinite[0, 2, 0] = math.nan, math.inf
+    nan = patch.clone()
+    infinite = patch.clone()
+    nan[0, 4, 1] = math.nan
+    infinite[0, 2, 0] = math.inf
     ids, uv = visible_patches(torch.cat([point, line, behind, near, nan, infinite]), camera(), 0.2)
     assert (ids == -1).all()
     assert uv.isfinite().all()
@@ -171,15 +187,23 @@ def test_a_patch_through_the_near_plane_is_cut_there() -> None:
     assert ((uv >= 0) & (uv <= 1)).all()
 
 
-def some_image(seed: int, views: int = 1, width: int = 14, height: int = 11) -> tuple[Tensor, Tensor, Tensor, Places]:
-    """Means, colours of two channels, crossings anywhere, and the places of pixels that show one of three patches."""
+def some_image(
+    seed: int, views: int = 1, width: int = 14, height: int = 11
+) -> tuple[Tensor, Tensor, Tensor, Places]:
+    """Means, colours of two channels, crossings anywhere, and the places of pixels that show one of
+    three patches."""
     ids, uv = visible_patches(random_patches(3, seed, 0.5), camera(width, height, views=views), 0.2)
     places = Places.of(ids, uv)
     generator = torch.Generator().manual_seed(seed)
     means = (ids >= 0).nonzero()[:, [2, 1]] + 0.5
     colours = torch.rand(len(means), 2, generator=generator, dtype=torch.float64)
     crossings = torch.rand(views, 2, height, width, generator=generator, dtype=torch.float64)
-    return means.double().requires_grad_(), colours.requires_grad_(), crossings.requires_grad_(), places
+    return (
+        means.double().requires_grad_(),
+        colours.requires_grad_(),
+        crossings.requires_grad_(),
+        places,
+    )
 
 
 @pytest.mark.parametrize(("seed", "views"), [(0, 1), (1, 2), (2, 1)])
@@ -227,7 +251,9 @@ def test_a_pixel_is_covered_as_far_as_the_outline_goes(edge: float) -> None:
     right = (15 + edge - 12) * 3 / 20
     points = flat((right, -9, 0), (right, 9, 0), (-20, 0, 0))
     _, through = drawn(points, camera())
-    torch.testing.assert_close(through[0, 9, 13:18], torch.tensor([0, 0, 1 - edge, 1, 1], dtype=torch.float64))
+    torch.testing.assert_close(
+        through[0, 9, 13:18], torch.tensor([0, 0, 1 - edge, 1, 1], dtype=torch.float64)
+    )
 
 
 def test_the_nearer_one_covers_the_other_along_its_own_outline() -> None:
@@ -245,9 +271,12 @@ def test_the_nearer_one_covers_the_other_along_its_own_outline() -> None:
 
 def test_two_that_meet_share_their_outline() -> None:
     """Neighbours of one wall: no light comes through, and both ends of the outline move it."""
-    one, other = flat((0.03, -9, 0), (0.03, 9, 0), (-20, 0, 0)), flat((0.03, -9, 0), (0.03, 9, 0), (20, 0, 0))
+    one = flat((0.03, -9, 0), (0.03, 9, 0), (-20, 0, 0))
+    other = flat((0.03, -9, 0), (0.03, 9, 0), (20, 0, 0))
     points = torch.cat([one, other]).requires_grad_()
-    image, through = drawn(points, camera(), torch.stack([torch.zeros(6, 1), torch.ones(6, 1)]).double())
+    image, through = drawn(
+        points, camera(), torch.stack([torch.zeros(6, 1), torch.ones(6, 1)]).double()
+    )
     assert (through == 0).all()
     (by_points,) = torch.autograd.grad(image.sum(), points)
     torch.testing.assert_close(by_points[0, :4].sum(0), by_points[1, :4].sum(0))
@@ -256,7 +285,8 @@ def test_two_that_meet_share_their_outline() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_gradient_is_that_of_what_is_drawn(seed: int) -> None:
-    """Of whole images by control points, against differences: outlines move, and colours move along."""
+    """Of whole images by control points, against differences: outlines move, and colours move
+    along."""
     points = random_patches(1, seed + 7, 0.1) * 0.2
     points = points + flat((-0.8, -0.7, 0.2), (0.9, -0.3, 0), (-0.2, 0.8, -0.1))
     colours = torch.linspace(0, 1, 6, dtype=torch.float64).view(1, 6, 1) * 0.4 + 0.5
@@ -281,17 +311,21 @@ def test_the_gradient_is_that_of_what_is_drawn(seed: int) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_same_bytes_on_any_number_of_threads(dtype: torch.dtype) -> None:
-    points, cameras = random_patches(30, 3, 0.3).to(dtype), camera(70, 75, 2.5, views=2).to(dtype=dtype)
+    points = random_patches(30, 3, 0.3).to(dtype)
+    cameras = camera(70, 75, 2.5, views=2).to(dtype=dtype)
     results = []
     for threads in (1, 2, 4):
         with kernel_threads(threads):
             values = points.clone().requires_grad_()
             ids, uv = visible_patches(values, cameras, 0.2)
             places = Places.of(ids, uv)
-            at, crossings = patch_values(values, places.ids, places.uv), outline_crossings(values, cameras, places)
+            at = patch_values(values, places.ids, places.uv)
+            crossings = outline_crossings(values, cameras, places)
             image, through = blend_patches(at[:, :2] * 20 + 30, at, crossings, places)
             (image.square().sum() + through.sum()).backward()
-            results.append([ids, uv, crossings.detach(), image.detach(), through.detach(), values.grad])
+            results.append(
+                [ids, uv, crossings.detach(), image.detach(), through.detach(), values.grad]
+            )
     for other in results[1:]:
         for one, two in zip(results[0], other, strict=True):
             assert one is not None
@@ -304,14 +338,17 @@ def test_the_ops_are_those_of_torch() -> None:
     torch.library.opcheck(patch_values_op, (values.requires_grad_(), ids, uv, 0))
     means, colours, crossings, places = some_image(0)
     torch.library.opcheck(
-        patch_values_backward_op, (values.detach(), ids, uv, torch.ones(5, 3, dtype=torch.float64), 0)
+        patch_values_backward_op,
+        (values.detach(), ids, uv, torch.ones(5, 3, dtype=torch.float64), 0),
     )
     torch.library.opcheck(blend_patches_op, (means, colours, crossings, places.rows, places.ids))
     inputs = [colours.detach(), crossings.detach(), places.rows, places.ids]
     by_image = [x.detach() for x in blend_patches(means, colours, crossings, places)]
     torch.library.opcheck(blend_patches_backward_op, (inputs, by_image))
     at = [x.detach() for x in (camera().cam_from_world, camera().intrinsics)]
-    torch.library.opcheck(patch_ends_op, (values.detach(), at, torch.zeros_like(ids), ids, uv, torch.zeros_like(ids)))
+    torch.library.opcheck(
+        patch_ends_op, (values.detach(), at, torch.zeros_like(ids), ids, uv, torch.zeros_like(ids))
+    )
 
 
 def test_what_does_not_fit_is_refused() -> None:
@@ -330,4 +367,6 @@ def test_what_does_not_fit_is_refused() -> None:
 
 def test_weights_of_a_patch_sum_to_one() -> None:
     uv = random_places(20, 1)[1]
-    torch.testing.assert_close(bernstein(uv[:, 0], uv[:, 1]).sum(1), torch.ones(20, dtype=torch.float64))
+    torch.testing.assert_close(
+        bernstein(uv[:, 0], uv[:, 1]).sum(1), torch.ones(20, dtype=torch.float64)
+    )

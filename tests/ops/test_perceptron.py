@@ -1,4 +1,5 @@
-"""The fused perceptron against plain torch in float64, and its promises: same bits on any threads, NaN in its row."""
+"""The fused perceptron against plain torch in float64, and its promises: same bits on any threads,
+NaN in its row."""
 
 from __future__ import annotations
 
@@ -14,7 +15,13 @@ from torch import Tensor
 import dyngs.ops.perceptron as ops
 from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
-from dyngs.ops.perceptron import Layer, perceptron, perceptron_backward_op, perceptron_op, reference_perceptron
+from dyngs.ops.perceptron import (
+    Layer,
+    perceptron,
+    perceptron_backward_op,
+    perceptron_op,
+    reference_perceptron,
+)
 
 
 def make_layers(widths: list[int], skip: int | None, seed: int = 0) -> list[Layer]:
@@ -23,7 +30,9 @@ def make_layers(widths: list[int], skip: int | None, seed: int = 0) -> list[Laye
     layers = []
     for i, (before, out) in enumerate(pairwise(widths)):
         features = before + (widths[0] if i == skip else 0)
-        weight = torch.randn(out, features, generator=generator, dtype=torch.float64) * math.sqrt(2 / features)
+        weight = torch.randn(out, features, generator=generator, dtype=torch.float64) * math.sqrt(
+            2 / features
+        )
         bias = 0.1 * torch.randn(out, generator=generator, dtype=torch.float64)
         layers.append(Layer(weight.requires_grad_(), bias.requires_grad_()))
     return layers
@@ -73,9 +82,12 @@ def networks(draw: st.DrawFn) -> tuple[list[int], int | None]:
 
 @given(network=networks(), rows=st.integers(0, 200), kept=st.booleans(), seed=st.integers(0, 1000))
 @settings(max_examples=60, deadline=None)
-def test_double_equals_torch(network: tuple[list[int], int | None], rows: int, kept: bool, seed: int) -> None:
+def test_double_equals_torch(
+    network: tuple[list[int], int | None], rows: int, kept: bool, seed: int
+) -> None:
     widths, skip = network
-    x, layers = make_rows(rows, widths[0], seed), make_layers(widths, skip, seed)
+    x = make_rows(rows, widths[0], seed)
+    layers = make_layers(widths, skip, seed)
     expected = value_and_gradients(reference_perceptron, x, layers, skip)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ops, "KEPT_BYTES", 2**30 if kept else -1)
@@ -85,7 +97,12 @@ def test_double_equals_torch(network: tuple[list[int], int | None], rows: int, k
 
 @pytest.mark.parametrize(
     ("widths", "skip", "rows"),
-    [([64, 64, 192, 10], None, 3000), ([76, *[128] * 8, 10], 4, 300), ([3, 300, 2], None, 500), ([300, 5], None, 97)],
+    [
+        ([64, 64, 192, 10], None, 3000),
+        ([76, *[128] * 8, 10], 4, 300),
+        ([3, 300, 2], None, 500),
+        ([300, 5], None, 97),
+    ],
 )
 def test_float_is_near_double(widths: list[int], skip: int | None, rows: int) -> None:
     x, layers = cast(make_rows(rows, widths[0]), make_layers(widths, skip), torch.float32)
@@ -93,18 +110,22 @@ def test_float_is_near_double(widths: list[int], skip: int | None, rows: int) ->
     got = value_and_gradients(perceptron, x, layers, skip)
     # The value: sums of up to 300 terms, 2^-24 each, mostly cancelling, through up to nine layers.
     assert_close(got[:1], expected[:1], 5e-6)
-    # The gradients: as much again. In addition a ReLU whose input is within rounding of 0 may switch, which changes a
-    # row's part of the gradient by far more than rounding; of 10^5 to 10^6 units a few do, so these are counted only.
+    # The gradients: as much again. In addition a ReLU whose input is within rounding of 0 may
+    # switch, which changes a row's part of the gradient by far more than rounding; of 10^5 to 10^6
+    # units a few do, so these are counted only.
     for a, b in zip(got[1:], expected[1:], strict=True):
         off = (a.double() - b).abs() > 2e-5 * b.abs().max()
         assert off.double().mean() < 0.01
 
 
-@pytest.mark.parametrize(("widths", "skip"), [([3, 4, 2], None), ([2, 5, 3, 4, 3], 2), ([4, 3], None), ([2, 3, 1], 1)])
+@pytest.mark.parametrize(
+    ("widths", "skip"), [([3, 4, 2], None), ([2, 5, 3, 4, 3], 2), ([4, 3], None), ([2, 3, 1], 1)]
+)
 def test_gradcheck(widths: list[int], skip: int | None) -> None:
     layers = make_layers(widths, skip)
     x = make_rows(400, widths[0]).detach()
-    safe = torch.ones(400, dtype=torch.bool)  # rows where no ReLU is within reach of a finite difference
+    # rows where no ReLU is within reach of a finite difference
+    safe = torch.ones(400, dtype=torch.bool)
     h = x
     for i, layer in enumerate(layers[:-1]):
         h = torch.cat([h, x], dim=1) if i == skip else h
@@ -115,15 +136,20 @@ def test_gradcheck(widths: list[int], skip: int | None) -> None:
     assert x.shape[0] == 5
 
     def function(x: Tensor, *flat: Tensor) -> Tensor:
-        return perceptron(x, [Layer(w, b) for w, b in zip(flat[::2], flat[1::2], strict=True)], skip=skip)
+        return perceptron(
+            x, [Layer(w, b) for w, b in zip(flat[::2], flat[1::2], strict=True)], skip=skip
+        )
 
     assert torch.autograd.gradcheck(function, (x, *parameters(layers)))
 
 
 @pytest.mark.parametrize("kept", [True, False])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_same_bits_on_any_number_of_threads(dtype: torch.dtype, kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    widths, skip = [20, 33, 70, 10], 2
+def test_same_bits_on_any_number_of_threads(
+    dtype: torch.dtype, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    widths = [20, 33, 70, 10]
+    skip = 2
     x, layers = cast(make_rows(2500, widths[0]), make_layers(widths, skip), dtype)
     results = []
     with kernel_threads(1):
@@ -137,7 +163,8 @@ def test_same_bits_on_any_number_of_threads(dtype: torch.dtype, kept: bool, monk
 
 
 def test_a_row_does_not_depend_on_its_place() -> None:
-    """Blocks and tiles are an implementation detail: each row's output is the same bits alone and among others."""
+    """Blocks and tiles are an implementation detail: each row's output is the same bits alone and
+    among others."""
     x, layers = cast(make_rows(230, 17), make_layers([17, 40, 9], None), torch.float32)
     together = perceptron(x, layers)
     for row in (0, 1, 95, 96, 97, 229):
@@ -185,11 +212,15 @@ def test_strided_and_transposed_inputs() -> None:
 
 def test_known_answers() -> None:
     weight = torch.tensor([[2.0, 0.0], [0.0, -1.0]])
-    layers = [Layer(weight, torch.tensor([0.0, 1.0])), Layer(torch.tensor([[1.0, 10.0]]), torch.tensor([0.5]))]
+    layers = [
+        Layer(weight, torch.tensor([0.0, 1.0])),
+        Layer(torch.tensor([[1.0, 10.0]]), torch.tensor([0.5])),
+    ]
     x = torch.tensor([[1.0, 3.0], [-1.0, -3.0]])
     # Hidden, after the ReLU: (2, 0) and (0, 4).
     assert perceptron(x, layers).tolist() == [[2.5], [40.5]]
-    assert perceptron(x, layers[:1]).tolist() == [[2.0, -2.0], [-2.0, 4.0]]  # no ReLU after the last layer
+    # no ReLU after the last layer
+    assert perceptron(x, layers[:1]).tolist() == [[2.0, -2.0], [-2.0, 4.0]]
     with_input = [layers[0], Layer(torch.tensor([[1.0, 10.0, 100.0, 1000.0]]), torch.tensor([0.5]))]
     assert perceptron(x, with_input, skip=1).tolist() == [[3102.5], [-3059.5]]
 
@@ -208,7 +239,9 @@ def test_gradients_that_nobody_asked_for_are_not_computed() -> None:
     assert not perceptron(x, frozen).requires_grad
     with_x = make_rows(9, 5)
     expected = torch.autograd.grad(perceptron(with_x, layers).sum(), [with_x, *parameters(layers)])
-    assert torch.equal(torch.autograd.grad(perceptron(with_x, frozen).sum(), with_x)[0], expected[0])
+    assert torch.equal(
+        torch.autograd.grad(perceptron(with_x, frozen).sum(), with_x)[0], expected[0]
+    )
     grads = torch.autograd.grad(perceptron(x, layers).sum(), parameters(layers))
     assert all(torch.equal(a, b) for a, b in zip(grads, expected[1:], strict=True))
 
@@ -216,21 +249,29 @@ def test_gradients_that_nobody_asked_for_are_not_computed() -> None:
 def test_is_a_well_behaved_torch_op() -> None:
     layers = make_layers([5, 7, 3], None)
     params = torch.cat([p.detach().reshape(-1) for p in parameters(layers)]).requires_grad_()
-    # Activations are not kept here: opcheck would compare the padding between them, which nobody writes or reads.
+    # Activations are not kept here: opcheck would compare the padding between them, which nobody
+    # writes or reads.
     torch.library.opcheck(perceptron_op, (make_rows(9, 5), params, [5, 7, 3], 0, False))
-    inputs, grad = [make_rows(9, 5).detach(), params.detach(), torch.empty(0)], make_rows(9, 3).detach()
+    inputs = [make_rows(9, 5).detach(), params.detach(), torch.empty(0)]
+    grad = make_rows(9, 3).detach()
     torch.library.opcheck(perceptron_backward_op, (inputs, grad, [5, 7, 3], 0, True))
 
 
 def test_compiles_in_one_graph() -> None:
-    x, layers = make_rows(9, 5), make_layers([5, 7, 3], 1)
+    x = make_rows(9, 5)
+    layers = make_layers([5, 7, 3], 1)
     compiled = torch.compile(perceptron, fullgraph=True, backend="aot_eager")
-    assert_close(value_and_gradients(compiled, x, layers, 1), value_and_gradients(perceptron, x, layers, 1), 0.0)
+    assert_close(
+        value_and_gradients(compiled, x, layers, 1),
+        value_and_gradients(perceptron, x, layers, 1),
+        0.0,
+    )
 
 
 def bad_input(change: str) -> tuple[Tensor, list[Layer], int | None]:
     layers = make_layers([5, 7, 3], None)
-    x, skip = make_rows(9, 5), None
+    x = make_rows(9, 5)
+    skip = None
     if change == "rows":
         x = x[0]
     elif change == "no columns":

@@ -1,4 +1,5 @@
-"""The HexPlane look-up and the penalties of its planes against plain torch, finite differences and known answers."""
+"""The HexPlane look-up and the penalties of its planes against plain torch, finite differences and
+known answers."""
 
 from __future__ import annotations
 
@@ -28,28 +29,40 @@ WEIGHTS = (0.3, 0.7, 0.2)
 
 
 def make_levels(
-    sizes: tuple[int, ...], times: int, channels: int, dtype: torch.dtype = torch.float64, seed: int = 0
+    sizes: tuple[int, ...],
+    times: int,
+    channels: int,
+    dtype: torch.dtype = torch.float64,
+    seed: int = 0,
 ) -> list[PlaneLevel]:
     """Random planes around 1, so that products neither vanish nor grow."""
     generator = torch.Generator().manual_seed(seed)
 
     def planes(rows: int, size: int) -> Tensor:
-        return (torch.rand(3, rows, size, channels, generator=generator, dtype=torch.float64) + 0.5).to(dtype)
+        return (
+            torch.rand(3, rows, size, channels, generator=generator, dtype=torch.float64) + 0.5
+        ).to(dtype)
 
     return [PlaneLevel(planes(size, size), planes(times, size)) for size in sizes]
 
 
-def make_coords(count: int, dtype: torch.dtype = torch.float64, reach: float = 1.1, seed: int = 0) -> Tensor:
+def make_coords(
+    count: int, dtype: torch.dtype = torch.float64, reach: float = 1.1, seed: int = 0
+) -> Tensor:
     """(M, 3) uniform in [-reach, reach]."""
     generator = torch.Generator().manual_seed(seed + 1)
-    return (reach * (2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1)).to(dtype)
+    return (reach * (2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1)).to(
+        dtype
+    )
 
 
 def sample(plane: Tensor, fast: Tensor, slow: Tensor) -> Tensor:
     """(M, C) bilinear samples of a plane (rows, columns, C) at coordinates (M,) in [-1, 1]."""
     grid = torch.stack([fast, slow], dim=1)[None, None]
     image = plane.permute(2, 0, 1)[None]
-    return grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
+    return grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[
+        0, :, 0
+    ].T
 
 
 def reference_features(coords: Tensor, time: float, levels: list[PlaneLevel]) -> Tensor:
@@ -79,8 +92,14 @@ def reference_penalty(levels: list[PlaneLevel], weights: tuple[float, float, flo
     total = torch.zeros((), dtype=levels[0].space.dtype)
     for level in levels:
         for space, time in zip(level.space, level.time, strict=True):
-            total = total + weights[0] * (mean_squared_bend(space, 0) + mean_squared_bend(space, 1)) / 2
-            total = total + weights[1] * mean_squared_bend(time, 0) + weights[2] * (1 - time).abs().mean()
+            total = (
+                total + weights[0] * (mean_squared_bend(space, 0) + mean_squared_bend(space, 1)) / 2
+            )
+            total = (
+                total
+                + weights[1] * mean_squared_bend(time, 0)
+                + weights[2] * (1 - time).abs().mean()
+            )
     return total
 
 
@@ -89,14 +108,21 @@ def leaves(levels: list[PlaneLevel]) -> list[Tensor]:
 
 
 def with_gradients(levels: list[PlaneLevel]) -> list[PlaneLevel]:
-    return [PlaneLevel(x.space.clone().requires_grad_(), x.time.clone().requires_grad_()) for x in levels]
+    return [
+        PlaneLevel(x.space.clone().requires_grad_(), x.time.clone().requires_grad_())
+        for x in levels
+    ]
 
 
 def run_features(
-    function: Callable[[Tensor, float, list[PlaneLevel]], Tensor], coords: Tensor, time: float, levels: list[PlaneLevel]
+    function: Callable[[Tensor, float, list[PlaneLevel]], Tensor],
+    coords: Tensor,
+    time: float,
+    levels: list[PlaneLevel],
 ) -> list[Tensor]:
     """Features, and the gradients of a fixed weighted sum of them by coordinates and planes."""
-    coords, levels = coords.clone().requires_grad_(), with_gradients(levels)
+    coords = coords.clone().requires_grad_()
+    levels = with_gradients(levels)
     features = function(coords, time, levels)
     generator = torch.Generator().manual_seed(7)
     upstream = torch.randn(features.shape, generator=generator, dtype=torch.float64).to(features)
@@ -104,7 +130,8 @@ def run_features(
 
 
 def run_penalty(
-    function: Callable[[list[PlaneLevel], tuple[float, float, float]], Tensor], levels: list[PlaneLevel]
+    function: Callable[[list[PlaneLevel], tuple[float, float, float]], Tensor],
+    levels: list[PlaneLevel],
 ) -> list[Tensor]:
     levels = with_gradients(levels)
     value = function(levels, WEIGHTS)
@@ -138,19 +165,21 @@ def assert_equal(got: list[Tensor], expected: list[Tensor]) -> None:
 def test_features_equal_grid_sample(
     count: int, sizes: tuple[int, ...], times: int, channels: int, time: float, seed: int
 ) -> None:
-    levels, coords = make_levels(sizes, times, channels, seed=seed), make_coords(count, seed=seed)
+    levels = make_levels(sizes, times, channels, seed=seed)
+    coords = make_coords(count, seed=seed)
     got = run_features(hexplane_features, coords, time, levels)
     assert_all_close(got, run_features(reference_features, coords, time, levels), 1e-12)
 
 
 @pytest.mark.parametrize("channels", [32, 19])
 def test_every_instruction_set_gives_the_same_features(isa: str, channels: int) -> None:
-    levels, coords = make_levels((16, 32), 9, channels), make_coords(300)
+    levels = make_levels((16, 32), 9, channels)
+    coords = make_coords(300)
     expected = run_features(reference_features, coords, 0.37, levels)
     assert_all_close(run_features(hexplane_features, coords, 0.37, levels), expected, 1e-12)
     singles = [PlaneLevel(x.space.float(), x.time.float()) for x in levels]
-    # Products of six numbers and sums of some hundred terms are good to 1e-6. An index u * 15.5 + 15.5 is good to 2e-6,
-    # and the gradient by u is multiplied by 15.5.
+    # Products of six numbers and sums of some hundred terms are good to 1e-6. An index u * 15.5 +
+    # 15.5 is good to 2e-6, and the gradient by u is multiplied by 15.5.
     got = run_features(hexplane_features, coords.float(), 0.37, singles)
     inside = run_features(reference_features, coords.float().double(), 0.37, levels)
     assert_all_close(got, inside, 2e-5)
@@ -160,8 +189,10 @@ def test_every_instruction_set_gives_the_same_features(isa: str, channels: int) 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_any_number_of_threads_gives_the_same_bytes(channels: int, dtype: torch.dtype) -> None:
     # two levels of three packets of channels or one: more tasks than threads, and fewer
-    levels, coords = make_levels((20, 33), 7, channels, dtype), make_coords(1500, dtype)
-    features, penalties = [], []
+    levels = make_levels((20, 33), 7, channels, dtype)
+    coords = make_coords(1500, dtype)
+    features = []
+    penalties = []
     for threads in (1, 2, 3, 8):
         with kernel_threads(threads):
             features.append(run_features(hexplane_features, coords, 0.61, levels))
@@ -202,15 +233,20 @@ def test_samples_lie_where_they_are_said_to() -> None:
     coords = torch.tensor([[float(i - 1) for i in (x, y, z)]], dtype=torch.float64)
     space = level.space[0, y, x] * level.space[1, z, x] * level.space[2, z, y]
     expected = space * level.time[0, t, x] * level.time[1, t, y] * level.time[2, t, z]
-    torch.testing.assert_close(hexplane_features(coords, t / 3, [level])[0], expected, rtol=1e-14, atol=0)
+    torch.testing.assert_close(
+        hexplane_features(coords, t / 3, [level])[0], expected, rtol=1e-14, atol=0
+    )
 
 
 @pytest.mark.parametrize("time", [0.0, 1.0, -3.0, 4.0, math.inf, -math.inf])
 def test_first_and_last_time(time: float) -> None:
-    levels, coords = make_levels((5,), 6, 4), make_coords(20)
+    levels = make_levels((5,), 6, 4)
+    coords = make_coords(20)
     row = 0 if time <= 0 else 5
     frozen = [PlaneLevel(x.space, x.time[:, row : row + 1]) for x in levels]
-    torch.testing.assert_close(hexplane_features(coords, time, levels), hexplane_features(coords, 0.4, frozen))
+    torch.testing.assert_close(
+        hexplane_features(coords, time, levels), hexplane_features(coords, 0.4, frozen)
+    )
     *_, g_time = run_features(hexplane_features, coords, time, levels)
     assert g_time[:, row].any()
     assert not torch.cat([g_time[:, :row], g_time[:, row + 1 :]], dim=1).any()
@@ -231,7 +267,8 @@ def test_outside_the_box_is_its_border() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_nan_stays_where_it_is(dtype: torch.dtype) -> None:
-    levels, coords = make_levels((6, 1), 3, 20, dtype), make_coords(40, dtype)
+    levels = make_levels((6, 1), 3, 20, dtype)
+    coords = make_coords(40, dtype)
     coords[17, 1] = math.nan
     features, g_coords, *_ = run_features(hexplane_features, coords, 0.2, levels)
     assert features.isnan().all(dim=1).nonzero().flatten().tolist() == [17]
@@ -240,7 +277,9 @@ def test_nan_stays_where_it_is(dtype: torch.dtype) -> None:
 
 
 def test_no_points() -> None:
-    results = run_features(hexplane_features, torch.zeros(0, 3), 0.5, make_levels((4, 8), 3, 32, torch.float32))
+    results = run_features(
+        hexplane_features, torch.zeros(0, 3), 0.5, make_levels((4, 8), 3, 32, torch.float32)
+    )
     features, g_coords, *g_planes = results
     assert features.shape == (0, 64)
     assert g_coords.shape == (0, 3)
@@ -249,15 +288,21 @@ def test_no_points() -> None:
 
 
 def test_order_of_points_does_not_matter() -> None:
-    levels, coords = make_levels((12,), 3, 16), make_coords(100)
+    levels = make_levels((12,), 3, 16)
+    coords = make_coords(100)
     shuffled = torch.randperm(100, generator=torch.Generator().manual_seed(5))
     features = hexplane_features(coords, 0.3, levels)
     assert torch.equal(hexplane_features(coords[shuffled], 0.3, levels), features[shuffled])
 
 
 def test_strided_inputs() -> None:
-    levels, coords = make_levels((7,), 4, 18), make_coords(30)
-    strided = [PlaneLevel(*(x.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0) for x in leaves(levels)))]
+    levels = make_levels((7,), 4, 18)
+    coords = make_coords(30)
+    strided = [
+        PlaneLevel(
+            *(x.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0) for x in leaves(levels))
+        )
+    ]
     assert not strided[0].space.is_contiguous()
     expected = run_features(hexplane_features, coords, 0.4, levels)
     assert_equal(run_features(hexplane_features, coords.T.contiguous().T, 0.4, strided), expected)
@@ -288,11 +333,16 @@ def test_constant_coordinates_get_no_gradient() -> None:
     channels=st.integers(1, 20),
     seed=st.integers(0, 1000),
 )
-def test_penalty_equals_reference(sizes: tuple[int, ...], times: int, channels: int, seed: int) -> None:
+def test_penalty_equals_reference(
+    sizes: tuple[int, ...], times: int, channels: int, seed: int
+) -> None:
     levels = make_levels(sizes, times, channels, seed=seed)
-    # Sums of up to 40 * 40 * 20 squares, one after the other in one and pairwise in the other: half a unit for each.
+    # Sums of up to 40 * 40 * 20 squares, one after the other in one and pairwise in the other: half
+    # a unit for each.
     rounding = 40 * 40 * 20 * 0.5 * torch.finfo(torch.float64).eps
-    assert_all_close(run_penalty(plane_penalty, levels), run_penalty(reference_penalty, levels), rounding)
+    assert_all_close(
+        run_penalty(plane_penalty, levels), run_penalty(reference_penalty, levels), rounding
+    )
 
 
 def test_every_instruction_set_gives_the_same_penalty(isa: str) -> None:
@@ -300,22 +350,29 @@ def test_every_instruction_set_gives_the_same_penalty(isa: str) -> None:
     expected = run_penalty(reference_penalty, levels)
     assert_all_close(run_penalty(plane_penalty, levels), expected, 1e-13)
     singles = [PlaneLevel(x.space.float(), x.time.float()) for x in levels]
-    rounded = run_penalty(reference_penalty, [PlaneLevel(x.space.double(), x.time.double()) for x in singles])
-    assert_all_close(run_penalty(plane_penalty, singles), rounded, 1e-6)  # some ten roundings of 6e-8
+    rounded = run_penalty(
+        reference_penalty, [PlaneLevel(x.space.double(), x.time.double()) for x in singles]
+    )
+    # some ten roundings of 6e-8
+    assert_all_close(run_penalty(plane_penalty, singles), rounded, 1e-6)
 
 
 def test_straight_planes_of_ones_cost_nothing() -> None:
     ramp = torch.arange(8, dtype=torch.float64)
     space = (ramp[:, None] + 3 * ramp)[None, :, :, None].repeat(3, 1, 1, 4)
-    value, g_space, g_time = run_penalty(plane_penalty, [PlaneLevel(space, torch.ones(3, 5, 8, 4).double())])
+    value, g_space, g_time = run_penalty(
+        plane_penalty, [PlaneLevel(space, torch.ones(3, 5, 8, 4).double())]
+    )
     assert value == 0
     assert not g_space.any()
     assert not g_time.any()
 
 
 def test_known_penalty() -> None:
-    space, time = torch.zeros(3, 3, 3, 1), torch.ones(3, 3, 3, 1)
-    space[0, 1, 1, 0] = 1.0  # bends of -2 in the middle of one row and of one column, out of three each
+    space = torch.zeros(3, 3, 3, 1)
+    time = torch.ones(3, 3, 3, 1)
+    # bends of -2 in the middle of one row and of one column, out of three each
+    space[0, 1, 1, 0] = 1.0
     time[1, 1, 2, 0] = 4.0  # a bend of -6, out of three; 3 away from 1, out of nine
     level = [PlaneLevel(space, time)]
     assert plane_penalty(level, (1.0, 0.0, 0.0)).item() == pytest.approx(4 / 3)
@@ -353,15 +410,28 @@ def test_nan_in_a_plane_shows_in_the_penalty() -> None:
         (lambda c, x: (c.double(), 0.5, x), "coordinates must be torch.float32"),
         (lambda c, x: (c, math.nan, x), "time must be a number"),
         (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space[:2], x[0].time)]), "level 0 must have space"),
-        (lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space, x[0].time)]), "level 1 must have space"),
-        (lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space[..., :4], x[1].time[..., :4])]), "level 1 must have"),
+        (
+            lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space, x[0].time)]),
+            "level 1 must have space",
+        ),
+        (
+            lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space[..., :4], x[1].time[..., :4])]),
+            "level 1 must have",
+        ),
         (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time[:, :0])]), "none empty"),
-        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time.double())]), "level 0 must be torch.float32"),
-        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space.half(), x[0].time.half())]), "in float32 or float64"),
+        (
+            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time.double())]),
+            "level 0 must be torch.float32",
+        ),
+        (
+            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space.half(), x[0].time.half())]),
+            "in float32 or float64",
+        ),
     ],
 )
 def test_input_that_does_not_fit(
-    change: Callable[[Tensor, list[PlaneLevel]], tuple[Tensor, float, list[PlaneLevel]]], message: str
+    change: Callable[[Tensor, list[PlaneLevel]], tuple[Tensor, float, list[PlaneLevel]]],
+    message: str,
 ) -> None:
     levels = make_levels((4, 6), 3, 5, torch.float32)
     with pytest.raises(DyngsError, match=message):
@@ -377,9 +447,13 @@ def test_the_kernels_refuse_arrays_that_do_not_fit() -> None:
     (level,) = make_levels((4,), 3, 5, torch.float32)
     arrays = [(level.space, level.time)]
     with pytest.raises(ValueError, match="different sizes"):
-        core.hexplane_forward(torch.zeros(7, 3), arrays, 0.5, torch.zeros(6, 5), torch.zeros(7, dtype=torch.int32), 1)
+        core.hexplane_forward(
+            torch.zeros(7, 3), arrays, 0.5, torch.zeros(6, 5), torch.zeros(7, dtype=torch.int32), 1
+        )
     with pytest.raises(ValueError, match="another size than the planes"):
-        core.plane_penalty(arrays, [(level.time, level.time)], WEIGHTS, torch.zeros(1, dtype=torch.float64), 1)
+        core.plane_penalty(
+            arrays, [(level.time, level.time)], WEIGHTS, torch.zeros(1, dtype=torch.float64), 1
+        )
 
 
 @pytest.mark.parametrize("with_coords", [True, False])
@@ -389,9 +463,11 @@ def test_features_are_a_well_behaved_torch_op(with_coords: bool) -> None:
     torch.library.opcheck(hexplane_op, (coords, leaves(levels), 0.3))
     planes = [x.detach() for x in leaves(levels)]
     features, order = hexplane_op(coords.detach(), planes, 0.3)
-    # The gradient by the coordinates is asked for, because opcheck refuses results without elements that are not new.
+    # The gradient by the coordinates is asked for, because opcheck refuses results without elements
+    # that are not new.
     torch.library.opcheck(
-        hexplane_backward_op, (coords.detach(), planes, order, torch.ones_like(features), 0.3, with_coords)
+        hexplane_backward_op,
+        (coords.detach(), planes, order, torch.ones_like(features), 0.3, with_coords),
     )
 
 
@@ -407,5 +483,8 @@ def test_features_and_penalty_compile_in_one_graph() -> None:
         return hexplane_features(coords, time, levels).sum() + plane_penalty(levels, WEIGHTS)
 
     compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    coords, levels = make_coords(9), make_levels((4, 6), 3, 2)
-    assert_equal(run_features(compiled, coords, 0.3, levels), run_features(run, coords, 0.3, levels))
+    coords = make_coords(9)
+    levels = make_levels((4, 6), 3, 2)
+    assert_equal(
+        run_features(compiled, coords, 0.3, levels), run_features(run, coords, 0.3, levels)
+    )

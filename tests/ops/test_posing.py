@@ -1,4 +1,5 @@
-"""Gaussians moved by joints against T S T^T in float64, and gradients that are exact, and finite where axes are alike.
+"""Gaussians moved by joints against T S T^T in float64, and gradients that are exact, and finite
+where axes are alike.
 
 In the tests, N Gaussians follow J joints.
 """
@@ -27,9 +28,12 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 
 
 def random_case(count: int, joints: int, seed: int = 0) -> list[Tensor]:
-    """Arguments of ``pose_by_joints``, all of them leaves; every Gaussian follows three joints, in all ways."""
+    """Arguments of ``pose_by_joints``, all of them leaves; every Gaussian follows three joints, in
+    all ways."""
     weights = normal(count, joints, seed=seed).exp()
-    weights = weights * (weights >= weights.sort(descending=True).values[:, min(2, joints - 1), None])
+    weights = weights * (
+        weights >= weights.sort(descending=True).values[:, min(2, joints - 1), None]
+    )
     case = [
         normal(count, 3, seed=seed + 1),
         normal(count, 4, seed=seed + 2),
@@ -41,7 +45,8 @@ def random_case(count: int, joints: int, seed: int = 0) -> list[Tensor]:
 
 
 def moved_alone(linear: Tensor, quats: Tensor, log_scales: Tensor) -> Posed:
-    """Gaussians at the origin of which each follows a joint of its own, with the linear map (N, 3, 3)."""
+    """Gaussians at the origin of which each follows a joint of its own, with the linear map (N, 3,
+    3)."""
     transforms = torch.cat([linear, torch.zeros_like(linear[..., :1])], dim=-1)
     weights = torch.eye(len(linear), dtype=linear.dtype)
     return pose_by_joints(torch.zeros_like(log_scales), quats, log_scales, weights, transforms)
@@ -52,7 +57,9 @@ def covariances(quats: Tensor, log_scales: Tensor) -> Tensor:
     return half @ half.mT
 
 
-def reference(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> list[Tensor]:
+def reference(
+    means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor
+) -> list[Tensor]:
     """Means, covariances and blended transforms in plain torch."""
     blended = torch.einsum("nj,jab->nab", weights, transforms)
     linear = blended[..., :3]
@@ -81,7 +88,9 @@ def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) ->
             assert (a.double() - b).abs().max() <= tolerance * max(1.0, b.abs().max().item())
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(count=st.integers(0, 40), joints=st.integers(1, 35), seed=st.integers(0, 1000))
 def test_double_equals_torch(isa: str, count: int, joints: int, seed: int) -> None:
     case = random_case(count, joints, seed)
@@ -90,49 +99,66 @@ def test_double_equals_torch(isa: str, count: int, joints: int, seed: int) -> No
 
 
 @settings(max_examples=30, deadline=None)
-@given(seed=st.integers(0, 2**16), shear=st.sampled_from([0.0, 0.1, 1.0]), spread=st.sampled_from([0.0, 0.5, 3.0]))
+@given(
+    seed=st.integers(0, 2**16),
+    shear=st.sampled_from([0.0, 0.1, 1.0]),
+    spread=st.sampled_from([0.0, 0.5, 3.0]),
+)
 def test_covariances_are_moved_exactly(seed: int, shear: float, spread: float) -> None:
     linear = torch.eye(3, dtype=torch.float64) + shear * normal(40, 3, 3, seed=seed)
-    quats, log_scales = normal(40, 4, seed=seed + 1), spread * normal(40, 3, seed=seed + 2) - 5
+    quats = normal(40, 4, seed=seed + 1)
+    log_scales = spread * normal(40, 3, seed=seed + 2) - 5
     still = covariances(quats, log_scales)
     wanted = linear @ still @ linear.mT
-    # T S T^T cancels where T nearly flattens the longest axis: what rounding does is a fraction of |T|^2 |S|. Up to 24
-    # rotations of 4 roundings each, and the products before and after: 100 or so, twice in a square. Axes of less than
-    # e^-16 of the longest are taken for that.
+    # T S T^T cancels where T nearly flattens the longest axis: what rounding does is a fraction of
+    # |T|^2 |S|. Up to 24 rotations of 4 roundings each, and the products before and after: 100 or
+    # so, twice in a square. Axes of less than e^-16 of the longest are taken for that.
     size = linear.norm(dim=(1, 2)).square() * still.norm(dim=(1, 2))
     thinnest = 4 * math.exp(-32)
     for dtype in (torch.float64, torch.float32):
         found = moved_alone(linear.to(dtype), quats.to(dtype), log_scales.to(dtype))
         moved = covariances(found.quats.double(), found.log_scales.double())
-        assert float(((moved - wanted).norm(dim=(1, 2)) / size).max()) < 100 * torch.finfo(dtype).eps + thinnest
+        assert (
+            float(((moved - wanted).norm(dim=(1, 2)) / size).max())
+            < 100 * torch.finfo(dtype).eps + thinnest
+        )
 
 
 def test_axes_are_the_singular_values() -> None:
-    linear, quats, log_scales = normal(50, 3, 3, seed=1), normal(50, 4, seed=2), normal(50, 3, seed=3)
+    linear = normal(50, 3, 3, seed=1)
+    quats = normal(50, 4, seed=2)
+    log_scales = normal(50, 3, seed=3)
     half = linear @ (rotation_matrices(quats) * log_scales.exp()[:, None])
     wanted = np.linalg.svd(half.numpy(), compute_uv=False)
-    found = moved_alone(linear, quats, log_scales).log_scales.exp().sort(dim=1, descending=True).values
+    found = (
+        moved_alone(linear, quats, log_scales).log_scales.exp().sort(dim=1, descending=True).values
+    )
     torch.testing.assert_close(found, torch.from_numpy(wanted.copy()), rtol=1e-11, atol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_rigid_motion_turns_and_leaves_the_axes(dtype: torch.dtype) -> None:
-    """Discs of two equal axes, too: no axis is turned into the other. A larger body has larger Gaussians."""
+    """Discs of two equal axes, too: no axis is turned into the other. A larger body has larger
+    Gaussians."""
     means, quats, log_scales, weights, _ = (x.detach().to(dtype) for x in random_case(60, 4))
     log_scales[::2, 1] = log_scales[::2, 0]
-    turn, shift = rotation_matrices(normal(1, 4, seed=9))[0].to(dtype), torch.tensor([1.0, 2, 3], dtype=dtype)
+    turn = rotation_matrices(normal(1, 4, seed=9))[0].to(dtype)
+    shift = torch.tensor([1.0, 2, 3], dtype=dtype)
     transforms = torch.cat([2.5 * turn, shift[:, None]], dim=1).expand(4, 3, 4)
     found = pose_by_joints(means, quats, log_scales, weights, transforms)
     near = {"rtol": 0, "atol": 100 * torch.finfo(dtype).eps}
     torch.testing.assert_close(found.means, 2.5 * means @ turn.T + shift, **near)
     torch.testing.assert_close(found.log_scales, log_scales + math.log(2.5), **near)
-    torch.testing.assert_close(rotation_matrices(found.quats), turn @ rotation_matrices(quats), **near)
+    torch.testing.assert_close(
+        rotation_matrices(found.quats), turn @ rotation_matrices(quats), **near
+    )
     assert (found.quats.gather(1, found.quats.abs().argmax(1, keepdim=True)) > 0).all()
 
 
 def test_a_reflection_gives_rotations_all_the_same() -> None:
     mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)).expand(4, 3, 3)
-    quats, log_scales = normal(4, 4), normal(4, 3, seed=3)
+    quats = normal(4, 4)
+    log_scales = normal(4, 3, seed=3)
     found = moved_alone(mirror, quats, log_scales)
     wanted = mirror @ covariances(quats, log_scales) @ mirror.mT
     torch.testing.assert_close(covariances(found.quats, found.log_scales), wanted)
@@ -154,13 +180,24 @@ def test_float_agrees_with_double(isa: str) -> None:
     assert_close(results(posed, single), results(posed, case), 1e-5)
 
 
-@pytest.mark.parametrize("log_scales", [(-4.0, -4.0, -4.0), (-4.0, -4.0, -6.0), (0.0, -80.0, -80.0)])
-@pytest.mark.parametrize("flattened", [(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (0, 0, 1), (0, 0, 0)])
+@pytest.mark.parametrize(
+    "log_scales", [(-4.0, -4.0, -4.0), (-4.0, -4.0, -6.0), (0.0, -80.0, -80.0)]
+)
+@pytest.mark.parametrize(
+    "flattened", [(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (0, 0, 1), (0, 0, 0)]
+)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_maps_that_flatten(log_scales: tuple[float, ...], flattened: tuple[int, ...], dtype: torch.dtype) -> None:
-    """As blends of opposite rotations do: discs, balls and needles are moved exactly, and all gradients are finite."""
+def test_maps_that_flatten(
+    log_scales: tuple[float, ...], flattened: tuple[int, ...], dtype: torch.dtype
+) -> None:
+    """As blends of opposite rotations do: discs, balls and needles are moved exactly, and all
+    gradients are finite."""
     linear = rotation_matrices(normal(5, 4)) * torch.tensor(flattened)
-    given = [linear, torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1), torch.tensor([log_scales]).repeat(5, 1)]
+    given = [
+        linear,
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1),
+        torch.tensor([log_scales]).repeat(5, 1),
+    ]
     given = [x.to(dtype).requires_grad_() for x in given]
     found = moved_alone(*given)
     wanted = linear @ covariances(*(x.detach().double() for x in given[1:])) @ linear.mT
@@ -217,7 +254,13 @@ def test_nan_stays_with_its_gaussian(which: int, bad: float) -> None:
     case[which][17, 1] = bad
     found = pose_by_joints(*case)
     lost = torch.arange(40) == 17
-    touched = ("means",) if which == 0 else ("quats", "log_scales") if which < 3 else ("means", "log_scales")
+    touched = (
+        ("means",)
+        if which == 0
+        else ("quats", "log_scales")
+        if which < 3
+        else ("means", "log_scales")
+    )
     for name in touched:
         assert not getattr(found, name)[lost].isfinite().all()
     for name in ("means", "quats", "log_scales", "transforms"):
@@ -239,7 +282,8 @@ def test_gradients_that_nobody_asks_for() -> None:
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
     case = [x.detach().to(dtype) for x in random_case(5, 3)]
-    found, wanted = pose_by_joints(*case), pose_by_joints(*(x.float() for x in case))
+    found = pose_by_joints(*case)
+    wanted = pose_by_joints(*(x.float() for x in case))
     assert found.quats.dtype == torch.float32
     assert torch.equal(found.quats, wanted.quats)
 
@@ -265,7 +309,9 @@ def test_bad_inputs_are_refused() -> None:
 
 def test_second_derivatives_are_refused() -> None:
     case = random_case(4, 2)
-    (first,) = torch.autograd.grad(pose_by_joints(*case).means.square().sum(), case[4], create_graph=True)
+    (first,) = torch.autograd.grad(
+        pose_by_joints(*case).means.square().sum(), case[4], create_graph=True
+    )
     with pytest.raises(DyngsError, match="differentiable once"):
         first.square().sum().backward()
 
@@ -273,7 +319,9 @@ def test_second_derivatives_are_refused() -> None:
 def test_it_is_a_well_behaved_torch_op() -> None:
     case = random_case(9, 4)
     torch.library.opcheck(posing_op, tuple(case))
-    rest, weights, transforms = [x.detach() for x in case[:3]], case[3].detach(), case[4].detach()
+    rest = [x.detach() for x in case[:3]]
+    weights = case[3].detach()
+    transforms = case[4].detach()
     found = list(posing_op(*rest, weights, transforms))
     grads = [torch.ones_like(x) for x in rest]
     for by_blended, with_weights in ((None, False), (torch.ones_like(found[3]), True)):
@@ -284,6 +332,8 @@ def test_it_is_a_well_behaved_torch_op() -> None:
 def test_compiles_in_one_graph() -> None:
     compiled = torch.compile(posed, fullgraph=True, backend="aot_eager")
     case = random_case(9, 4)
-    found, expected = (torch.autograd.grad(sum(x.sum() for x in f(*case)), case) for f in (compiled, posed))
+    found, expected = (
+        torch.autograd.grad(sum(x.sum() for x in f(*case)), case) for f in (compiled, posed)
+    )
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a, b)

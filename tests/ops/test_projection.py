@@ -1,4 +1,5 @@
-"""The native projection: against the reference in float64, on every instruction set, and what it culls."""
+"""The native projection: against the reference in float64, on every instruction set, and what it
+culls."""
 
 from __future__ import annotations
 
@@ -14,7 +15,13 @@ from scenes import Scene, look_around, random_scene, relative_error, weights
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.ops.projection import Projection, ProjectionOptions, project, project_backward_op, project_op
+from dyngs.ops.projection import (
+    Projection,
+    ProjectionOptions,
+    project,
+    project_backward_op,
+    project_op,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -23,15 +30,21 @@ INPUTS = ("means", "quats", "scales", "cam_from_world", "intrinsics")
 DEFAULTS = ProjectionOptions()
 
 
-def splats(scene: Scene, options: ProjectionOptions = DEFAULTS, function: Callable = project) -> Projection:
+def splats(
+    scene: Scene, options: ProjectionOptions = DEFAULTS, function: Callable = project
+) -> Projection:
     return function(scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras, options)
 
 
-def slopes(scene: Scene, options: ProjectionOptions = DEFAULTS, function: Callable = project) -> list[Tensor]:
+def slopes(
+    scene: Scene, options: ProjectionOptions = DEFAULTS, function: Callable = project
+) -> list[Tensor]:
     """Gradients of a weighted sum of all outputs with respect to INPUTS."""
     leaves = scene.leaves()
     p = splats(leaves, options, function)
-    total = torch.stack([(getattr(p, name) * weights(getattr(p, name))).sum() for name in OUTPUTS]).sum()
+    total = torch.stack(
+        [(getattr(p, name) * weights(getattr(p, name))).sum() for name in OUTPUTS]
+    ).sum()
     return list(torch.autograd.grad(total, [getattr(leaves, name) for name in INPUTS]))
 
 
@@ -40,7 +53,8 @@ def visible(p: Projection) -> Tensor:
 
 
 def front(n: int = 1, dtype: torch.dtype = torch.float64) -> Scene:
-    """n copies of a ball on the axis of one camera at the origin, 3 units in front of it; 32x32 px."""
+    """n copies of a ball on the axis of one camera at the origin, 3 units in front of it; 32x32
+    px."""
     scene = random_scene(n=n, views=1, size=(32, 32)).to(dtype)
     means = torch.zeros_like(scene.means)
     means[:, 2] = 3
@@ -65,16 +79,24 @@ def front(n: int = 1, dtype: torch.dtype = torch.float64) -> Scene:
     alpha_min=st.sampled_from([0.0, 1 / 255]),
 )
 def test_equals_the_reference(seed: int, antialiased: bool, eps2d: float, alpha_min: float) -> None:
-    """rtol 1e-9: both are float64; needles and the clamp of the Jacobian are among the random Gaussians."""
+    """rtol 1e-9: both are float64; needles and the clamp of the Jacobian are among the random
+    Gaussians."""
     scene = random_scene(n=33, views=3, seed=seed)
-    scene = replace(scene, means=2 * scene.means, scales=scene.scales * torch.logspace(-2, 1, 33).double()[:, None])
+    scene = replace(
+        scene,
+        means=2 * scene.means,
+        scales=scene.scales * torch.logspace(-2, 1, 33).double()[:, None],
+    )
     options = ProjectionOptions(eps2d=eps2d, antialiased=antialiased, alpha_min=alpha_min)
-    ours, truth = splats(scene, options), splats(scene, options, reference.project)
+    ours = splats(scene, options)
+    truth = splats(scene, options, reference.project)
     assert torch.equal(ours.radii, truth.radii)
     for name in OUTPUTS:
         torch.testing.assert_close(getattr(ours, name), getattr(truth, name), rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(ours.conics, truth.conics, rtol=1e-9, atol=1e-12)
-    for name, x, y in zip(INPUTS, slopes(scene, options), slopes(scene, options, reference.project), strict=True):
+    for name, x, y in zip(
+        INPUTS, slopes(scene, options), slopes(scene, options, reference.project), strict=True
+    ):
         assert relative_error(x, y) < 1e-9, name
 
 
@@ -90,15 +112,19 @@ def test_gradcheck() -> None:
 
 
 def test_float_equals_double_on_every_isa(isa: str) -> None:
-    """1e-5: rounding, 6e-8 per operation, times the condition of the formulas (x/z of points near the camera)."""
+    """1e-5: rounding, 6e-8 per operation, times the condition of the formulas (x/z of points near
+    the camera)."""
     scene = random_scene(n=200).to(torch.float32)
     truth_scene = scene.to(torch.float64)
     options = ProjectionOptions(alpha_min=0.0)
-    ours, truth = splats(scene, options), splats(truth_scene, options)
+    ours = splats(scene, options)
+    truth = splats(truth_scene, options)
     assert torch.equal(visible(ours), visible(truth))
     for name in OUTPUTS:
         assert relative_error(getattr(ours, name), getattr(truth, name)) < 1e-5, name
-    for name, x, y in zip(INPUTS, slopes(scene, options), slopes(truth_scene, options), strict=True):
+    for name, x, y in zip(
+        INPUTS, slopes(scene, options), slopes(truth_scene, options), strict=True
+    ):
         assert relative_error(x, y) < 1e-5, name
 
 
@@ -169,7 +195,11 @@ def test_faint_and_small_splats_are_culled(dtype: torch.dtype) -> None:
     scene = front(3, dtype)
     scene.opacities[:] = torch.tensor([1 / 255, 1.001 / 255, 1.0], dtype=dtype)
     assert visible(splats(scene))[0].tolist() == [False, True, True]
-    assert visible(splats(scene, ProjectionOptions(radius_clip=3.0)))[0].tolist() == [False, False, True]
+    assert visible(splats(scene, ProjectionOptions(radius_clip=3.0)))[0].tolist() == [
+        False,
+        False,
+        True,
+    ]
 
 
 def test_splats_beside_the_image_are_culled() -> None:
@@ -190,11 +220,14 @@ def test_culled_rows_are_zero_and_get_no_gradient() -> None:
 
 
 def test_extent_holds_every_pixel_that_is_drawn() -> None:
-    """Alpha just outside the extent is below alpha_min, just inside (half extents are rounded up by at most 1) not."""
+    """Alpha just outside the extent is below alpha_min, just inside (half extents are rounded up by
+    at most 1) not."""
     scene = random_scene(n=50, views=1)
     p = splats(scene)
     seen = visible(p)[0]
-    covariance = torch.linalg.inv(torch.stack([p.conics[0, seen][:, [0, 1]], p.conics[0, seen][:, [1, 2]]], 1))
+    covariance = torch.linalg.inv(
+        torch.stack([p.conics[0, seen][:, [0, 1]], p.conics[0, seen][:, [1, 2]]], 1)
+    )
     reach = (2 * (scene.opacities[seen] * 255).log())[:, None] * covariance.diagonal(dim1=1, dim2=2)
     assert (p.radii[0, seen] >= reach.sqrt() - 1e-9).all()
     assert (p.radii[0, seen] < reach.sqrt() + 1).all()
@@ -212,12 +245,16 @@ def test_compensation_is_the_share_of_light_before_the_low_pass() -> None:
     bare = (float(scene.intrinsics[0, 0, 0]) * 0.1 / 3) ** 2
     p = splats(scene)
     assert p.compensations.item() == pytest.approx(bare / (bare + 0.3), rel=1e-12)
-    assert splats(scene, ProjectionOptions(eps2d=0.0)).compensations.item() == pytest.approx(1, rel=1e-12)
+    assert splats(scene, ProjectionOptions(eps2d=0.0)).compensations.item() == pytest.approx(
+        1, rel=1e-12
+    )
 
 
 def test_quaternions_need_not_be_normalised(scene: Scene) -> None:
     longer = replace(scene, quats=7 * scene.quats)
-    torch.testing.assert_close(splats(longer).factors, splats(scene).factors, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(
+        splats(longer).factors, splats(scene).factors, rtol=1e-12, atol=1e-14
+    )
     torch.testing.assert_close(7 * slopes(longer)[1], slopes(scene)[1], rtol=1e-9, atol=1e-12)
     along = (slopes(scene)[1] * scene.quats).sum(-1)
     assert along.abs().max() < 1e-12 * slopes(scene)[1].abs().max()  # length has no influence
@@ -225,7 +262,8 @@ def test_quaternions_need_not_be_normalised(scene: Scene) -> None:
 
 def test_world_and_camera_moved_together_see_the_same(scene: Scene) -> None:
     motion = look_around(3)[2]
-    turn = torch.tensor([0.955336489125606, 0.0, 0.29552020666133955, 0.0], dtype=torch.float64)  # 0.6 rad about y
+    # 0.6 rad about y
+    turn = torch.tensor([0.955336489125606, 0.0, 0.29552020666133955, 0.0], dtype=torch.float64)
     w, (x, y, z, s) = turn, scene.quats.unbind(-1)
     product = [w[0] * x - w[2] * z, w[0] * y + w[2] * s, w[0] * z + w[2] * x, w[0] * s - w[2] * y]
     moved = replace(
@@ -234,7 +272,8 @@ def test_world_and_camera_moved_together_see_the_same(scene: Scene) -> None:
         quats=torch.stack(product, -1),
         cam_from_world=scene.cam_from_world @ torch.linalg.inv(motion),
     )
-    ours, truth = splats(moved), splats(scene)
+    ours = splats(moved)
+    truth = splats(scene)
     for name in OUTPUTS:
         assert relative_error(getattr(ours, name), getattr(truth, name)) < 1e-12, name
 
@@ -243,14 +282,28 @@ def test_world_and_camera_moved_together_see_the_same(scene: Scene) -> None:
 def test_opcheck(with_cameras: bool, scene: Scene) -> None:
     leaves = scene.leaves()
     cameras = leaves if with_cameras else scene
-    tensors = (leaves.means, leaves.quats, leaves.scales, scene.opacities, cameras.cam_from_world, cameras.intrinsics)
+    tensors = (
+        leaves.means,
+        leaves.quats,
+        leaves.scales,
+        scene.opacities,
+        cameras.cam_from_world,
+        cameras.intrinsics,
+    )
     args = (*tensors, list(scene.size), [0.3, 0.2, 1e10, 0.0, 0.0], False)
     torch.library.opcheck(project_op, args)
 
 
 def test_opcheck_backward(scene: Scene) -> None:
     p = splats(scene)
-    tensors = [scene.means, scene.quats, scene.scales, scene.opacities, scene.cam_from_world, scene.intrinsics]
+    tensors = [
+        scene.means,
+        scene.quats,
+        scene.scales,
+        scene.opacities,
+        scene.cam_from_world,
+        scene.intrinsics,
+    ]
     grads = [weights(getattr(p, name)) for name in OUTPUTS]
     args = (tensors, p.radii, grads, list(scene.size), [0.3, 0.2, 1e10, 0.0, 0.0], False, True)
     torch.library.opcheck(project_backward_op, args)

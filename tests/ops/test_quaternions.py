@@ -21,7 +21,8 @@ from dyngs.ops.quaternions import quat_product, quats_of, rotate, rotation_matri
 
 SCALES = [1e-45, 1e-38, 1e-30, 1e-20, 1e-13, 1e-6, 1.0, 1e6, 1e13, 1e20, 1e37]
 ROUNDING = 8 * torch.finfo(torch.float32).eps
-"""Of a unit quaternion: two divisions, four squares, their sum, the root; and again for what it is compared with."""
+"""Of a unit quaternion: two divisions, four squares, their sum, the root; and again for what it is
+compared with."""
 
 
 def some_quats(seed: int = 0) -> Tensor:
@@ -43,12 +44,16 @@ def test_any_length_is_made_one(seed: int, exponent: float) -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_user_takes_every_length(scale: float) -> None:
-    """1e20 and 1e-13 were wrong in each: their squares leave float32, or the norm was taken for 1e-12 at least."""
+    """1e20 and 1e-13 were wrong in each: their squares leave float32, or the norm was taken for
+    1e-12 at least."""
     short = scale < 1e-40
-    quats = torch.tensor([[1.0, 2.0, -3.0, 4.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 1.0, 1.0, 1.0]]) * (1 if short else scale)
+    quats = torch.tensor([[1.0, 2.0, -3.0, 4.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 1.0, 1.0, 1.0]]) * (
+        1 if short else scale
+    )
     quats = quats.sign() * scale if short else quats
     matrices = rotation_matrices(quats.double()).float()
-    vectors, log_scales = torch.randn(3, 3), torch.tensor([[0.0, -1.0, -2.0]]).repeat(3, 1)
+    vectors = torch.randn(3, 3)
+    log_scales = torch.tensor([[0.0, -1.0, -2.0]]).repeat(3, 1)
     close = {"rtol": 0, "atol": 8 * ROUNDING}  # entries are sums of products of two entries each
     torch.testing.assert_close(rotation_matrices(quats), matrices, **close)
     torch.testing.assert_close(shortest_axes(quats, log_scales), matrices[:, :, 2], **close)
@@ -69,15 +74,21 @@ def test_every_user_takes_every_length(scale: float) -> None:
 def test_gradients_are_those_of_the_kernel(scale: float) -> None:
     """Divided by the norm, for which at least 1e-12 is taken (for the largest entry)."""
     quats = (torch.tensor([[1.0, 0.5, -0.25, 2.0]]) * scale).requires_grad_()
-    means, scales = torch.tensor([[0.1, 0.2, 4.0]]), torch.tensor([[0.3, 0.2, 0.1]])
-    cameras = Cameras(torch.eye(4)[None], torch.tensor([[[50.0, 0, 25], [0, 50, 25], [0, 0, 1]]]), 50, 50)
+    means = torch.tensor([[0.1, 0.2, 4.0]])
+    scales = torch.tensor([[0.3, 0.2, 0.1]])
+    cameras = Cameras(
+        torch.eye(4)[None], torch.tensor([[[50.0, 0, 25], [0, 50, 25], [0, 0, 1]]]), 50, 50
+    )
 
     def slope(given: Tensor) -> Tensor:
         factors = project(means, given, scales, torch.ones(1), cameras).factors
         return torch.autograd.grad((factors * torch.tensor([1.0, 2.0, 3.0])).sum(), quats)[0]
 
-    by_kernel, by_torch = slope(quats), slope(unit_quats(quats))
-    torch.testing.assert_close(by_torch, by_kernel, rtol=1e-4, atol=float(1e-4 * by_kernel.abs().max()))
+    by_kernel = slope(quats)
+    by_torch = slope(unit_quats(quats))
+    torch.testing.assert_close(
+        by_torch, by_kernel, rtol=1e-4, atol=float(1e-4 * by_kernel.abs().max())
+    )
     assert bool(by_torch.isfinite().all())
     assert scale > 1e20 or bool(by_torch.any())
 
@@ -96,15 +107,20 @@ def test_zero_is_the_identity_and_what_is_not_finite_stays_so() -> None:
 def test_rotation_of_a_quarter_turn_and_of_nothing() -> None:
     quats = torch.tensor([[2.0, 0, 0, 2.0], [0.0, 0, 0, 0]], dtype=torch.float64)
     turn, nothing = rotation_matrices(quats)
-    torch.testing.assert_close(turn @ torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 1, 0]).double())
+    torch.testing.assert_close(
+        turn @ torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 1, 0]).double()
+    )
     assert torch.equal(nothing, torch.eye(3, dtype=torch.float64))
 
 
 def test_products_rotate_by_the_right_one_first() -> None:
-    first, second = some_quats(1).double(), some_quats(2).double()
+    first = some_quats(1).double()
+    second = some_quats(2).double()
     vectors = torch.randn(50, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     both = quat_product(second, first)
-    torch.testing.assert_close(rotation_matrices(both), rotation_matrices(second) @ rotation_matrices(first))
+    torch.testing.assert_close(
+        rotation_matrices(both), rotation_matrices(second) @ rotation_matrices(first)
+    )
     torch.testing.assert_close(rotate(both, vectors), rotate(second, rotate(first, vectors)))
     torch.testing.assert_close(both.norm(dim=1), first.norm(dim=1) * second.norm(dim=1))
 
@@ -112,7 +128,9 @@ def test_products_rotate_by_the_right_one_first() -> None:
 def random_rotations(count: int, noise: float = 0.0) -> Tensor:
     generator = torch.Generator().manual_seed(3)
     turns = Rotation.from_quat(np.random.default_rng(0).normal(size=(count, 4))).as_matrix()
-    return torch.from_numpy(turns) + noise * torch.randn(count, 3, 3, dtype=torch.float64, generator=generator)
+    return torch.from_numpy(turns) + noise * torch.randn(
+        count, 3, 3, dtype=torch.float64, generator=generator
+    )
 
 
 def matrix_of(quat: Tensor) -> Tensor:
@@ -121,7 +139,11 @@ def matrix_of(quat: Tensor) -> Tensor:
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.lists(st.sampled_from([-1.0, -0.6, -1e-9, 0.0, 1e-9, 0.3, 1.0]), min_size=4, max_size=4).filter(any))
+@given(
+    st.lists(
+        st.sampled_from([-1.0, -0.6, -1e-9, 0.0, 1e-9, 0.3, 1.0]), min_size=4, max_size=4
+    ).filter(any)
+)
 def test_quaternions_give_the_rotation_back(numbers: list[float]) -> None:
     """Of any rotation: half turns, and those with two or more components equally large."""
     quat = torch.nn.functional.normalize(torch.tensor(numbers, dtype=torch.float64), dim=0)
@@ -133,7 +155,9 @@ def test_quaternions_give_the_rotation_back(numbers: list[float]) -> None:
 def test_known_quaternions() -> None:
     assert quats_of(torch.eye(3)).tolist() == [1, 0, 0, 0]
     for axis in range(3):
-        half_turn = 2 * torch.diag(torch.nn.functional.one_hot(torch.tensor(axis), 3)).float() - torch.eye(3)
+        half_turn = 2 * torch.diag(
+            torch.nn.functional.one_hot(torch.tensor(axis), 3)
+        ).float() - torch.eye(3)
         assert quats_of(half_turn).tolist() == [float(k == axis + 1) for k in range(4)]
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert quats_of(quarter).tolist() == pytest.approx([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])
@@ -149,5 +173,7 @@ def test_gradients_of_quaternions() -> None:
     turns = random_rotations(20)
     assert set(quats_of(turns).abs().argmax(1).tolist()) == {0, 1, 2, 3}
     assert torch.autograd.gradcheck(quats_of, turns.requires_grad_())
-    half_turns = torch.stack([torch.diag(torch.tensor(x, dtype=torch.float64)) for x in ([1.0, -1, -1], [1, 1, 1])])
+    half_turns = torch.stack(
+        [torch.diag(torch.tensor(x, dtype=torch.float64)) for x in ([1.0, -1, -1], [1, 1, 1])]
+    )
     assert torch.autograd.gradcheck(quats_of, half_turns.requires_grad_())

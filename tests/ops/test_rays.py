@@ -40,7 +40,12 @@ def towards(*direction: float, origin: tuple[float, float, float] = (-5.0, 0.13,
 def some_rays(count: int, seed: int = 0) -> Rays:
     """From around a sphere of radius 3 to near its middle."""
     generator = torch.Generator().manual_seed(seed)
-    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64)) * 3
+    origins = (
+        torch.nn.functional.normalize(
+            torch.randn(count, 3, generator=generator, dtype=torch.float64)
+        )
+        * 3
+    )
     aims = torch.randn(count, 3, generator=generator, dtype=torch.float64) * 0.6
     return Rays(origins, torch.nn.functional.normalize(aims - origins))
 
@@ -51,42 +56,80 @@ def shifts_of(rays: Rays, value: float = 0.5) -> torch.Tensor:
 
 def some_samples(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Samples]:
     """Densities, colours and samples of rays with so many each."""
-    generator, total = torch.Generator().manual_seed(seed), sum(counts)
+    generator = torch.Generator().manual_seed(seed)
+    total = sum(counts)
     densities = torch.rand(total, generator=generator, dtype=torch.float64) * 3
     colours = torch.rand(total, 3, generator=generator, dtype=torch.float64)
     starts = torch.rand(total, generator=generator, dtype=torch.float64).cumsum(0)
     lengths = torch.rand(total, generator=generator, dtype=torch.float64)
     rays = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts, dtype=torch.long))
     offsets = offsets_of(torch.tensor(counts, dtype=torch.long))
-    samples = Samples(offsets, rays, starts, starts + lengths, torch.zeros(total, 3, dtype=torch.float64))
+    samples = Samples(
+        offsets, rays, starts, starts + lengths, torch.zeros(total, 3, dtype=torch.float64)
+    )
     return densities.requires_grad_(), colours.requires_grad_(), samples
 
 
 @given(seed=st.integers(0, 10_000), shift=st.floats(0, 0.99), fraction=st.floats(0, 1))
 @settings(max_examples=30, deadline=None)
-def test_samples_lie_in_occupied_cells_and_none_is_skipped(seed: int, shift: float, fraction: float) -> None:
+def test_samples_lie_in_occupied_cells_and_none_is_skipped(
+    seed: int, shift: float, fraction: float
+) -> None:
     generator = torch.Generator().manual_seed(seed)
     occupied = torch.rand(NESTED.shape, generator=generator) < fraction
-    rays, steps = some_rays(1, seed), Steps(0.05, 0.07)
+    rays = some_rays(1, seed)
+    steps = Steps(0.05, 0.07)
     found = march(rays, shifts_of(rays, shift), NESTED, occupied, steps)
     expected = reference_march(rays.origins[0], rays.directions[0], shift, NESTED, occupied, steps)
     assert found.starts.tolist() == pytest.approx(expected)
     middles = rays.origins + rays.directions * ((found.starts + found.ends) / 2)[:, None]
-    assert all(bool(occupied[cell]) for cell in (cell_of(NESTED, x) for x in middles) if cell is not None)
+    assert all(
+        bool(occupied[cell]) for cell in (cell_of(NESTED, x) for x in middles) if cell is not None
+    )
     assert torch.allclose(found.coords, NESTED.unit(middles))
 
 
 def test_an_empty_space_has_no_samples_and_a_full_one_all() -> None:
-    space, rays = Space((0.0, 0, 0), 1.0, 1, 4), towards(1.0, 0.0, 0.0)
-    full = march(rays, shifts_of(rays, 0.25), space, torch.ones(space.shape, dtype=torch.bool), Steps(0.0, 0.125))
+    space = Space((0.0, 0, 0), 1.0, 1, 4)
+    rays = towards(1.0, 0.0, 0.0)
+    full = march(
+        rays,
+        shifts_of(rays, 0.25),
+        space,
+        torch.ones(space.shape, dtype=torch.bool),
+        Steps(0.0, 0.125),
+    )
     assert len(full) == 16
-    assert len(march(rays, shifts_of(rays), space, torch.zeros(space.shape, dtype=torch.bool), Steps(0.0, 0.125))) == 0
+    assert (
+        len(
+            march(
+                rays,
+                shifts_of(rays),
+                space,
+                torch.zeros(space.shape, dtype=torch.bool),
+                Steps(0.0, 0.125),
+            )
+        )
+        == 0
+    )
     away = towards(-1.0, 0.0, 0.0)
-    assert len(march(away, shifts_of(away), space, torch.ones(space.shape, dtype=torch.bool), Steps(0.0, 0.125))) == 0
+    assert (
+        len(
+            march(
+                away,
+                shifts_of(away),
+                space,
+                torch.ones(space.shape, dtype=torch.bool),
+                Steps(0.0, 0.125),
+            )
+        )
+        == 0
+    )
 
 
 def test_samples_grow_with_the_distance() -> None:
-    rays, all_cells = towards(1.0, 0.1, 0.0), torch.ones(NESTED.shape, dtype=torch.bool)
+    rays = towards(1.0, 0.1, 0.0)
+    all_cells = torch.ones(NESTED.shape, dtype=torch.bool)
     found = march(rays, shifts_of(rays), NESTED, all_cells, Steps(0.05, 0.01, cone=0.02))
     lengths = found.ends - found.starts
     assert torch.allclose(lengths, (0.02 * found.starts).clamp_min(0.01))
@@ -94,8 +137,10 @@ def test_samples_grow_with_the_distance() -> None:
 
 
 def test_hard_rays_end() -> None:
-    """Along a wall, of no direction, of no number, from so far away that a step is lost in rounding."""
-    space, all_cells = Space((0.0, 0, 0), 1.0, 1, 4), torch.ones(1, 4, 4, 4, dtype=torch.bool)
+    """Along a wall, of no direction, of no number, from so far away that a step is lost in
+    rounding."""
+    space = Space((0.0, 0, 0), 1.0, 1, 4)
+    all_cells = torch.ones(1, 4, 4, 4, dtype=torch.bool)
     origins = torch.tensor([[-5.0, 1, 1], [0, 0, 0], [math.nan, 0, 0], [-1e9, 0, 0]])
     rays = Rays(origins, torch.tensor([[1.0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]]))
     found = march(rays, torch.full((4,), 0.5), space, all_cells, Steps(0.0, 0.1, most=100))
@@ -104,31 +149,49 @@ def test_hard_rays_end() -> None:
 
 
 def test_the_unit_cube_holds_everything_and_the_middle_half_what_is_near() -> None:
-    points = torch.tensor([[1.0, 0, 0], [2.0, 0, 0], [1e6, 0, 0], [-1.0, 1, 0.5]], dtype=torch.float64)
+    points = torch.tensor(
+        [[1.0, 0, 0], [2.0, 0, 0], [1e6, 0, 0], [-1.0, 1, 0.5]], dtype=torch.float64
+    )
     unit = Space((0.0, 0, 0), 1.0, 2, 8).unit(points)
     assert unit[:3, 0].tolist() == pytest.approx([0.75, 0.875, 1.0], abs=1e-6)
     assert unit[3].tolist() == pytest.approx([0.25, 0.75, 0.625])
     assert Space((0.0, 0, 0), 2.0, 1, 8).unit(points)[1].tolist() == pytest.approx([1.0, 0.5, 0.5])
 
 
-@given(counts=st.lists(st.integers(0, 12), min_size=1, max_size=6), seed=st.integers(0, 1000), least=st.floats(0, 0.5))
+@given(
+    counts=st.lists(st.integers(0, 12), min_size=1, max_size=6),
+    seed=st.integers(0, 1000),
+    least=st.floats(0, 0.5),
+)
 @settings(max_examples=40, deadline=None)
 def test_rays_see_what_a_loop_sees(counts: list[int], seed: int, least: float) -> None:
     densities, colours, samples = some_samples(counts, seed)
     found = composite(densities, colours, samples, least)
     expected = reference_composite(densities, colours, samples, least)
     results = found.colour, found.transmittance, found.depth
-    weights = [torch.randn(x.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64) for x in expected]
-    assert all(torch.allclose(a, b, rtol=1e-12, atol=1e-12) for a, b in zip(results, expected, strict=True))
+    weights = [
+        torch.randn(x.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+        for x in expected
+    ]
+    assert all(
+        torch.allclose(a, b, rtol=1e-12, atol=1e-12) for a, b in zip(results, expected, strict=True)
+    )
     if sum(counts):
-        by_kernel, by_loop = (torch.autograd.grad(out, (densities, colours), weights) for out in (results, expected))
-        assert all(torch.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in zip(by_kernel, by_loop, strict=True))
+        by_kernel, by_loop = (
+            torch.autograd.grad(out, (densities, colours), weights) for out in (results, expected)
+        )
+        assert all(
+            torch.allclose(a, b, rtol=1e-9, atol=1e-12)
+            for a, b in zip(by_kernel, by_loop, strict=True)
+        )
 
 
 def test_gradients_are_those_of_finite_differences() -> None:
     densities, colours, samples = some_samples([4, 0, 7])
     rest = samples.starts, samples.ends, samples.offsets
-    assert torch.autograd.gradcheck(lambda a, b: composite_op(a, b, *rest, 0.0)[:3], (densities, colours))
+    assert torch.autograd.gradcheck(
+        lambda a, b: composite_op(a, b, *rest, 0.0)[:3], (densities, colours)
+    )
 
 
 def test_nothing_is_seen_through_a_wall_and_everything_through_air() -> None:
@@ -148,14 +211,22 @@ def test_what_is_not_reached_changes_nothing() -> None:
     densities, colours, samples = some_samples([30, 30])
     which, offsets = reached(densities, samples, 0.01)
     assert 0 < int(which.sum()) < 60
-    left = Samples(offsets, samples.rays[which], samples.starts[which], samples.ends[which], samples.coords[which])
-    one, other = composite(densities, colours, samples, 0.01), composite(densities[which], colours[which], left, 0.01)
+    left = Samples(
+        offsets,
+        samples.rays[which],
+        samples.starts[which],
+        samples.ends[which],
+        samples.coords[which],
+    )
+    one = composite(densities, colours, samples, 0.01)
+    other = composite(densities[which], colours[which], left, 0.01)
     assert torch.equal(one.colour, other.colour)
     assert torch.equal(one.transmittance, other.transmittance)
 
 
 def test_the_same_bytes_on_any_number_of_threads() -> None:
-    rays, results = some_rays(700), []
+    rays = some_rays(700)
+    results = []
     occupied = torch.rand(NESTED.shape, generator=torch.Generator().manual_seed(0)) < 0.4
     single = Rays(rays.origins.float(), rays.directions.float())
     for threads in (1, 2, 5):
@@ -179,7 +250,13 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(DyngsError, match="one dtype"):
         composite(densities.float(), colours.float(), samples)
     with pytest.raises(DyngsError, match="cells must be"):
-        march(towards(1.0, 0, 0), torch.zeros(1), NESTED, torch.ones(2, 8, 8, 4, dtype=torch.bool), Steps(0.0, 0.1))
+        march(
+            towards(1.0, 0, 0),
+            torch.zeros(1),
+            NESTED,
+            torch.ones(2, 8, 8, 4, dtype=torch.bool),
+            Steps(0.0, 0.1),
+        )
 
 
 def test_the_ops_are_registered_as_torch_wants_them() -> None:
@@ -190,8 +267,14 @@ def test_the_ops_are_registered_as_torch_wants_them() -> None:
     torch.library.opcheck(composite_backward_op, ([x.detach() for x in given], grads, 0.0))
     torch.library.opcheck(reached_op, (densities.detach(), *given[2:], 0.1))
     rays = some_rays(3)
-    where = [rays.origins, rays.directions, shifts_of(rays)], torch.ones(NESTED.shape, dtype=torch.bool)
-    sizes = [*NESTED.centre, NESTED.half, float(NESTED.cascades), float(NESTED.cells)], [0.1, 0.05, 0.0, 100.0]
+    where = (
+        [rays.origins, rays.directions, shifts_of(rays)],
+        torch.ones(NESTED.shape, dtype=torch.bool),
+    )
+    sizes = (
+        [*NESTED.centre, NESTED.half, float(NESTED.cascades), float(NESTED.cells)],
+        [0.1, 0.05, 0.0, 100.0],
+    )
     torch.library.opcheck(march_counts_op, (*where, *sizes))
     offsets = offsets_of(march_counts_op(*where, *sizes))
     torch.library.opcheck(march_samples_op, (*where, *sizes, offsets, int(offsets[-1])))

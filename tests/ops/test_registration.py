@@ -1,4 +1,5 @@
-"""The native ops as ops of the dispatcher: all are checked, clear where not implemented, differentiable once."""
+"""The native ops as ops of the dispatcher: all are checked, clear where not implemented,
+differentiable once."""
 
 from __future__ import annotations
 
@@ -42,18 +43,22 @@ double_op = register("test_double", _double, devices=("cpu",), gradient=Gradient
 
 
 def on(device: DispatchKey, op: Any, *arguments: object) -> Any:
-    """What ``op`` gives where its tensors lie on another device, which this machine need not have."""
+    """What ``op`` gives where its tensors lie on another device, which this machine need not
+    have."""
     return op.redispatch(DispatchKeySet(device), *arguments)
 
 
 def test_every_op_is_checked() -> None:
-    """With ``torch.library.opcheck``: schema, fake kernel, registration of the gradient, tracing."""
+    """With ``torch.library.opcheck``: schema, fake kernel, registration of the gradient,
+    tracing."""
     for path in Path(dyngs.ops.__path__[0]).glob("[a-z]*.py"):
         import_module(f"dyngs.ops.{path.stem}")
     source = "".join(path.read_text(encoding="utf-8") for path in HERE.glob("test_*.py"))
     checked = {name.rstrip("_") for name in re.findall(r"opcheck\(\s*(\w+)_op\b", source)}
     names = {"shading_inputs": "shading"}
-    wanted = {names.get(name, name).rstrip("_") for name in _kernels if not name.startswith("test_")}
+    wanted = {
+        names.get(name, name).rstrip("_") for name in _kernels if not name.startswith("test_")
+    }
     assert wanted == checked - {"double"}
     assert len(wanted) > 15
 
@@ -63,7 +68,9 @@ def test_an_op_of_ones_own() -> None:
 
 
 def test_where_it_is_not_implemented_the_device_is_named() -> None:
-    with pytest.raises(DyngsError, match=r"dyngs::test_double has no implementation for tensors on cpu; move all"):
+    with pytest.raises(
+        DyngsError, match=r"dyngs::test_double has no implementation for tensors on cpu; move all"
+    ):
         on(DispatchKey.CUDA, double_op, torch.ones(3), [1.0])
     with pytest.raises(DyngsError, match=r"dyngs::count_nonfinite has no implementation"):
         on(DispatchKey.MPS, count_nonfinite_op, [torch.ones(3)])
@@ -79,7 +86,9 @@ def test_another_device_joins_without_a_change_of_callers() -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_the_line_names_it() -> None:
-    with pytest.raises(DyngsError, match=r"no implementation for tensors on cuda:0; move all of them to the CPU"):
+    with pytest.raises(
+        DyngsError, match=r"no implementation for tensors on cuda:0; move all of them to the CPU"
+    ):
         double_op(torch.ones(3, device="cuda"), [1.0])
 
 
@@ -88,14 +97,22 @@ def test_meta_tensors_give_shapes() -> None:
 
 
 def second_derivative(first: tuple[Tensor, ...], source: Tensor) -> None:
-    with pytest.raises(DyngsError, match=r"dyngs::\w+ is differentiable once; a second derivative was asked for"):
+    with pytest.raises(
+        DyngsError, match=r"dyngs::\w+ is differentiable once; a second derivative was asked for"
+    ):
         torch.autograd.grad(sum(x.square().sum() for x in first), source)
 
 
 def test_second_derivatives_are_an_error_not_zero() -> None:
     generator = torch.Generator().manual_seed(0)
-    points, motion, values = (torch.randn(4, n, generator=generator).requires_grad_() for n in (3, 7, 2))
-    nodes = torch.randn(4, 3, generator=generator), torch.ones(4), torch.tensor([[0], [1], [2], [3]])
+    points, motion, values = (
+        torch.randn(4, n, generator=generator).requires_grad_() for n in (3, 7, 2)
+    )
+    nodes = (
+        torch.randn(4, 3, generator=generator),
+        torch.ones(4),
+        torch.tensor([[0], [1], [2], [3]]),
+    )
     total = sum(x.sum() for x in blend_skinning(points, *nodes, motion, values))
     plain = torch.autograd.grad(total, (points, motion, values), retain_graph=True)
     first = torch.autograd.grad(total, (points, motion, values), create_graph=True)
@@ -104,14 +121,17 @@ def test_second_derivatives_are_an_error_not_zero() -> None:
 
 
 def test_second_derivatives_of_lists_of_tensors_are_an_error_too() -> None:
-    level = PlaneLevel(torch.ones(3, 4, 4, 2).requires_grad_(), torch.ones(3, 3, 4, 2).requires_grad_())
+    level = PlaneLevel(
+        torch.ones(3, 4, 4, 2).requires_grad_(), torch.ones(3, 3, 4, 2).requires_grad_()
+    )
     features = hexplane_features(torch.zeros(5, 3), 0.5, [level])
     first = torch.autograd.grad(features.sum(), (level.space, level.time), create_graph=True)
     second_derivative(first, level.space)
 
 
 def test_drawing_imports_neither_the_compiler_of_torch_nor_another_openmp() -> None:
-    """The former takes 2 s of CPU, which every command would pay; torch and the core share one pool of threads."""
+    """The former takes 2 s of CPU, which every command would pay; torch and the core share one pool
+    of threads."""
     code = (
         "import sys, torch\n"
         "from dyngs import Cameras, Gaussians, render\n"
@@ -122,5 +142,7 @@ def test_drawing_imports_neither_the_compiler_of_torch_nor_another_openmp() -> N
         "from dyngs.cli.doctor import openmp_runtimes\n"
         "print(len(openmp_runtimes() or [1]))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.stdout.split() == ["[]", "1"], done.stderr

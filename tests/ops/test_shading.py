@@ -16,7 +16,9 @@ from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.shading import Sight, num_inputs, shading_inputs, shading_op
 
 
-def sight(seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype = torch.float64) -> Sight:
+def sight(
+    seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype = torch.float64
+) -> Sight:
     """Eleven Gaussians, seven of them seen, in no order."""
     g = torch.Generator().manual_seed(seed)
 
@@ -27,7 +29,15 @@ def sight(seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.
     rest = (random(11, 3), rotation_matrices(random(1, 4))[0]) if on_body else None
     rows = torch.randperm(11, generator=g)[:7]
     return Sight(
-        random(11, 3), random(11, 4), random(11, 3), rows, random(3), box, rest, 0.3 if timed else None, normals
+        random(11, 3),
+        random(11, 4),
+        random(11, 3),
+        rows,
+        random(3),
+        box,
+        rest,
+        0.3 if timed else None,
+        normals,
     )
 
 
@@ -36,12 +46,17 @@ flags = st.booleans()
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), flags, flags, flags, st.sampled_from([torch.float32, torch.float64]))
-def test_it_is_what_torch_says(seed: int, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype) -> None:
+def test_it_is_what_torch_says(
+    seed: int, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype
+) -> None:
     seen = sight(seed, normals=normals, timed=timed, on_body=on_body, dtype=dtype)
-    base = torch.rand(7, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    base = torch.rand(7, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(
+        dtype
+    )
     found = shading_inputs(seen, base)
     assert found.shape == (7, num_inputs(sees_time=timed, sees_normals=normals))
-    # Numbers of at most 3 that come of some 30 roundings; 1e-5 is 84 units of float32, 1e-7 many of float64.
+    # Numbers of at most 3 that come of some 30 roundings; 1e-5 is 84 units of float32, 1e-7 many of
+    # float64.
     torch.testing.assert_close(found, reference.shading_inputs(seen, base))
 
 
@@ -49,19 +64,25 @@ def test_it_is_what_torch_says(seed: int, normals: bool, timed: bool, on_body: b
 def test_rotations_may_have_any_length(scale: float) -> None:
     seen = sight(3, normals=True, timed=False, on_body=False, dtype=torch.float32)
     rough = replace(seen, quats=seen.quats.sign())
-    longer, base = replace(rough, quats=rough.quats * scale), torch.full((7, 3), 0.3)
+    longer = replace(rough, quats=rough.quats * scale)
+    base = torch.full((7, 3), 0.3)
     torch.testing.assert_close(shading_inputs(longer, base), shading_inputs(rough, base))
     torch.testing.assert_close(reference.shading_inputs(longer, base), shading_inputs(rough, base))
 
 
 def test_every_isa_says_the_same(isa: str) -> None:
-    seen, base = sight(3, normals=True, timed=True, on_body=True, dtype=torch.float32), torch.full((7, 3), 0.3)
-    torch.testing.assert_close(shading_inputs(seen, base), reference.shading_inputs(seen, base), msg=isa)
+    seen = sight(3, normals=True, timed=True, on_body=True, dtype=torch.float32)
+    base = torch.full((7, 3), 0.3)
+    torch.testing.assert_close(
+        shading_inputs(seen, base), reference.shading_inputs(seen, base), msg=isa
+    )
 
 
 def test_threads_change_nothing() -> None:
     seen = sight(0, normals=True, timed=True, on_body=True)
-    many = replace(seen, rows=torch.randint(0, 11, (5000,), generator=torch.Generator().manual_seed(1)))
+    many = replace(
+        seen, rows=torch.randint(0, 11, (5000,), generator=torch.Generator().manual_seed(1))
+    )
     base = torch.rand(5000, 3, dtype=torch.float64)
     with kernel_threads(1):
         alone = shading_inputs(many, base)
@@ -78,13 +99,24 @@ def test_only_base_colours_get_a_gradient() -> None:
 
 
 def test_what_is_degenerate_stays_finite() -> None:
-    """An eye in the centre of a Gaussian, a rotation of length zero, three equal scales, nothing seen."""
+    """An eye in the centre of a Gaussian, a rotation of length zero, three equal scales, nothing
+    seen."""
     zeros = torch.zeros(1, 3)
-    seen = Sight(zeros, torch.zeros(1, 4), zeros, torch.tensor([0]), zeros[0], torch.tensor([[0.0] * 3, [1.0] * 3]))
+    seen = Sight(
+        zeros,
+        torch.zeros(1, 4),
+        zeros,
+        torch.tensor([0]),
+        zeros[0],
+        torch.tensor([[0.0] * 3, [1.0] * 3]),
+    )
     base = torch.full((1, 3), 0.5)
     torch.testing.assert_close(shading_inputs(seen, base), reference.shading_inputs(seen, base))
     assert shading_inputs(seen, base).isfinite().all()
-    assert shading_inputs(replace(seen, rows=torch.zeros(0, dtype=torch.long)), base[:0]).shape == (0, 13)
+    assert shading_inputs(replace(seen, rows=torch.zeros(0, dtype=torch.long)), base[:0]).shape == (
+        0,
+        13,
+    )
 
 
 @pytest.mark.parametrize("row", [-1, 11])
@@ -97,8 +129,11 @@ def test_a_row_that_does_not_exist_is_refused(row: int) -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32), st.floats(1e-3, 1e12))
 def test_far_places_stay_bounded_and_in_order(seed: int, scale: float) -> None:
-    points = scale * torch.randn(20, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    lengths, inside = points.norm(dim=1), reference.contracted(points).norm(dim=1)
+    points = scale * torch.randn(
+        20, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
+    lengths = points.norm(dim=1)
+    inside = reference.contracted(points).norm(dim=1)
     assert (inside <= 2).all()
     assert torch.equal(reference.contracted(points)[lengths <= 1], points[lengths <= 1])
     assert (inside[lengths.argsort()].diff() >= -1e-12).all()
@@ -107,7 +142,9 @@ def test_far_places_stay_bounded_and_in_order(seed: int, scale: float) -> None:
 def test_the_shortest_axis_is_the_normal() -> None:
     quats = torch.randn(30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     log_scales = torch.randn(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    expected = rotation_matrices(quats).gather(2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1))[..., 0]
+    expected = rotation_matrices(quats).gather(
+        2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1)
+    )[..., 0]
     torch.testing.assert_close(reference.shortest_axes(quats, log_scales), expected)
 
 

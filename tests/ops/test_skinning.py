@@ -71,15 +71,24 @@ def random_case(count: int, num_nodes: int, per_point: int, width: int, seed: in
 
 
 def reference(
-    points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
+    points: Tensor,
+    positions: Tensor,
+    radii: Tensor,
+    followed: Tensor,
+    motion: Tensor,
+    values: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The formula in plain torch, with rotations as q v q*."""
     arms = points[:, None] - positions[followed]
     weights = torch.softmax(-arms.detach().square().sum(-1) / (2 * radii[followed].square()), dim=1)
     shift, quats = motion[followed].split([3, 4], dim=-1)
     unit = quats / quats.norm(dim=-1, keepdim=True)
-    w, axis = unit[..., :1], unit[..., 1:]
-    turned = 2 * (axis * arms).sum(-1, keepdim=True) * axis + (w * w - axis.square().sum(-1, keepdim=True)) * arms
+    w = unit[..., :1]
+    axis = unit[..., 1:]
+    turned = (
+        2 * (axis * arms).sum(-1, keepdim=True) * axis
+        + (w * w - axis.square().sum(-1, keepdim=True)) * arms
+    )
     turned = turned + 2 * w * torch.linalg.cross(axis, arms)
     offset = (weights[..., None] * (turned - arms + shift)).sum(1)
     return offset, (weights[..., None] * values[followed]).sum(1)
@@ -89,7 +98,9 @@ def results(function, case: Case) -> list[Tensor]:
     """Offsets, blended values, and the gradients by the leaves for fixed gradients of both."""
     outputs = function(*case.arguments())
     generator = torch.Generator().manual_seed(7)
-    grads = [torch.randn(y.shape, generator=generator, dtype=torch.float64).to(y.dtype) for y in outputs]
+    grads = [
+        torch.randn(y.shape, generator=generator, dtype=torch.float64).to(y.dtype) for y in outputs
+    ]
     return [*(y.detach() for y in outputs), *torch.autograd.grad(outputs, case.leaves(), grads)]
 
 
@@ -101,7 +112,9 @@ def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) ->
             assert (a.double() - b).abs().max() <= tolerance * max(1.0, b.abs().max().item())
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     count=st.integers(0, 40),
     num_nodes=st.integers(1, 9),
@@ -109,11 +122,17 @@ def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) ->
     width=st.integers(0, 11),
     seed=st.integers(0, 1000),
 )
-def test_double_equals_torch(isa: str, count: int, num_nodes: int, per_point: int, width: int, seed: int) -> None:
-    """With several parts in the backward pass or one, values that fill registers or not, nodes followed twice."""
+def test_double_equals_torch(
+    isa: str, count: int, num_nodes: int, per_point: int, width: int, seed: int
+) -> None:
+    """With several parts in the backward pass or one, values that fill registers or not, nodes
+    followed twice."""
     case = random_case(count, num_nodes, per_point, width, seed)
-    short = case.motion.detach()[:, 3:].norm(dim=1).min()  # gradients grow as quaternions get shorter
-    assert_close(results(blend_skinning, case), results(reference, case), 1e-12 / min(1.0, short.item()))
+    # gradients grow as quaternions get shorter
+    short = case.motion.detach()[:, 3:].norm(dim=1).min()
+    assert_close(
+        results(blend_skinning, case), results(reference, case), 1e-12 / min(1.0, short.item())
+    )
 
 
 def test_double_equals_torch_for_many_points(isa: str) -> None:
@@ -123,11 +142,14 @@ def test_double_equals_torch_for_many_points(isa: str) -> None:
 
 
 def test_gradcheck() -> None:
-    """By motion and values with many nodes each; by the points where the weights, which are constant, cannot change."""
+    """By motion and values with many nodes each; by the points where the weights, which are
+    constant, cannot change."""
     case = random_case(7, 5, 3, 2)
 
     def by_nodes(motion: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        return blend_skinning(case.points, case.positions, case.radii, case.followed, motion, values)
+        return blend_skinning(
+            case.points, case.positions, case.radii, case.followed, motion, values
+        )
 
     assert torch.autograd.gradcheck(by_nodes, case.leaves()[1:])
     one = random_case(7, 5, 1, 2)
@@ -139,9 +161,12 @@ def test_gradcheck() -> None:
 
 
 def test_float_agrees_with_double(isa: str) -> None:
-    """Exponents of at most some tens, rounded to 6e-8, put 1e-6 on the small weights; a node sums 100 followers."""
+    """Exponents of at most some tens, rounded to 6e-8, put 1e-6 on the small weights; a node sums
+    100 followers."""
     case = random_case(600, 24, 4, 10)
-    assert_close(results(blend_skinning, case.to(torch.float32)), results(blend_skinning, case), 1e-5)
+    assert_close(
+        results(blend_skinning, case.to(torch.float32)), results(blend_skinning, case), 1e-5
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -164,19 +189,30 @@ def test_a_rigid_motion_of_all_nodes_moves_the_points_rigidly(seed: int, exponen
     matrix = torch.from_numpy(Rotation.from_quat(quat.roll(-1).numpy()).as_matrix())
     moved = case.positions @ matrix.T + shift - case.positions
     motion = torch.cat([moved, (10**exponent * quat).expand(6, 4)], dim=1)
-    offset, _ = blend_skinning(case.points, case.positions, case.radii, case.followed, motion, case.values)
+    offset, _ = blend_skinning(
+        case.points, case.positions, case.radii, case.followed, motion, case.values
+    )
     expected = case.points @ matrix.T + shift
     torch.testing.assert_close(case.points + offset, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("quat", [(1, 0, 0, 0), (-3, 0, 0, 0), (0, 0, 0, 0)], ids=["identity", "of length 3", "zero"])
+@pytest.mark.parametrize(
+    "quat", [(1, 0, 0, 0), (-3, 0, 0, 0), (0, 0, 0, 0)], ids=["identity", "of length 3", "zero"]
+)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_nodes_that_do_not_move_move_nothing(quat: tuple[int, ...], dtype: torch.dtype) -> None:
     """Not by a bit, even far away; and no gradient is infinite."""
     case = random_case(40, 6, 4, 3).to(dtype)
     motion = torch.tensor([0, 0, 0, *quat], dtype=dtype).expand(6, 7)
     points = (1e6 * case.points.detach()).requires_grad_()
-    case = Case(points, case.positions, case.radii, case.followed, motion.clone().requires_grad_(), case.values)
+    case = Case(
+        points,
+        case.positions,
+        case.radii,
+        case.followed,
+        motion.clone().requires_grad_(),
+        case.values,
+    )
     offset, *rest = results(blend_skinning, case)
     assert (offset == 0).all()
     assert all(x.isfinite().all() for x in rest)
@@ -191,7 +227,8 @@ def test_the_same_values_at_all_nodes_stay_themselves() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_near_node_takes_all_and_equal_nodes_share(dtype: torch.dtype) -> None:
-    """At a node, coincident nodes, a node of vanishing radius, and so far away that distances overflow."""
+    """At a node, coincident nodes, a node of vanishing radius, and so far away that distances
+    overflow."""
     positions = torch.tensor([[0, 0, 0], [50, 0, 0], [0, 0, 0]], dtype=dtype)
     values = torch.tensor([[1], [10], [100]], dtype=dtype)
     motion = IDENTITY.to(dtype).expand(3, 7)
@@ -209,7 +246,8 @@ def test_a_near_node_takes_all_and_equal_nodes_share(dtype: torch.dtype) -> None
 def test_nan_stays_with_the_point_and_the_followers_of_the_node(dtype: torch.dtype) -> None:
     case = random_case(40, 6, 2, 3).to(dtype)
     expected = blend_skinning(*case.arguments())
-    points, motion = case.points.detach().clone(), case.motion.detach().clone()
+    points = case.points.detach().clone()
+    motion = case.motion.detach().clone()
     points[3, 1], points[17, 0] = NAN, float("inf")
     motion[5, 4] = NAN
     got = blend_skinning(points, case.positions, case.radii, case.followed, motion, case.values)
@@ -231,7 +269,14 @@ def test_empty_and_tiny(shape: tuple[int, int, int, int]) -> None:
     count, num_nodes, per_point, width = shape
     case = random_case(count, max(num_nodes, 1), per_point, width)
     if num_nodes == 0:
-        case = Case(case.points, case.positions[:0], case.radii[:0], case.followed, case.motion[:0], case.values[:0])
+        case = Case(
+            case.points,
+            case.positions[:0],
+            case.radii[:0],
+            case.followed,
+            case.motion[:0],
+            case.values[:0],
+        )
     offset, blended, *grads = results(blend_skinning, case)
     assert offset.shape == (count, 3)
     assert blended.shape == (count, width)
@@ -244,7 +289,9 @@ def test_empty_and_tiny(shape: tuple[int, int, int, int]) -> None:
 def test_any_strides_and_half_precision() -> None:
     case = random_case(30, 5, 3, 4)
     strided = Case(*(x.repeat_interleave(2, dim=-1)[..., ::2] for x in case.arguments()))
-    for a, b in zip(blend_skinning(*strided.arguments()), blend_skinning(*case.arguments()), strict=True):
+    for a, b in zip(
+        blend_skinning(*strided.arguments()), blend_skinning(*case.arguments()), strict=True
+    ):
         assert torch.equal(a, b)
     mixed = Case(*(x.half() if x.is_floating_point() else x for x in case.arguments()))
     assert {x.dtype for x in blend_skinning(*mixed.arguments())} == {torch.float32}
@@ -295,7 +342,8 @@ def test_is_a_well_behaved_torch_op() -> None:
     torch.library.opcheck(skinning_op, case.arguments())
     points, positions, radii, followed, motion, values = (x.detach() for x in case.arguments())
     offset, blended, weights = skinning_op(points, positions, radii, followed, motion, values)
-    nodes, grads = [positions, radii, motion, values], [torch.ones_like(offset), torch.ones_like(blended)]
+    nodes = [positions, radii, motion, values]
+    grads = [torch.ones_like(offset), torch.ones_like(blended)]
     torch.library.opcheck(skinning_backward_op, (nodes, points, followed, weights, grads, True))
 
 
@@ -312,12 +360,16 @@ def test_compiles_in_one_graph() -> None:
 def test_every_isa_moves_the_rows_and_no_others(isa: str) -> None:
     tensors = [x.clone() for x in cloud().tensors().values()]
     before = [x.clone() for x in tensors]
-    rows, shift = torch.tensor([7, 2]), torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    rows = torch.tensor([7, 2])
+    shift = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
     add_offsets_(tensors, rows, (shift, None, None, torch.tensor([0.5, -0.5]), None))
-    means, logits = before[0].clone(), before[3].clone()
+    means = before[0].clone()
+    logits = before[3].clone()
     means[rows] += shift
     logits[rows] += torch.tensor([0.5, -0.5])
-    for found, expected in zip(tensors, (means, before[1], before[2], logits, before[4]), strict=True):
+    for found, expected in zip(
+        tensors, (means, before[1], before[2], logits, before[4]), strict=True
+    ):
         assert torch.equal(found, expected), isa
 
 

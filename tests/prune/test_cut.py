@@ -1,4 +1,5 @@
-"""What a cut takes away is gone, stays gone while the rest is trained, and can be restored from its checkpoint."""
+"""What a cut takes away is gone, stays gone while the rest is trained, and can be restored from its
+checkpoint."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ def trainer(config: Config, end: Checkpoint) -> Trainer:
 
 
 def test_everything_that_a_cut_says(trainer: Trainer) -> None:
-    count, whole = len(trainer.model.scene), field_size(trainer.model.scene)
+    count = len(trainer.model.scene)
+    whole = field_size(trainer.model.scene)
     assert whole is not None
     assert whole.pieces == 3
     cut = Cut(fraction=0.5, alpha_min=0.02, field=FieldSize(2, 1), harmonics=100.0)
@@ -69,25 +71,33 @@ def test_nodes_around_bodies_are_cut_as_without_them(trainer: Trainer) -> None:
     labels = torch.full((len(scene.moving),), -1)
     splines = {"places": torch.zeros(1, 5, 3), "quats": torch.ones(1, 5, 4)}
     with_body = replace(
-        scene, field=BodyField(scene.field, BodyRest(torch.zeros(1, 3), torch.ones(1), labels), splines)
+        scene,
+        field=BodyField(scene.field, BodyRest(torch.zeros(1, 3), torch.ones(1), labels), splines),
     )
     cut = with_field(with_body, FieldSize(2, 1))
     assert field_size(cut) == FieldSize(2, 1)
     assert torch.equal(cut.at(0.4).means, with_field(scene, FieldSize(2, 1)).at(0.4).means)
 
 
-def test_some_harmonics_stay_and_the_others_stay_gone(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of images that show this scene, but for noise: harmonics that are zero are worth nothing, those of others are."""
-    scene, colour = trainer.model.scene, background_colour(trainer.background)
+def test_some_harmonics_stay_and_the_others_stay_gone(
+    trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of images that show this scene, but for noise: harmonics that are zero are worth nothing,
+    those of others are."""
+    scene = trainer.model.scene
+    colour = background_colour(trainer.background)
     plain = torch.arange(len(scene)) % 2 == 0
     scene.gaussians.sh.data[plain, 1:] = 0
     scene.gaussians.sh.data[~plain, 1:] = 0.3
-    options, shown = trainer.model.options, []
+    options = trainer.model.options
+    shown = []
     for image in (trainer.images[i] for i in range(len(trainer.images))):
         with torch.no_grad():
             now = trainer.model.training.time_step(scene, image, trainer.done)
             drawn = scene.render(image.cameras, now, options=options, background=colour).rgb[0]
-        shown.append(replace(image, rgb_premultiplied=drawn + 0.05 * torch.randn(drawn.shape), alpha=None))
+        shown.append(
+            replace(image, rgb_premultiplied=drawn + 0.05 * torch.randn(drawn.shape), alpha=None)
+        )
     with monkeypatch.context() as patch:
         patch.setattr(trainer, "images", shown)
         apply_cut(trainer, Cut(harmonics=1e-3), torch.zeros(len(scene)))

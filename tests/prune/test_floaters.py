@@ -35,14 +35,19 @@ def config_of(root: Path, *keys: str) -> Config:
 
 @pytest.fixture
 def trainer(still: Path) -> Trainer:
-    """The start of a run, whose Gaussians fill a cube, with one more: close before the first camera."""
+    """The start of a run, whose Gaussians fill a cube, with one more: close before the first
+    camera."""
     trainer = assemble(config_of(still))
     cameras = trainer.images[0].cameras
     before = cameras.centers[0] + 0.3 * cameras.cam_from_world[0, 2, :3]
     gaussians = trainer.model.scene.gaussians.detach()
     tensors = {name: torch.cat([x, x[:1]]) for name, x in gaussians.tensors().items()}
-    tensors["means"][-1], tensors["log_scales"][-1], tensors["logit_opacities"][-1] = before, -4.0, 1.0
-    trainer.model.begin_with(trainer.model.scene.with_gaussians(Gaussians(**tensors)), trainer.model.training)
+    tensors["means"][-1] = before
+    tensors["log_scales"][-1] = -4.0
+    tensors["logit_opacities"][-1] = 1.0
+    trainer.model.begin_with(
+        trainer.model.scene.with_gaussians(Gaussians(**tensors)), trainer.model.training
+    )
     return trainer
 
 
@@ -57,7 +62,9 @@ def test_what_is_not_near_is_none(trainer: Trainer, monkeypatch: pytest.MonkeyPa
     assert not bool(floaters(trainer).any())
 
 
-def test_what_several_views_share_is_none(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_several_views_share_is_none(
+    trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "MAIN_FRACTION", 1.0)
     assert not bool(floaters(trainer).any())
 
@@ -73,7 +80,9 @@ def test_they_are_removed_before_the_run_is_saved(
 ) -> None:
     """Unless they are too many to be floaters."""
     monkeypatch.setattr(module, "FEWEST_VIEWS", 3)
-    monkeypatch.setattr(module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < count)
+    monkeypatch.setattr(
+        module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < count
+    )
     run = train(config_of(still, "train.remove_floaters=true", f"run.dir={tmp_path / 'run'}"))
     assert len(load_run(run).scene) == 300 - removed
     said = capsys.readouterr().err
@@ -81,12 +90,16 @@ def test_they_are_removed_before_the_run_is_saved(
     assert ("too many" in said) is (count > removed)
 
 
-@pytest.mark.parametrize("keys", [("train.remove_floaters=false",), ("train.remove_floaters=true",)])
+@pytest.mark.parametrize(
+    "keys", [("train.remove_floaters=false",), ("train.remove_floaters=true",)]
+)
 def test_few_views_or_no_wish_leave_all(
     keys: tuple[str, ...], still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "FEWEST_VIEWS", 3 if "false" in keys[0] else 20)
-    monkeypatch.setattr(module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < 2)
+    monkeypatch.setattr(
+        module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < 2
+    )
     assert len(load_run(train(config_of(still, *keys, f"run.dir={tmp_path / 'run'}"))).scene) == 300
 
 

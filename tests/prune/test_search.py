@@ -1,4 +1,5 @@
-"""Bisection keeps the most that it may, says what limits it, and holds out what nothing is trained on."""
+"""Bisection keeps the most that it may, says what limits it, and holds out what nothing is trained
+on."""
 
 from __future__ import annotations
 
@@ -89,12 +90,18 @@ def test_sizes_of_a_field() -> None:
     assert [_fewest(losses, most, 30) for most in (0.0, 0.1, 1.0)] == [30, 15, 8]
 
 
-def test_what_views_trained_on_lose_counts_too(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_views_trained_on_lose_counts_too(
+    trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Views held out may be kind to a cut by chance."""
     search = Search(trainer, trainer.checkpoint(), lambda text: None)
     monkeypatch.setattr(
-        search, "_tried", lambda cut: Candidate(cut, trainer.config, search.start, 10, 30.0, -0.1, cut.fraction)
+        search,
+        "_tried",
+        lambda cut: Candidate(cut, trainer.config, search.start, 10, 30.0, -0.1, cut.fraction),
     )
-    found, _ = search._bisected("Gaussians", [(f"{k}", Cut(fraction=k / 12)) for k in range(1, 13)], 0.5)
+    found, _ = search._bisected(
+        "Gaussians", [(f"{k}", Cut(fraction=k / 12)) for k in range(1, 13)], 0.5
+    )
     assert found is not None
     assert found.cut == Cut(fraction=0.5)

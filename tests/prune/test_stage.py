@@ -1,4 +1,5 @@
-"""The last stage of a run: exact, repeatable, the same as pruning the finished run, and drawn with masks."""
+"""The last stage of a run: exact, repeatable, the same as pruning the finished run, and drawn with
+masks."""
 
 from __future__ import annotations
 
@@ -58,11 +59,15 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 STAGE = PruneConfig(fraction=0.5, steps=6, mask_times=3)
 
 
-def moving_config(capture: Path, run_dir: Path, kind: str = "control_nodes", stage: PruneConfig = STAGE) -> Config:
+def moving_config(
+    capture: Path, run_dir: Path, kind: str = "control_nodes", stage: PruneConfig = STAGE
+) -> Config:
     return busy_config(capture, run_dir, kind).model_copy(update={"prune": stage})
 
 
-def still_config(capture: Path, run_dir: Path, stage: PruneConfig = STAGE, **changes: object) -> Config:
+def still_config(
+    capture: Path, run_dir: Path, stage: PruneConfig = STAGE, **changes: object
+) -> Config:
     return Config(
         data=DataConfig(root=capture),
         model=StaticModel(sh_degree=1, filter_3d=True),
@@ -86,12 +91,15 @@ def trained(config: Config) -> Trainer:
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(kind: str, moving: Path, tmp_path: Path) -> None:
+def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(
+    kind: str, moving: Path, tmp_path: Path
+) -> None:
     """From the checkpoint before the stage, and from one in its middle."""
     config = moving_config(moving, tmp_path / "run", kind)
     config = config.model_copy(update={"train": config.train.model_copy(update={"save_every": 27})})
     folder = train(config)
-    run, paths = load_run(folder), checkpoint_paths(folder)
+    run = load_run(folder)
+    paths = checkpoint_paths(folder)
     assert [p.stem for p in paths] == ["step_0000027", "step_0000030"]
     wanted = final_bytes(folder)
     paths[-1].unlink()
@@ -108,13 +116,17 @@ def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(kind: str, mov
 def test_a_still_run_has_no_masks_and_resumes_exactly(still: Path, tmp_path: Path) -> None:
     wanted = final_bytes(train(still_config(still, tmp_path / "whole")))
     config = still_config(still, tmp_path / "parts")
-    folder = train(config.model_copy(update={"train": config.train.model_copy(update={"save_every": 11})}))
+    folder = train(
+        config.model_copy(update={"train": config.train.model_copy(update={"save_every": 11})})
+    )
     assert load_run(folder).step == 14
     checkpoint_paths(folder)[-1].unlink()
     assert load_run(folder).step == 11
     train(load_resolved(folder), resume_from=folder)
     assert final_bytes(folder) == wanted
-    assert not [name for name in load_checkpoint(checkpoint_paths(folder)[-1]).tensors if "masks" in name]
+    assert not [
+        name for name in load_checkpoint(checkpoint_paths(folder)[-1]).tensors if "masks" in name
+    ]
 
 
 def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
@@ -181,12 +193,15 @@ def test_the_stage_begins_once_where_training_ends(still: Path, tmp_path: Path) 
         loop.run()
         (changed,) = [event for event in told if isinstance(event, TopologyChanged)]
         assert changed == TopologyChanged(8, changed.before, changed.before - changed.before // 2)
-        assert [event.text.split(":")[0] for event in told if isinstance(event, Message)] == ["pruned"]
+        assert [event.text.split(":")[0] for event in told if isinstance(event, Message)] == [
+            "pruned"
+        ]
         assert trainer.num_gaussians == changed.after
         place = told.index(changed)
         assert isinstance(told[place + 1], Started if resumed else StepDone)
     plain = still_config(still, tmp_path, PruneConfig())
-    trainer, told = assemble(plain), []
+    trainer = assemble(plain)
+    told = []
     loop = Loop(trainer, plain.total_steps, Stopwatch())
     loop.subscribe(PruneStage(loop, lambda: trainer), told.append)
     loop.run()
@@ -201,8 +216,11 @@ def test_what_it_says() -> None:
 
 
 def test_cameras_of_a_standing_rig_are_taken_once() -> None:
-    one, other = camera(), camera()
-    moved = Cameras(other.cam_from_world + torch.tensor(0.5), other.intrinsics, other.width, other.height)
+    one = camera()
+    other = camera()
+    moved = Cameras(
+        other.cam_from_world + torch.tensor(0.5), other.intrinsics, other.width, other.height
+    )
     assert distinct_cameras([one, moved, camera(), moved], 8) == [one, moved]
     assert evenly_spaced(10, 3) == [0, 3, 6]
     assert evenly_spaced(2, 3) == [0, 1]
@@ -211,7 +229,9 @@ def test_cameras_of_a_standing_rig_are_taken_once() -> None:
 BLACK = torch.zeros(3)
 
 
-def views(scene: GaussianScene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)) -> ScoringViews:
+def views(
+    scene: GaussianScene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+) -> ScoringViews:
     return ScoringViews(scene, [camera(), camera(40, 28)], times, RenderOptions(), BLACK)
 
 
@@ -232,18 +252,25 @@ def test_sums_are_over_cameras_at_each_moment() -> None:
 def test_what_is_hidden_or_transparent_is_worth_least() -> None:
     """Of five balls the second lies behind a wall, the fourth is faint."""
     balls = row_of_balls()
-    means, log_scales, logits = balls.means.clone(), balls.log_scales.clone(), balls.logit_opacities.clone()
+    means = balls.means.clone()
+    log_scales = balls.log_scales.clone()
+    logits = balls.logit_opacities.clone()
     means[0] = torch.tensor([-0.5, 0.0, -1.0])  # before the second, which is at x = -0.5
     log_scales[0] = -1.0
-    logits[0], logits[3] = 9.0, -4.0
-    scene = StaticScene(gaussians=balls.replace(means=means, log_scales=log_scales, logit_opacities=logits))
+    logits[0] = 9.0
+    logits[3] = -4.0
+    scene = StaticScene(
+        gaussians=balls.replace(means=means, log_scales=log_scales, logit_opacities=logits)
+    )
     found = importance(views(scene, (None,)), slopes=True)
     assert found.slopes is not None
     for scores in (found.contribution, found.variation, found.slopes):
         assert set(scores.argsort()[:2].tolist()) == {1, 3}
 
 
-def constant(fractions: list[list[float]], opacities: list[list[float]] | None = None) -> Importance:
+def constant(
+    fractions: list[list[float]], opacities: list[list[float]] | None = None
+) -> Importance:
     """K moments of N Gaussians of one size."""
     c = torch.tensor(fractions)
     o = torch.full_like(c, 0.5) if opacities is None else torch.tensor(opacities)
@@ -286,7 +313,9 @@ def test_one_moment_and_nothing_at_all() -> None:
 def test_scores_are_finite_where_something_is_never_seen() -> None:
     class Fading(Blinking):
         def offsets(self, means, time, rows=None):
-            return Offsets(torch.zeros(len(means), 3), logit_opacities=torch.full((len(means),), -200.0 * time))
+            return Offsets(
+                torch.zeros(len(means), 3), logit_opacities=torch.full((len(means),), -200.0 * time)
+            )
 
     found = importance(views(moving_scene(Fading(), rows=(0, 1, 2, 3, 4))), slopes=True)
     for scores in (found.variation, found.contribution):
@@ -297,14 +326,17 @@ SCORES = torch.tensor([3.0, 0.5, 2.0, 0.5, 9.0])
 
 
 @pytest.mark.parametrize(
-    ("fraction", "kept"), [(0.0, {0, 1, 2, 3, 4}), (0.2, {0, 1, 2, 4}), (0.4, {0, 2, 4}), (0.79, {0, 4}), (0.99, {4})]
+    ("fraction", "kept"),
+    [(0.0, {0, 1, 2, 3, 4}), (0.2, {0, 1, 2, 4}), (0.4, {0, 2, 4}), (0.79, {0, 4}), (0.99, {4})],
 )
 def test_the_lowest_go_and_of_equal_ones_the_last(fraction: float, kept: set[int]) -> None:
     assert set(torch.nonzero(highest(SCORES, fraction))[:, 0].tolist()) == kept
 
 
 @given(st.lists(st.floats(0, 10, width=32), min_size=1, max_size=30), st.floats(0, 0.999))
-def test_no_more_go_than_asked_and_none_above_one_that_stays(values: list[float], fraction: float) -> None:
+def test_no_more_go_than_asked_and_none_above_one_that_stays(
+    values: list[float], fraction: float
+) -> None:
     scores = torch.tensor(values)
     kept = highest(scores, fraction)
     assert 1 <= kept.sum() <= len(scores)
@@ -314,7 +346,8 @@ def test_no_more_go_than_asked_and_none_above_one_that_stays(values: list[float]
 
 
 def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
-    """Between key times, too: three of ten training times are key times, and none of the Gaussians is there at them."""
+    """Between key times, too: three of ten training times are key times, and none of the Gaussians
+    is there at them."""
     centers = torch.tensor([2, 3, 6, 7]) / 9
     start = FreeStart(torch.zeros(0), (), centers, torch.full((4,), 0.03), torch.zeros(4, 3))
     field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)

@@ -1,4 +1,5 @@
-"""Avatar files: what is read back plays as the run does, also through the CLI; what is wrong with one is one line."""
+"""Avatar files: what is read back plays as the run does, also through the CLI; what is wrong with
+one is one line."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ from dyngs.splats.similarity import Similarity
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "person"
-    return write_human_capture(folder, HumanOptions(size=24, num_frames=2, num_new=0, num_cameras=2, num_test=0))
+    return write_human_capture(
+        folder, HumanOptions(size=24, num_frames=2, num_new=0, num_cameras=2, num_test=0)
+    )
 
 
 def trained(capture: Path, folder: Path, **model: object) -> Path:
@@ -63,19 +66,28 @@ def file(run_dir: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def motion(tmp_path: Path) -> Path:
     poses = 0.3 * torch.randn(3, 55, 3, generator=torch.Generator().manual_seed(0))
-    write_amass(Motion(poses, torch.zeros(3, 3), torch.zeros(10), 10.0, torch.ones(3)), tmp_path / "walk.npz")
+    write_amass(
+        Motion(poses, torch.zeros(3, 3), torch.zeros(10), 10.0, torch.ones(3)),
+        tmp_path / "walk.npz",
+    )
     return tmp_path / "walk.npz"
 
 
 def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> None:
-    run, read = open_run(run_dir), open_scene(file)
+    run = open_run(run_dir)
+    read = open_scene(file)
     for one, other in ((run.in_motion(motion), read.in_motion(motion)), (run.at_rest(), read)):
         for time in (0.0, 0.7, 1.0):
-            wanted, found = one.scene.at(time).tensors(), other.scene.at(time).tensors()
+            wanted = one.scene.at(time).tensors()
+            found = other.scene.at(time).tensors()
             for name, x in found.items():
-                if name != "quats":  # axes of nearly equal length turn by more than their shape shows
+                if name != "quats":
+                    # axes of nearly equal length turn by more than their shape shows
                     torch.testing.assert_close(x, wanted[name], rtol=0, atol=1e-5)
-            shapes = [rotation_matrices(x["quats"]) * x["log_scales"].exp()[:, None] for x in (found, wanted)]
+            shapes = [
+                rotation_matrices(x["quats"]) * x["log_scales"].exp()[:, None]
+                for x in (found, wanted)
+            ]
             a, b = (x @ x.mT for x in shapes)
             assert float((a - b).abs().amax((1, 2)).div(b.abs().amax((1, 2))).max()) < 1e-4
     assert isinstance(read.scene, HumanScene)
@@ -122,7 +134,10 @@ def test_files_that_are_missing_cut_altered_or_foreign(run_dir: Path, file: Path
     for where in (0.3, 0.99):
         at = int(where * len(whole))
         file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
-        assert "its checksum differs; export it again with `dyngs export RUN --format avatar`" in refusal(file)
+        assert (
+            "its checksum differs; export it again with `dyngs export RUN --format avatar`"
+            in refusal(file)
+        )
     assert "not an avatar of dyngs" in refusal(checkpoint_paths(run_dir)[-1])
     assert "cannot be read as an avatar" in refusal(file.with_name("none.safetensors"))
 
@@ -135,8 +150,14 @@ Change = Callable[[dict[str, Tensor]], object]
     [
         (lambda x: x.pop("anchors.face"), "anchors.face is missing"),
         (lambda x: x.pop("gaussians.means"), "gaussians.means is missing"),
-        (lambda x: x.update({"gaussians.quats": torch.zeros(3, 4)}), "'gaussians.quats' is float32"),
-        (lambda x: x.update({"anchors.joints": x["anchors.joints"].float()}), "'anchors.joints' is float32"),
+        (
+            lambda x: x.update({"gaussians.quats": torch.zeros(3, 4)}),
+            "'gaussians.quats' is float32",
+        ),
+        (
+            lambda x: x.update({"anchors.joints": x["anchors.joints"].float()}),
+            "'anchors.joints' is float32",
+        ),
         (lambda x: x["gaussians.means"].fill_(torch.nan), "'gaussians.means' holds NaN"),
         (lambda x: x["anchors.joints"].fill_(55), "'anchors.joints' names something beyond the 55"),
         (lambda x: x["anchors.weights"].mul_(2), "negative or do not sum to 1"),
@@ -174,7 +195,16 @@ def test_the_command_line_takes_the_file_for_the_run(
     words = ["--out", str(tmp_path / "orbit"), "--path", "orbit", "--frames", "2"]
     assert main(["render", str(file), *words, "--size", "24x24"]) == 0
     assert len(list((tmp_path / "orbit").glob("*.png"))) == 2
-    words = ["--out", str(tmp_path / "spiral"), "--motion", str(motion), "--path", "spiral", "--times", "0:1:2"]
+    words = [
+        "--out",
+        str(tmp_path / "spiral"),
+        "--motion",
+        str(motion),
+        "--path",
+        "spiral",
+        "--times",
+        "0:1:2",
+    ]
     assert main(["render", str(file), *words, "--size", "24x24"]) == 0
     assert len(list((tmp_path / "spiral").glob("*.png"))) == 2
     words = ["--out", str(tmp_path / "splats"), "--motion", str(motion)]
@@ -184,7 +214,10 @@ def test_the_command_line_takes_the_file_for_the_run(
     for wrong, line in (
         (["export", str(file)], "is exported as Gaussians or tracks, with --out PATH"),
         (["render", str(file), "--out", "x", "--view", "3"], "holds no views"),
-        (["export", str(run_dir), "--format", "avatar", "--time", "0.5"], "--time does not go with --format avatar"),
+        (
+            ["export", str(run_dir), "--format", "avatar", "--time", "0.5"],
+            "--time does not go with --format avatar",
+        ),
     ):
         assert main(wrong) == 2
         assert line in capsys.readouterr().err
@@ -195,7 +228,9 @@ def test_a_person_of_a_file_becomes_a_page(
 ) -> None:
     page = tmp_path / "page.html"
     assert main(["export", str(file), "--motion", str(motion), "--out", str(page)]) == 0
-    header = json.loads(page.read_text(encoding="utf-8").split('id="header">')[1].split("</script>")[0])
+    header = json.loads(
+        page.read_text(encoding="utf-8").split('id="header">')[1].split("</script>")[0]
+    )
     assert header["moves"]
     assert len(header["bones"]["parents"]) == 55
     assert header["up"] == pytest.approx([0.0, 1.0, 0.0], abs=1e-6)
@@ -205,7 +240,9 @@ def test_a_person_of_a_file_becomes_a_page(
     assert "Give --out FILE.html" in line
 
 
-def test_a_person_of_an_edited_run_is_in_its_frame(capture: Path, run_dir: Path, motion: Path, tmp_path: Path) -> None:
+def test_a_person_of_an_edited_run_is_in_its_frame(
+    capture: Path, run_dir: Path, motion: Path, tmp_path: Path
+) -> None:
     """Files that hold nothing but the person have them where all other exports do."""
     how = Similarity((0.6, 0.0, 0.0, 0.8), 2.5, (1.0, -2.0, 0.5))
     opened = open_run(run_dir)
@@ -213,7 +250,8 @@ def test_a_person_of_an_edited_run_is_in_its_frame(capture: Path, run_dir: Path,
         moved = replace(one, edited=RunFrame(how, up="z")).in_own_frame()
         assert moved.edited is None
         for time in (0.0, 0.7):
-            wanted, found = how.gaussians(one.scene.at(time)), moved.scene.at(time)
+            wanted = how.gaussians(one.scene.at(time))
+            found = moved.scene.at(time)
             torch.testing.assert_close(found.means, wanted.means, rtol=0, atol=2e-5)
             torch.testing.assert_close(found.scales, wanted.scales, rtol=1e-4, atol=0)
     edited = replace(opened, edited=RunFrame(how, up="z")).in_own_frame()

@@ -50,7 +50,8 @@ def test_an_image_that_was_replaced_is_named(capture: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("at", [0.0, 0.4, 1.0])
 def test_an_edit_of_a_large_file_is_found(at: float, capture: Path, tmp_path: Path) -> None:
-    """Of 200 kB only some blocks are read; a compressed image differs from the edit on, so in its last block."""
+    """Of 200 kB only some blocks are read; a compressed image differs from the edit on, so in its
+    last block."""
     path = capture / "train" / "r_001.png"
     data = bytearray(path.read_bytes() + bytes(200_000))
     path.write_bytes(data)
@@ -78,7 +79,8 @@ def swap_poses(root: Path) -> None:
     def swap(frames: list[dict[str, object]]) -> None:
         poses = [frame["transform_matrix"] for frame in frames]
         if len(frames) > 1:
-            frames[0]["transform_matrix"], frames[1]["transform_matrix"] = poses[1], poses[0]
+            frames[0]["transform_matrix"] = poses[1]
+            frames[1]["transform_matrix"] = poses[0]
 
     edit_frames(root, swap)
 
@@ -105,16 +107,24 @@ def add_times(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (resize, r"other sizes, times or cameras of train/r_000, train/r_001, train/r_002 and 1 more\)"),
+        (
+            resize,
+            r"other sizes, times or cameras of train/r_000, train/r_001, train/r_002 and 1 more\)",
+        ),
         (swap_poses, r"other sizes, times or cameras of train/r_000, train/r_001\)"),
         (scale_world, r"other sizes, times or cameras of train/r_000, .* and 1 more"),
         (change_angle, r"other sizes, times or cameras of train/r_000, .* and 1 more"),
         (add_times, r"other sizes, times or cameras of train/r_000, .* and 1 more"),
-        (lambda root: edit_frames(root, lambda frames: frames.pop()), r"\(without training views train/r_003\)"),
+        (
+            lambda root: edit_frames(root, lambda frames: frames.pop()),
+            r"\(without training views train/r_003\)",
+        ),
     ],
     ids=["resized", "swapped poses", "scaled", "other focal length", "times", "a view fewer"],
 )
-def test_another_capture_is_refused(change: Callable[[Path], None], said: str, capture: Path, tmp_path: Path) -> None:
+def test_another_capture_is_refused(
+    change: Callable[[Path], None], said: str, capture: Path, tmp_path: Path
+) -> None:
     change(capture)
     with pytest.raises(DyngsError, match=said) as refused:
         changes(capture, tmp_path)

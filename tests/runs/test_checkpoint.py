@@ -50,7 +50,9 @@ def _checkpoint(step: int) -> Checkpoint:
         "sampler.order": torch.arange(5),
         "rng": generator.get_state(),
     }
-    return Checkpoint(CheckpointInfo(step, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic"), tensors)
+    return Checkpoint(
+        CheckpointInfo(step, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic"), tensors
+    )
 
 
 def _config(root: Path, **model: bool) -> Config:
@@ -65,7 +67,9 @@ def test_the_newest_is_that_of_the_most_steps(tmp_path: Path) -> None:
     assert latest_checkpoint(tmp_path).info.step == 10_000_000
 
 
-def test_nobody_is_told_to_delete_a_file_that_may_be_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_is_told_to_delete_a_file_that_may_be_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Too little memory, too many open files, no permission."""
     for step in (1, 2):
         save_checkpoint(tmp_path, _checkpoint(step), 1.0)
@@ -92,7 +96,9 @@ def test_a_link_to_nothing_is_an_error(tmp_path: Path) -> None:
         latest_checkpoint(tmp_path)
 
 
-def test_a_run_can_be_loaded_while_it_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_can_be_loaded_while_it_trains(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two checkpoints are saved, and the one that was found removed, before it is opened."""
     save_checkpoint(tmp_path, _checkpoint(1), 1.0)
     real = checkpoint.load_checkpoint
@@ -126,12 +132,22 @@ def test_only_the_last_two_are_kept_with_their_times(tmp_path: Path) -> None:
         "step_0000015.safetensors",
     ]
     assert latest_checkpoint(tmp_path).info.step == 15
-    assert (seconds_at(tmp_path, 10), seconds_at(tmp_path, 15), seconds_at(tmp_path, 99)) == (2.0, 3.0, 0.0)
+    assert (seconds_at(tmp_path, 10), seconds_at(tmp_path, 15), seconds_at(tmp_path, 99)) == (
+        2.0,
+        3.0,
+        0.0,
+    )
     save_checkpoint(tmp_path, _checkpoint(12), 9.0)  # by a run that went on from step 10
-    assert (seconds_at(tmp_path, 10), seconds_at(tmp_path, 12), seconds_at(tmp_path, 15)) == (2.0, 9.0, 0.0)
+    assert (seconds_at(tmp_path, 10), seconds_at(tmp_path, 12), seconds_at(tmp_path, 15)) == (
+        2.0,
+        9.0,
+        0.0,
+    )
 
 
-@pytest.mark.parametrize("damage", ["truncated", "altered", "header", "empty", "no safetensors", "foreign"])
+@pytest.mark.parametrize(
+    "damage", ["truncated", "altered", "header", "empty", "no safetensors", "foreign"]
+)
 def test_damage_is_named_with_the_file_and_the_previous_one(tmp_path: Path, damage: str) -> None:
     save_checkpoint(tmp_path, _checkpoint(5), 1.0)
     path = save_checkpoint(tmp_path, _checkpoint(10), 2.0)
@@ -167,7 +183,9 @@ def test_a_model_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
     assert latest_checkpoint(tmp_path).info.step == 5
 
 
-def test_a_failed_write_leaves_the_earlier_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_leaves_the_earlier_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     save_checkpoint(tmp_path, _checkpoint(5), 1.0)
 
     def full(*_: object, **__: object) -> None:
@@ -176,7 +194,9 @@ def test_a_failed_write_leaves_the_earlier_ones(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("dyngs.files.tensor_file.save_file", full)
     with pytest.raises(DyngsError, match=r"step_0000010.safetensors.*No space left"):
         save_checkpoint(tmp_path, _checkpoint(10), 2.0)
-    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step_0000005.safetensors"]
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [
+        "step_0000005.safetensors"
+    ]
 
 
 def test_load_run_gives_the_newest_model(tmp_path: Path) -> None:
@@ -187,14 +207,18 @@ def test_load_run_gives_the_newest_model(tmp_path: Path) -> None:
     assert (run.step, run.seconds_train, run.config) == (10, 2.5, _config(tmp_path))
     assert run.info.world_offset == (1e6 + 0.25, 0.0, -3.0)
     assert torch.equal(run.scene.gaussians.sh, _checkpoint(10).tensors["gaussians.sh"])
-    assert torch.equal(run.scene.gaussians.log_scales, _checkpoint(10).tensors["gaussians.log_scales"])
+    assert torch.equal(
+        run.scene.gaussians.log_scales, _checkpoint(10).tensors["gaussians.log_scales"]
+    )
 
 
 def test_load_run_fuses_the_filter_of_a_filtered_model(tmp_path: Path) -> None:
     save_config(_config(tmp_path, filter_3d=True), tmp_path / RESOLVED_NAME)
     checkpoint = _checkpoint(5)
     save_checkpoint(tmp_path, checkpoint, 1.0)
-    expected = fuse_filter(Gaussians(**checkpoint.part("gaussians")), checkpoint.tensors["model.filter_std"])
+    expected = fuse_filter(
+        Gaussians(**checkpoint.part("gaussians")), checkpoint.tensors["model.filter_std"]
+    )
     drawn = load_run(tmp_path).scene.at(None)
     assert torch.equal(drawn.log_scales, expected.log_scales)
     assert torch.equal(drawn.logit_opacities, expected.logit_opacities)
@@ -252,14 +276,18 @@ def _header(**changes: object) -> dict[str, object]:
 def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
     tmp_path: Path, kind: str, has_only_scene_file: bool
 ) -> None:
-    """The checksum fits; tensors lack, have other types, shapes and values, headers others kinds of fields."""
+    """The checksum fits; tensors lack, have other types, shapes and values, headers others kinds of
+    fields."""
     (tensors, model), chance = contents(kind), random.Random(kind)
     save_config(Config(data=DataConfig(root=tmp_path), model=model), tmp_path / RESOLVED_NAME)
-    path = tmp_path / ("scene.dyngs" if has_only_scene_file else "checkpoints/step_0000007.safetensors")
+    path = tmp_path / (
+        "scene.dyngs" if has_only_scene_file else "checkpoints/step_0000007.safetensors"
+    )
     path.parent.mkdir(exist_ok=True)
     if has_only_scene_file:
         tensors = drawable(restored_scene(Checkpoint(CheckpointInfo(**_header()), tensors), model))  # type: ignore[arg-type]
-    refused, told = 0, []
+    refused = 0
+    told = []
     for trial in range(11):
         changed, header = forged(tensors, _header(), chance) if trial else (tensors, _header())
         try:
@@ -317,7 +345,11 @@ def test_headers_of_other_types_are_refused(tmp_path: Path, key: str, value: obj
         ("model.rows", lambda x: x.int(), "'rows' is int32"),
         ("model.times", lambda x: x + 0.5, "outside"),
         ("model.filter_std", lambda x: -x, "negative"),
-        ("model.field.buffers.followed", lambda x: x + 5, "'followed' names something beyond the 4"),
+        (
+            "model.field.buffers.followed",
+            lambda x: x + 5,
+            "'followed' names something beyond the 4",
+        ),
         ("model.field.buffers.followed", lambda x: x[1:], r"'followed' is int64 \(3, 4\)"),
         ("model.field.buffers.radii", torch.zeros_like, "'radii' must be above 0"),
         ("model.field.buffers.positions", lambda x: x[1:], r"float32 \(4,"),
@@ -336,13 +368,18 @@ def test_what_does_not_fit_is_named(
     save_config(Config(data=DataConfig(root=tmp_path), model=model), tmp_path / RESOLVED_NAME)
     path = tmp_path / "checkpoints" / "step_0000007.safetensors"
     path.parent.mkdir()
-    write_tensors(path, checkpoint._KIND, tensors | {name: change(tensors[name]).contiguous()}, _header())
-    with pytest.raises(DyngsError, match=rf"step_0000007\.safetensors: cannot be read \(ValueError: .*{said}"):
+    write_tensors(
+        path, checkpoint._KIND, tensors | {name: change(tensors[name]).contiguous()}, _header()
+    )
+    with pytest.raises(
+        DyngsError, match=rf"step_0000007\.safetensors: cannot be read \(ValueError: .*{said}"
+    ):
         load_run(tmp_path)
 
 
 @pytest.mark.parametrize(
-    "text", ["[" * 5000, "[1]", '{"seconds_train": {"4": NaN, "x": 1}}', '{"seconds_train": {"4": 1e999}}']
+    "text",
+    ["[" * 5000, "[1]", '{"seconds_train": {"4": NaN, "x": 1}}', '{"seconds_train": {"4": 1e999}}'],
 )
 def test_times_that_are_damaged_are_forgotten(tmp_path: Path, text: str) -> None:
     (tmp_path / "timing.json").write_text(text)

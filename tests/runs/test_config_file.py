@@ -1,4 +1,5 @@
-"""A run of a person keeps the fit that it was trained on, wherever the fit lay and wherever the folder goes."""
+"""A run of a person keeps the fit that it was trained on, wherever the fit lay and wherever the
+folder goes."""
 
 from __future__ import annotations
 
@@ -26,18 +27,29 @@ def fit_of(person: Path, folder: Path, raised: float = 0.01) -> Path:
     folder.mkdir(parents=True)
     for name in ("body_train.npz", "body_pose.npz"):
         arrays = dict(np.load(person / name))
-        np.savez(folder / name, **(arrays | {"trans": arrays["trans"] + np.array([0, raised, 0], np.float32)}))
+        np.savez(
+            folder / name,
+            **(arrays | {"trans": arrays["trans"] + np.array([0, raised, 0], np.float32)}),
+        )
     (folder / "fit_report.json").write_text("{}")
     (folder / "fit_overlays.png").write_bytes(b"an image")
     return folder
 
 
 def config_of(person: Path, fit: Path, run_dir: Path) -> Config:
-    words = [f"data.root={person}", f"data.body={fit}", f"run.dir={run_dir}", "run.threads=1", "train.steps=3"]
+    words = [
+        f"data.root={person}",
+        f"data.body={fit}",
+        f"run.dir={run_dir}",
+        "run.threads=1",
+        "train.steps=3",
+    ]
     return dyngs.load_config("human", [*words, "train.log_every=1", "model.resolution=24"])
 
 
-def test_a_moved_run_needs_no_cache(person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_moved_run_needs_no_cache(
+    person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     fit = fit_of(person, tmp_path / "cache" / "bodies" / "person.1")
     config = config_of(person, fit, tmp_path / "run")
     run = dyngs.train(config)
@@ -85,7 +97,8 @@ def test_a_fit_that_is_gone_stays_named(person: Path, tmp_path: Path) -> None:
 
 
 def test_bodies_are_the_same_by_their_contents(person: Path, tmp_path: Path) -> None:
-    one, two = fit_of(person, tmp_path / "one"), fit_of(person, tmp_path / "two")
+    one = fit_of(person, tmp_path / "one")
+    two = fit_of(person, tmp_path / "two")
     other = fit_of(person, tmp_path / "other", raised=0.02)
     assert is_same_body(one, two)
     assert is_same_body(None, None)
@@ -101,5 +114,9 @@ def test_bodies_are_the_same_by_their_contents(person: Path, tmp_path: Path) -> 
 
 def test_another_fit_is_another_run(person: Path, tmp_path: Path) -> None:
     dyngs.train(config_of(person, fit_of(person, tmp_path / "one"), tmp_path / "run"))
-    with pytest.raises(DyngsError, match=r"another one \(data\.body is .*run/body there and .*two here\)"):
-        dyngs.train(config_of(person, fit_of(person, tmp_path / "two", raised=0.02), tmp_path / "run"))
+    with pytest.raises(
+        DyngsError, match=r"another one \(data\.body is .*run/body there and .*two here\)"
+    ):
+        dyngs.train(
+            config_of(person, fit_of(person, tmp_path / "two", raised=0.02), tmp_path / "run")
+        )

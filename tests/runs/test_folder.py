@@ -1,4 +1,5 @@
-"""Whatever lies in a folder, no command replaces it unasked, and what a killed process left half written goes."""
+"""Whatever lies in a folder, no command replaces it unasked, and what a killed process left half
+written goes."""
 
 from __future__ import annotations
 
@@ -23,14 +24,25 @@ from dyngs.export.scene_file import write_scene_file
 from dyngs.export.splat_files import write_run_sequence
 from dyngs.files.lock import LOCK_NAME, InUseError, writing
 from dyngs.files.outputs import new_folder, require_new_folder
-from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
+from dyngs.runs.checkpoint import (
+    KEEP_CHECKPOINTS,
+    checkpoint_paths,
+    latest_checkpoint,
+    load_run,
+    save_checkpoint,
+)
 from dyngs.runs.folder import default_folder, require_empty, tidy
 from dyngs.runs.log import RunLog
 from dyngs.runs.opened import open_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-FOREIGN = {"notes.txt": "mine", "checkpoints/best.pt": "mine", ".step_7.txt": "mine", "deep/a.png": "mine"}
+FOREIGN = {
+    "notes.txt": "mine",
+    "checkpoints/best.pt": "mine",
+    ".step_7.txt": "mine",
+    "deep/a.png": "mine",
+}
 OWN = {
     "config": {"config.yaml": "a: foreign file\n"},
     "log": {"log.jsonl": '{"step": 1}\n'},
@@ -75,7 +87,9 @@ Command = Callable[[Path, Path, Path], object]
 """Of the capture, a run, and where to."""
 COMMANDS: dict[str, Command] = {
     "train": lambda capture, run, out: train(config_of(capture, out)),
-    "compact": lambda capture, run, out: prune_run(run, out, ("prune.fraction=0.5", "prune.steps=1", "run.threads=1")),
+    "compact": lambda capture, run, out: prune_run(
+        run, out, ("prune.fraction=0.5", "prune.steps=1", "run.threads=1")
+    ),
     "export": lambda capture, run, out: write_scene_file(run, out),
     "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),
     "synth": lambda capture, run, out: require_new_folder(out),
@@ -120,7 +134,9 @@ def test_files_of_others_stay(still: Path, run_dir: Path, tmp_path: Path, comman
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_file_in_place_of_the_folder_stays(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+def test_a_file_in_place_of_the_folder_stays(
+    still: Path, run_dir: Path, tmp_path: Path, command: str
+) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(DyngsError) as caught:
         COMMANDS[command](still, run_dir, tmp_path / "out")
@@ -130,7 +146,9 @@ def test_a_file_in_place_of_the_folder_stays(still: Path, run_dir: Path, tmp_pat
 
 
 @pytest.mark.parametrize("command", ["train", "compact", "export", "resume", "sequence"])
-def test_a_folder_that_cannot_be_written_is_told(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+def test_a_folder_that_cannot_be_written_is_told(
+    still: Path, run_dir: Path, tmp_path: Path, command: str
+) -> None:
     out = tmp_path / "out"
     out.mkdir()
     out.chmod(0o500)
@@ -176,7 +194,9 @@ def test_a_run_that_is_only_stored_stays(still: Path, run_dir: Path, tmp_path: P
     assert _contents(out) == before
 
 
-def test_a_run_stopped_before_its_first_checkpoint_is_taken_up(still: Path, run_dir: Path, tmp_path: Path) -> None:
+def test_a_run_stopped_before_its_first_checkpoint_is_taken_up(
+    still: Path, run_dir: Path, tmp_path: Path
+) -> None:
     """By the same command or by --resume, and by nothing else."""
     end = checkpoint_paths(run_dir)[-1].read_bytes()
     for resumes in (False, True):
@@ -209,11 +229,17 @@ def test_what_a_kill_leaves_goes_when_the_run_goes_on(run_dir: Path, tmp_path: P
         shutil.copyfile(newest, newest.with_name(f"step_000000{step}.safetensors"))
     left = ["checkpoints/.step_0000004.77-abcdef.dyngs.safetensors"]
     left += [".timing.77-abcdef.dyngs.json", LOCK_NAME]
-    kept = [".metrics.77-abcdef.dyngs.json", ".timing.json.swp", "checkpoints/.step_best.safetensors"]
+    kept = [
+        ".metrics.77-abcdef.dyngs.json",
+        ".timing.json.swp",
+        "checkpoints/.step_best.safetensors",
+    ]
     for name in (*left, *kept):
         (run / name).write_text("half")
     train(load_resolved(run), resume_from=run)
-    assert [path.name for path in checkpoint_paths(run)] == [path.name for path in checkpoint_paths(run_dir)]
+    assert [path.name for path in checkpoint_paths(run)] == [
+        path.name for path in checkpoint_paths(run_dir)
+    ]
     assert len(checkpoint_paths(run)) == KEEP_CHECKPOINTS
     assert [name for name in left if (run / name).exists()] == []
     assert [name for name in kept if not (run / name).exists()] == []
@@ -222,7 +248,8 @@ def test_what_a_kill_leaves_goes_when_the_run_goes_on(run_dir: Path, tmp_path: P
 @pytest.mark.skipif(sys.platform == "win32", reason="links")
 def test_nothing_is_removed_through_a_link(tmp_path: Path) -> None:
     outside = _filled(
-        tmp_path / "outside", {".step_2.1-abcdef.dyngs.safetensors": "mine", ".a.1-abcdef.dyngs.json": "mine"}
+        tmp_path / "outside",
+        {".step_2.1-abcdef.dyngs.safetensors": "mine", ".a.1-abcdef.dyngs.json": "mine"},
     )
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "checkpoints").symlink_to(outside)
@@ -238,7 +265,9 @@ def test_a_torn_last_line_of_the_log_is_dropped_once(run_dir: Path, tmp_path: Pa
         with RunLog(tmp_path, 4):
             pass
         whole = 4 if cut == len(lines[3]) else 3  # only its end of line lacked
-        assert (tmp_path / "log.jsonl").read_text() == "".join(line + "\n" for line in lines[:whole])
+        assert (tmp_path / "log.jsonl").read_text() == "".join(
+            line + "\n" for line in lines[:whole]
+        )
 
 
 def test_the_time_of_a_checkpoint_is_there_as_soon_as_it_is(
@@ -270,7 +299,10 @@ def test_a_new_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     with new_folder(out, require_empty) as started:
         (started / "a").touch()
     assert [path.name for path in out.iterdir()] == ["a"]
-    with pytest.raises(DyngsError, match="exists already"), new_folder(tmp_path / "new", require_empty) as started:
+    with (
+        pytest.raises(DyngsError, match="exists already"),
+        new_folder(tmp_path / "new", require_empty) as started,
+    ):
         _filled(tmp_path / "new", {"b": "of somebody else"})
     assert _contents(tmp_path) == {"out/a": b"", "new/b": b"of somebody else"}
 
@@ -279,14 +311,25 @@ def test_a_new_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_a_few_kills_lose_nothing(tmp_path: Path) -> None:
     """The first seconds of benchmarks/soak.py, which does this for long."""
     soak = Path(__file__).parents[2] / "benchmarks" / "soak.py"
-    words = [sys.executable, str(soak), "--kills", "2", "--minutes", "1", "--jobs", "static,prune,export"]
+    words = [
+        sys.executable,
+        str(soak),
+        "--kills",
+        "2",
+        "--minutes",
+        "1",
+        "--jobs",
+        "static,prune,export",
+    ]
     done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^\d kills in .*, 0 lost$", done.stdout, re.MULTILINE)
 
 
 @pytest.mark.parametrize("command", ["train", "export", "resume"])
-def test_nothing_is_written_while_another_writes(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
+def test_nothing_is_written_while_another_writes(
+    still: Path, run_dir: Path, tmp_path: Path, command: str
+) -> None:
     out = tmp_path / "out"
     shutil.copytree(run_dir, out)
     with writing(out):
@@ -296,7 +339,9 @@ def test_nothing_is_written_while_another_writes(still: Path, run_dir: Path, tmp
         assert _contents(out) == before
 
 
-def test_the_command_says_it_in_one_line(still: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_it_in_one_line(
+    still: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["train", "static", f"data.root={still}", f"run.dir={run_dir}"]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1

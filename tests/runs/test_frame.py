@@ -11,7 +11,9 @@ from dyngs.errors import DyngsError
 from dyngs.runs.frame import FRAME_NAME, RunFrame, read_frame, write_frame
 from dyngs.splats.similarity import Similarity
 
-FRAME = RunFrame(Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (1.0, -2.0, 1 / 3)), (691000.5, 0.0, 0.0), "z", True)
+FRAME = RunFrame(
+    Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (1.0, -2.0, 1 / 3)), (691000.5, 0.0, 0.0), "z", True
+)
 
 
 def test_back_and_forth(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""What runs, configurations and captures read, and that every function that writes to a path looks at it."""
+"""What runs, configurations and captures read, and that every function that writes to a path looks
+at it."""
 
 from __future__ import annotations
 
@@ -32,11 +33,21 @@ from dyngs.runs.opened import open_run
 
 PACKAGE = Path(dyngs.__file__).parent
 
-WRITERS = {"atomic_file", "write_text", "write_image", "VideoWriter", "write_tensors", "save_config"}
+WRITERS = {
+    "atomic_file",
+    "write_text",
+    "write_image",
+    "VideoWriter",
+    "write_tensors",
+    "save_config",
+}
 CHECKS = {"require_output", "require_empty", "require_new_folder", "new_folder", "folder_of_export"}
 ROOMS_BELOW = ("files/", "config/", "runs/", "data/images/", "splats/", "ops/")
-"""Rooms of writers that are handed what they write, or that keep the run folder and the caches of dyngs itself."""
-VALUES = "is handed values, and reads no file that it could replace; the command checks its arguments"
+"""Rooms of writers that are handed what they write, or that keep the run folder and the caches of
+dyngs itself."""
+VALUES = (
+    "is handed values, and reads no file that it could replace; the command checks its arguments"
+)
 OWN = "in a run folder, or in a hidden folder, that its caller has made and checked"
 UNCHECKED = {
     "api/choose.py:write_choices": OWN,
@@ -70,7 +81,11 @@ UNCHECKED = {
 
 def names_called(function: ast.AST) -> set[str]:
     calls = (node.func for node in ast.walk(function) if isinstance(node, ast.Call))
-    return {f.attr if isinstance(f, ast.Attribute) else f.id for f in calls if isinstance(f, ast.Attribute | ast.Name)}
+    return {
+        f.attr if isinstance(f, ast.Attribute) else f.id
+        for f in calls
+        if isinstance(f, ast.Attribute | ast.Name)
+    }
 
 
 def functions() -> dict[str, ast.FunctionDef]:
@@ -79,21 +94,30 @@ def functions() -> dict[str, ast.FunctionDef]:
     for file in sorted(PACKAGE.rglob("*.py")):
         name = file.relative_to(PACKAGE).as_posix()
         for node in ast.parse(file.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_") and not name.startswith(ROOMS_BELOW):
+            if (
+                isinstance(node, ast.FunctionDef)
+                and not node.name.startswith("_")
+                and not name.startswith(ROOMS_BELOW)
+            ):
                 given = [*node.args.args, *node.args.kwonlyargs]
-                if any("Path" in ast.unparse(a.annotation) for a in given if a.annotation is not None):
+                if any(
+                    "Path" in ast.unparse(a.annotation) for a in given if a.annotation is not None
+                ):
                     found[f"{name}:{node.name}"] = node
     return found
 
 
 def unchecked() -> set[str]:
     """Functions that write, or call such a function, and check nothing."""
-    known, writing = functions(), set(WRITERS)
+    known = functions()
+    writing = set(WRITERS)
     while True:
         found = {
             name
             for name, node in known.items()
-            if names_called(node) & writing and not names_called(node) & CHECKS and not name.startswith("cli/")
+            if names_called(node) & writing
+            and not names_called(node) & CHECKS
+            and not name.startswith("cli/")
         }
         more = writing | {name.split(":")[1] for name in found}
         if more == writing:
@@ -102,7 +126,8 @@ def unchecked() -> set[str]:
 
 
 def test_every_function_that_writes_checks_its_output() -> None:
-    """A new one calls ``require_output``, makes a new folder, or is named in ``UNCHECKED`` with its reason."""
+    """A new one calls ``require_output``, makes a new folder, or is named in ``UNCHECKED`` with its
+    reason."""
     assert unchecked() == UNCHECKED.keys()
 
 
@@ -135,7 +160,13 @@ def test_no_function_replaces_a_file_of_the_capture(tmp_path: Path) -> None:
     (tmp_path / "link.png").symlink_to(image)
     os.link(image, tmp_path / "hard.png")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    for out in (image, tmp_path / "link.png", tmp_path / "hard.png", root / "transforms_train.json", root):
+    for out in (
+        image,
+        tmp_path / "link.png",
+        tmp_path / "hard.png",
+        root / "transforms_train.json",
+        root,
+    ):
         for name, write in write_all(run, out).items():
             with pytest.raises(DyngsError, match="is read") as caught:
                 write()
@@ -177,14 +208,18 @@ def test_what_a_run_reads(tmp_path: Path) -> None:
             inputs_of(named).require_output(run / "scene.dyngs")
 
 
-def test_files_that_a_capture_names_elsewhere(nerfstudio_root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_files_that_a_capture_names_elsewhere(
+    nerfstudio_root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """With ``data.follow_links`` the images may lie anywhere: they are read, too."""
     moved = tmp_path_factory.mktemp("elsewhere") / "images"
     shutil.move(nerfstudio_root / "images", moved)
     file = nerfstudio_root / "transforms.json"
     file.write_text(file.read_text().replace("images/", f"{moved}/"))
     image = next(path for path in moved.iterdir() if path.is_file())
-    config = load_config(packaged_preset("static"), [f"data.root={nerfstudio_root}", "data.follow_links=true"])
+    config = load_config(
+        packaged_preset("static"), [f"data.root={nerfstudio_root}", "data.follow_links=true"]
+    )
     with pytest.raises(DyngsError, match="is the file that is read"):
         inputs_of(config).require_output(image)
     with pytest.raises(DyngsError, match="is the file that is read"):

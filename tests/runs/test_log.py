@@ -17,7 +17,15 @@ from dyngs.training.events import Evaluated, Message
 
 
 def _record(step: int, psnr: float | None = 20.0) -> LogRecord:
-    return LogRecord(step, loss=0.5, psnr=psnr, num_gaussians=1234, num_moving=56, bad_gradients=0, seconds=float(step))
+    return LogRecord(
+        step,
+        loss=0.5,
+        psnr=psnr,
+        num_gaussians=1234,
+        num_moving=56,
+        bad_gradients=0,
+        seconds=float(step),
+    )
 
 
 def _steps(path: Path) -> list[int]:
@@ -65,11 +73,16 @@ def test_it_listens_to_steps_and_scores(tmp_path: Path) -> None:
         log(Evaluated(12, "test", 21.0, 0.9, 3.0))
     lines = [json.loads(line) for line in log.path.read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10, 12, 12]
-    assert lines[0] | {"seconds": 0.0} == asdict(_record(5)) | {"psnr": lines[0]["psnr"], "seconds": 0.0}
+    assert lines[0] | {"seconds": 0.0} == asdict(_record(5)) | {
+        "psnr": lines[0]["psnr"],
+        "seconds": 0.0,
+    }
     assert lines[-1] == {"step": 12, "split": "test", "psnr": 21.0, "ssim": 0.9}
 
 
 @pytest.mark.parametrize(("difference", "psnr"), [(0.1, 20.0), (math.nan, None)])
-def test_a_quality_that_is_no_number_is_null(tmp_path: Path, difference: float, psnr: float | None) -> None:
+def test_a_quality_that_is_no_number_is_null(
+    tmp_path: Path, difference: float, psnr: float | None
+) -> None:
     record = record_of(step_done(1, 1, difference))
     assert record.psnr == (None if psnr is None else pytest.approx(psnr, abs=1e-4))

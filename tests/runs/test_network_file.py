@@ -1,4 +1,5 @@
-"""Weights of a network in one file: what it predicts stays what it was, and everything else is refused."""
+"""Weights of a network in one file: what it predicts stays what it was, and everything else is
+refused."""
 
 from __future__ import annotations
 
@@ -29,11 +30,14 @@ def config(tmp_path: Path) -> Config:
 def checkpoint(scale: float = 1.0) -> Checkpoint:
     network = GpsNetwork(STEREO, torch.Generator().manual_seed(0))
     tensors = {f"model.network.{name}": scale * x for name, x in network.state_dict().items()}
-    return Checkpoint(INFO, tensors | {"rng": torch.zeros(3), "optimizer.step.x": torch.tensor(1.0)})
+    return Checkpoint(
+        INFO, tensors | {"rng": torch.zeros(3), "optimizer.step.x": torch.tensor(1.0)}
+    )
 
 
 def test_weights_are_those_of_the_run_to_float16(config: Config, tmp_path: Path) -> None:
-    """Next to the section ``model``; nothing of the training is in the file, nor a path of the run."""
+    """Next to the section ``model``; nothing of the training is in the file, nor a path of the
+    run."""
     stored = checkpoint()
     path = write_network(tmp_path / "run", config, stored, tmp_path / "net.safetensors")
     found, weights = read_network(path)
@@ -72,7 +76,9 @@ def test_other_files_are_refused(config: Config, tmp_path: Path) -> None:
     messages = [_refusal(bad)]
     for key, changed in cases:
         header = {"step": 1, "extent": 1.0, "world_offset": (0, 0, 0), "background": "white"}
-        write_tensors(bad, FileKind(key, "", 1), {}, header | {"rasterize_mode": "classic"} | changed)
+        write_tensors(
+            bad, FileKind(key, "", 1), {}, header | {"rasterize_mode": "classic"} | changed
+        )
         messages.append(_refusal(bad))
     assert "not the weights of a network" in messages[1]
     assert "model.kind=static" in messages[2]
@@ -85,10 +91,14 @@ def _refusal(path: Path) -> str:
     return str(error.value)
 
 
-def test_published_weights_are_known_by_their_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_published_weights_are_known_by_their_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(network_file, "PUBLISHED", "no_weights_here")
-    with pytest.raises(DyngsError, match=r"gps: no run and no file of weights; .* install the package"):
+    with pytest.raises(
+        DyngsError, match=r"gps: no run and no file of weights; .* install the package"
+    ):
         published_network("gps")
     (tmp_path / "no_weights_here").mkdir()
     (tmp_path / "no_weights_here" / "gps.safetensors").touch()

@@ -1,4 +1,5 @@
-"""Opened scenes: what is known about a run, an avatar or a file, and that a capture is read once, when it is needed."""
+"""Opened scenes: what is known about a run, an avatar or a file, and that a capture is read once,
+when it is needed."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_moving_run(tmp_path_factory.mktemp("run"), offset=(1.0, 2.0, 3.0))
 
 
-def test_a_capture_is_read_once_and_only_when_it_is_needed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_capture_is_read_once_and_only_when_it_is_needed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read = opened_module.read_capture_of
     calls = []
     monkeypatch.setattr(opened_module, "read_capture_of", lambda *of: calls.append(of) or read(*of))
@@ -84,13 +87,17 @@ def test_another_background_is_drawn(folder: Path) -> None:
     camera = opened.cameras.select(0) if opened.cameras is not None else pytest.fail("no cameras")
     white, dark = (one.scene.render(camera, 0.0).rgb.detach() for one in (opened, black))
     assert float((white - dark).min()) >= -1e-6
-    assert torch.equal(white, opened.scene.render(camera, 0.0, background=torch.ones(3)).rgb.detach())
+    assert torch.equal(
+        white, opened.scene.render(camera, 0.0, background=torch.ones(3)).rgb.detach()
+    )
     assert float((white - dark).max()) == pytest.approx(1, abs=1e-3)
 
 
 def test_only_people_play_motions(folder: Path) -> None:
     run: Opened = open_scene(folder)
-    with pytest.raises(DyngsError, match=r"--motion walk.npz needs the run of a person \(model.kind=human\)"):
+    with pytest.raises(
+        DyngsError, match=r"--motion walk.npz needs the run of a person \(model.kind=human\)"
+    ):
         run.in_motion(Path("walk.npz"))
     with pytest.raises(DyngsError, match="--pose rest needs the run of a person"):
         run.at_rest()

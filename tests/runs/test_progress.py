@@ -14,7 +14,15 @@ from dyngs.training.events import Evaluated, Message, TotalChanged
 
 
 def _record(step: int, psnr: float | None = 20.0) -> LogRecord:
-    return LogRecord(step, loss=0.5, psnr=psnr, num_gaussians=1234, num_moving=56, bad_gradients=0, seconds=float(step))
+    return LogRecord(
+        step,
+        loss=0.5,
+        psnr=psnr,
+        num_gaussians=1234,
+        num_moving=56,
+        bad_gradients=0,
+        seconds=float(step),
+    )
 
 
 def test_without_a_terminal_there_are_about_ten_lines() -> None:
@@ -53,7 +61,8 @@ def test_on_a_terminal_there_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_it_listens() -> None:
-    """To every fifth step and the last, to messages, and to another number of steps; evaluations do not slow it."""
+    """To every fifth step and the last, to messages, and to another number of steps; evaluations do
+    not slow it."""
     stream = io.StringIO()
     with Progress(12, 0, 5, stream) as progress:
         for step in range(1, 8):
@@ -63,13 +72,19 @@ def test_it_listens() -> None:
         progress(TotalChanged(8))
         progress(step_done(8, 8))
     lines = stream.getvalue().splitlines()
-    assert [line.split(" loss")[0] for line in lines] == ["step 5/12", "something was found", "step 8/8"]
+    assert [line.split(" loss")[0] for line in lines] == [
+        "step 5/12",
+        "something was found",
+        "step 8/8",
+    ]
     assert "1,234 Gaussians" in lines[0]
     assert " 0.0 steps/s" in lines[-1], "a million seconds more were spent training"
 
 
 @pytest.mark.parametrize("is_terminal", [False, True])
-def test_a_closed_terminal_does_not_end_the_run(is_terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_terminal_does_not_end_the_run(
+    is_terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("TERM", "xterm")
 
     class Gone(io.StringIO):

@@ -22,10 +22,16 @@ def parameters(scene: Gaussians, of_nerfstudio: bool) -> torch.nn.ParameterDict:
     rest = scene.sh[:, 1:]
     found = {"means": scene.means, "scales": scene.log_scales, "quats": 3 * scene.quats}
     if of_nerfstudio:
-        found |= {"opacities": scene.logit_opacities[:, None], "features_dc": scene.sh[:, 0], "features_rest": rest}
+        found |= {
+            "opacities": scene.logit_opacities[:, None],
+            "features_dc": scene.sh[:, 0],
+            "features_rest": rest,
+        }
     else:
         found |= {"opacities": scene.logit_opacities, "sh0": scene.sh[:, :1], "shN": rest}
-    return torch.nn.ParameterDict({name: torch.nn.Parameter(tensor.clone()) for name, tensor in found.items()})
+    return torch.nn.ParameterDict(
+        {name: torch.nn.Parameter(tensor.clone()) for name, tensor in found.items()}
+    )
 
 
 def nerfstudio(scene: Gaussians) -> dict[str, Any]:
@@ -55,7 +61,10 @@ def same(found: Gaussians, wanted: Gaussians) -> None:
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gsplat(degree: int, tmp_path: Path) -> None:
     scene = cloud(50, degree)
-    torch.save({"step": 6999, "splats": parameters(scene, False).state_dict()}, tmp_path / "ckpt_6999_rank0.pt")
+    torch.save(
+        {"step": 6999, "splats": parameters(scene, False).state_dict()},
+        tmp_path / "ckpt_6999_rank0.pt",
+    )
     back = read_splats(tmp_path / "ckpt_6999_rank0.pt")
     same(back.gaussians, scene)
     assert back.up == "z"
@@ -76,7 +85,9 @@ def test_nerfstudio_without_harmonics_stores_logits_of_colours(tmp_path: Path) -
     torch.testing.assert_close(read_splats(tmp_path / "a.ckpt").gaussians.base_rgb, colours)
 
 
-def test_a_checkpoint_is_converted_upright(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_checkpoint_is_converted_upright(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene = cloud(50, 1)
     torch.save({"step": 1, "splats": parameters(scene, False).state_dict()}, tmp_path / "a.pt")
     assert main(["convert", str(tmp_path / "a.pt"), str(tmp_path / "a.ply")]) == 0
@@ -102,8 +113,13 @@ class Attack:
 def test_code_in_a_file_is_not_run(place: str, tmp_path: Path) -> None:
     attack = Attack(tmp_path / "attacked")
     whole = parameters(cloud(5, 1), False).state_dict()
-    torch.save({"splats": whole, "x": attack if place == "beside" else {"z": [attack]}}, tmp_path / "a.pt")
-    with pytest.raises(DyngsError, match=r"a\.pt: is damaged, or holds objects that only code could restore; export"):
+    torch.save(
+        {"splats": whole, "x": attack if place == "beside" else {"z": [attack]}}, tmp_path / "a.pt"
+    )
+    with pytest.raises(
+        DyngsError,
+        match=r"a\.pt: is damaged, or holds objects that only code could restore; export",
+    ):
         read_splats(tmp_path / "a.pt")
     assert not (tmp_path / "attacked").exists()
 
@@ -125,10 +141,14 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 def test_tensors_that_share_numbers_are_not_written_out(tmp_path: Path) -> None:
     """An expanded tensor is a few bytes of a file, whatever its shape."""
     whole = parameters(cloud(5, 1), False).state_dict()
-    torch.save({"splats": {**whole, "means": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt")
+    torch.save(
+        {"splats": {**whole, "means": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt"
+    )
     with pytest.raises(DyngsError, match=r"asks for 1,099,511,627,776 Gaussians"):
         read_splats(tmp_path / "a.pt")
-    torch.save({"splats": {**whole, "scales": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt")
+    torch.save(
+        {"splats": {**whole, "scales": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt"
+    )
     with pytest.raises(DyngsError, match=r"scales should hold 5 x 3 floats"):
         read_splats(tmp_path / "a.pt")
 
@@ -144,9 +164,14 @@ def test_other_checkpoints_are_refused(tmp_path: Path) -> None:
         {"splats": {**whole, "other.means": whole["means"]}},
     ):
         torch.save(state, path)
-        with pytest.raises(DyngsError, match=r"a\.pt: holds no Gaussians as .* `ns-export gaussian-splat`"):
+        with pytest.raises(
+            DyngsError, match=r"a\.pt: holds no Gaussians as .* `ns-export gaussian-splat`"
+        ):
             read_splats(path)
-    for state, problem in ((short, "quats should hold 5 x 4"), (odd, "5 harmonics for each Gaussian are of no degree")):
+    for state, problem in (
+        (short, "quats should hold 5 x 4"),
+        (odd, "5 harmonics for each Gaussian are of no degree"),
+    ):
         torch.save({"splats": state}, path)
         with pytest.raises(DyngsError, match=problem):
             read_splats(path)

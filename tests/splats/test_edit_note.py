@@ -30,5 +30,7 @@ def test_damaged_ones_are_refused(told: str, tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     path.write_bytes(b"one")
     note_path(path).write_text(told)
-    with pytest.raises(DyngsError, match=r"a\.spz\.edit\.json: is no note of `dyngs edit`; remove it"):
+    with pytest.raises(
+        DyngsError, match=r"a\.spz\.edit\.json: is no note of `dyngs edit`; remove it"
+    ):
         read_note(path)

@@ -1,4 +1,5 @@
-"""All formats through one reader and one writer: the same images, within what each format rounds."""
+"""All formats through one reader and one writer: the same images, within what each format
+rounds."""
 
 from __future__ import annotations
 
@@ -38,12 +39,21 @@ from dyngs.splats.gltf import add_gaussians
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import SplatFile, splat_options
 
-LEAST_PSNR = {"ply": 99, "compressed-ply": 42, "spz": 36, "splat": 40, "sog": 35, "glb": 90, "usd": 90}
+LEAST_PSNR = {
+    "ply": 99,
+    "compressed-ply": 42,
+    "spz": 36,
+    "splat": 40,
+    "sog": 35,
+    "glb": 90,
+    "usd": 90,
+}
 """dB, of a scene whose harmonics are as strong as its base colours."""
 
 without_usd = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core")
 every = pytest.mark.parametrize(
-    "kind", [pytest.param(f, marks=without_usd if f.name == "usd" else (), id=f.name) for f in FORMATS]
+    "kind",
+    [pytest.param(f, marks=without_usd if f.name == "usd" else (), id=f.name) for f in FORMATS],
 )
 
 
@@ -65,13 +75,19 @@ def test_a_file_shows_what_was_written(kind: Format, tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
 @pytest.mark.parametrize(
-    "suffix", [pytest.param(x, marks=without_usd if f.name == "usd" else ()) for f in FORMATS for x in f.suffixes]
+    "suffix",
+    [
+        pytest.param(x, marks=without_usd if f.name == "usd" else ())
+        for f in FORMATS
+        for x in f.suffixes
+    ],
 )
 def test_a_full_disk_is_one_line_and_leaves_the_former_file(suffix: str, tmp_path: Path) -> None:
     """No file may take more than 2 KB, of which the first scene needs less in every format."""
     import resource
 
-    path, usual = tmp_path / f"a{suffix}", resource.getrlimit(resource.RLIMIT_FSIZE)
+    path = tmp_path / f"a{suffix}"
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
     path.write_bytes(b"former")
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, usual[1]))
     try:
@@ -87,7 +103,9 @@ def test_a_full_disk_is_one_line_and_leaves_the_former_file(suffix: str, tmp_pat
 
 
 @every
-def test_what_pointed_up_points_up_in_the_viewers_of_the_format(kind: Format, tmp_path: Path) -> None:
+def test_what_pointed_up_points_up_in_the_viewers_of_the_format(
+    kind: Format, tmp_path: Path
+) -> None:
     scene = cloud(degree=min(3, kind.max_degree))
     path = file_of(kind, tmp_path)
     back = read_splats(write_splats(path, upright(SplatFile(scene, up="z"), None, path)).path)
@@ -99,9 +117,13 @@ def test_what_pointed_up_points_up_in_the_viewers_of_the_format(kind: Format, tm
 
 @every
 def test_what_the_format_cannot_say_is_said(kind: Format, tmp_path: Path) -> None:
-    written = write_splats(file_of(kind, tmp_path), SplatFile(cloud(30, 4), RasterizeMode.ANTIALIASED))
+    written = write_splats(
+        file_of(kind, tmp_path), SplatFile(cloud(30, 4), RasterizeMode.ANTIALIASED)
+    )
     said = " ".join(written.notes)
-    assert (f"harmonics above degree {kind.max_degree} are left out" in said) == (kind.max_degree < 4)
+    assert (f"harmonics above degree {kind.max_degree} are left out" in said) == (
+        kind.max_degree < 4
+    )
     assert ("antialiased" in said) == (not kind.states_mode)
     if kind.states_mode:
         assert splat_options(read_splats(written.path)).mode is RasterizeMode.ANTIALIASED
@@ -111,7 +133,9 @@ def test_what_the_format_cannot_say_is_said(kind: Format, tmp_path: Path) -> Non
 def test_the_degree_that_is_asked_for(kind: Format, tmp_path: Path) -> None:
     for degree in (1,) if kind.name == "usd" else range(kind.max_degree + 1):
         scene = cloud(30, 1)
-        back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(scene), sh_degree=degree).path)
+        back = read_splats(
+            write_splats(file_of(kind, tmp_path), SplatFile(scene), sh_degree=degree).path
+        )
         assert back.gaussians.sh_degree == degree
         if degree > 1:
             assert float(back.gaussians.sh[:, 4:].abs().max()) < 0.04  # bytes around zero
@@ -121,10 +145,13 @@ def test_the_degree_that_is_asked_for(kind: Format, tmp_path: Path) -> None:
 
 
 @every
-def test_one_gaussian_exactly_opaque_and_one_exactly_transparent(kind: Format, tmp_path: Path) -> None:
+def test_one_gaussian_exactly_opaque_and_one_exactly_transparent(
+    kind: Format, tmp_path: Path
+) -> None:
     scene = cloud(40, 0)
     logits = torch.linspace(-3, 3, 40)
-    logits[0], logits[1] = 40.0, -200.0  # 1 and 0 in float32, or in 8 bits
+    logits[0] = 40.0
+    logits[1] = -200.0  # 1 and 0 in float32, or in 8 bits
     scene = scene.replace(logit_opacities=logits)
     back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(scene)).path)
     assert len(back.gaussians) == 40
@@ -148,8 +175,10 @@ def test_one_gaussian_alone(kind: Format, tmp_path: Path) -> None:
 def test_every_truncation_is_an_error(kind: Format, tmp_path: Path) -> None:
     path = file_of(kind, tmp_path)
     data = write_splats(path, SplatFile(cloud(40, min(1, kind.max_degree)))).path.read_bytes()
-    for fraction in (0.5,) if kind.name == "usd" else (0.0, 0.01, 0.1, 0.5, 0.9, 0.999):  # USD is slow to read
-        path.write_bytes(data[: int(fraction * len(data)) - (kind.name == "splat")])  # a .splat ends after any row
+    for fraction in (0.5,) if kind.name == "usd" else (0.0, 0.01, 0.1, 0.5, 0.9, 0.999):
+        # USD is slow to read
+        # a .splat ends after any row
+        path.write_bytes(data[: int(fraction * len(data)) - (kind.name == "splat")])
         with pytest.raises(DyngsError, match="a\\.") as refused:
             read_splats(path)
         assert "\n" not in str(refused.value)
@@ -168,13 +197,16 @@ def test_what_cannot_be_written(kind: Format, tmp_path: Path) -> None:
 
 def test_values_that_are_not_finite_are_counted(tmp_path: Path) -> None:
     scene = cloud(10, 0)
-    means, logits = scene.means.clone(), scene.logit_opacities.clone()
+    means = scene.means.clone()
+    logits = scene.logit_opacities.clone()
     path = write_splats(tmp_path / "a.ply", SplatFile(scene)).path
     data = bytearray(path.read_bytes())
     row = (len(data) - data.index(b"end_header\n") - 11) // 10
     names = ["x", "y", "z", "nx", "ny", "nz", "dc", "dc", "dc", "opacity"]
     start = data.index(b"end_header\n") + 11
-    for i, (name, value) in enumerate((("x", torch.nan), ("opacity", torch.inf), ("opacity", torch.nan))):
+    for i, (name, value) in enumerate(
+        (("x", torch.nan), ("opacity", torch.inf), ("opacity", torch.nan))
+    ):
         at = start + row * i + 4 * names.index(name)
         data[at : at + 4] = torch.tensor(value).numpy().tobytes()
     path.write_bytes(data)
@@ -193,7 +225,8 @@ def test_suffixes() -> None:
     assert known_format(Path(".ply")) is None
     for name in ("b", "b.xyz"):
         with pytest.raises(
-            DyngsError, match=r"names no format of Gaussians; use one of \.compressed\.ply, \.ply, \.spz"
+            DyngsError,
+            match=r"names no format of Gaussians; use one of \.compressed\.ply, \.ply, \.spz",
         ):
             format_of(Path(name))
     assert [format_named(f.name) for f in FORMATS] == list(FORMATS)
@@ -209,7 +242,9 @@ def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
         read_splats(tmp_path / "b.spz")
 
 
-def test_counts_beyond_the_file_cost_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counts_beyond_the_file_cost_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import gzip
     import struct
 
@@ -226,24 +261,38 @@ def test_counts_beyond_the_file_cost_nothing(tmp_path: Path, monkeypatch: pytest
 def test_the_original_place_is_known_from_a_ply(tmp_path: Path) -> None:
     for name in ("a.ply", "a.compressed.ply"):
         path = tmp_path / name
-        splat = SplatFile(cloud(20, 1), RasterizeMode.ANTIALIASED, 0.1, (1.0, 2.0, 3.0), ("mine",), "z")
+        splat = SplatFile(
+            cloud(20, 1), RasterizeMode.ANTIALIASED, 0.1, (1.0, 2.0, 3.0), ("mine",), "z"
+        )
         back = read_splats(write_splats(path, upright(splat, None, path)).path)
-        assert (back.mode, back.eps2d, back.world_offset, back.up) == (splat.mode, 0.1, (1.0, 2.0, 3.0), "-y")
+        assert (back.mode, back.eps2d, back.world_offset, back.up) == (
+            splat.mode,
+            0.1,
+            (1.0, 2.0, 3.0),
+            "-y",
+        )
         assert back.turned == pytest.approx(upright(splat, None, path).turned)
         assert "mine" in back.comments
-        again = read_splats(write_splats(path, replace(back, comments=(*back.comments, "caf\xe9", "two\rlines"))).path)
+        again = read_splats(
+            write_splats(
+                path, replace(back, comments=(*back.comments, "caf\xe9", "two\rlines"))
+            ).path
+        )
         assert again.comments == back.comments  # nothing twice, nothing that breaks the header
 
 
 @every
 def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path) -> None:
     """In the axes of the capture in the file, in those of the file for people."""
-    path, turn = tmp_path / f"a{kind.suffixes[0]}", Similarity((0.0, 1.0, 0.0, 0.0))
+    path = tmp_path / f"a{kind.suffixes[0]}"
+    turn = Similarity((0.0, 1.0, 0.0, 0.0))
     splat = SplatFile(cloud(20, 0), world_offset=FAR, up=kind.up, turned=turn.turn)
     written = write_splats(path, splat)
     line = " ".join(f"{x:.12g}" for x in turn.points(np.array(FAR)))
     end = "the file states it" if kind.holds_comments else f"{kind.name} cannot state it"
-    assert written.notes == (f"the scene is far from the origin: {line} is subtracted from its positions ({end})",)
+    assert written.notes == (
+        f"the scene is far from the origin: {line} is subtracted from its positions ({end})",
+    )
     back = read_splats(path)
     if kind.holds_comments:
         assert (back.world_offset, back.turned) == (FAR, turn.turn)
@@ -254,7 +303,9 @@ def test_doubles_far_from_the_origin_show_the_same(tmp_path: Path) -> None:
     positions = write_far_ply(tmp_path / "far.ply", SplatFile(near))
     back = read_splats(tmp_path / "far.ply")
     assert back.world_offset == back.file_offset
-    np.testing.assert_allclose(back.gaussians.means.double().numpy() + back.file_offset, positions, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        back.gaussians.means.double().numpy() + back.file_offset, positions, rtol=0, atol=1e-6
+    )
     assert "is subtracted from its positions" in back.notes[0]
     x, y, z = (np.array(back.file_offset) - FAR).tolist()
     moved = Similarity(shift=(x, y, z)).gaussians(back.gaussians)
@@ -267,7 +318,8 @@ def test_doubles_far_from_the_origin_show_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".glb", pytest.param(".usda", marks=without_usd)])
 def test_nodes_far_from_the_origin_lose_nothing(suffix: str, tmp_path: Path) -> None:
     """Of other programs, which say nothing of an offset."""
-    path, near = tmp_path / f"a{suffix}", cloud(100, 0)
+    path = tmp_path / f"a{suffix}"
+    near = cloud(100, 0)
     write_splats(path, SplatFile(near, up="y"))
     if suffix == ".glb":
         document = GlbDocument()
@@ -290,7 +342,9 @@ def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
     path = tmp_path / f"a{kind.suffixes[0]}"
     before = SplatFile(cloud(30, kind.max_degree), up="-y", turned=(0.0, 0.0, 1.0, 0.0))
     edited = moved_file(
-        moved_file(before, Similarity((0.6, 0.0, 0.8, 0.0), 0.5), "-y"), Similarity(shift=(1, 2, 3)), "-y"
+        moved_file(before, Similarity((0.6, 0.0, 0.8, 0.0), 0.5), "-y"),
+        Similarity(shift=(1, 2, 3)),
+        "-y",
     )
     back = read_splats(write_splats(path, upright(edited, None, path)).path)
     assert note_path(path).exists() is not kind.holds_comments
@@ -304,7 +358,9 @@ def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
 
 
 def test_an_edit_that_is_none_is_refused(tmp_path: Path) -> None:
-    path = write_splats(tmp_path / "a.ply", moved_file(SplatFile(cloud(3)), Similarity(scale=2), None)).path
+    path = write_splats(
+        tmp_path / "a.ply", moved_file(SplatFile(cloud(3)), Similarity(scale=2), None)
+    ).path
     path.write_bytes(path.read_bytes().replace(b"edited: 1.0 0.0", b"edited: 3.0 0.0"))
     with pytest.raises(DyngsError, match="is no similarity; remove it"):
         read_splats(path)
@@ -345,7 +401,11 @@ def test_files_hold_scenes_of_any_unit(kind: Format, factor: float, tmp_path: Pa
 def test_quaternions_need_not_be_of_unit_length(tmp_path: Path) -> None:
     scene: Gaussians = cloud(50, 0)
     for kind in [kind for kind in readable() if kind.name != "usd"]:
-        back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(replace(scene, quats=scene.quats * 3))).path)
+        back = read_splats(
+            write_splats(
+                file_of(kind, tmp_path), SplatFile(replace(scene, quats=scene.quats * 3))
+            ).path
+        )
         assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
 
 
@@ -390,10 +450,12 @@ def test_a_ply_of_another_program() -> None:
 
 @pytest.mark.parametrize("name", ["three.spz", "three_v4.spz"])
 def test_an_spz_of_another_program(name: str) -> None:
-    """Its bytes stand for just these values; those of the harmonics are multiples of an eighth, and exact."""
+    """Its bytes stand for just these values; those of the harmonics are multiples of an eighth, and
+    exact."""
     if name == "three_v4.spz":
         pytest.importorskip("zstandard")
-    found, wanted = read_splats(KNOWN / name).gaussians, three()
+    found = read_splats(KNOWN / name).gaussians
+    wanted = three()
     exactly(found.means, wanted.means * TURNED)
     exactly(found.log_scales, wanted.log_scales)
     opacity = torch.tensor(OPACITY_BYTES) / 255
@@ -413,7 +475,10 @@ def test_an_spz_is_written_as_by_another_program(tmp_path: Path) -> None:
     assert ours[:12] == theirs[:12]
     assert (ours[13], theirs[13]) == (16, 12)
     bits = [
-        [int.from_bytes(data[i : i + 3], "little", signed=True) / 2 ** data[13] for i in range(16, 43, 3)]
+        [
+            int.from_bytes(data[i : i + 3], "little", signed=True) / 2 ** data[13]
+            for i in range(16, 43, 3)
+        ]
         for data in (ours, theirs)
     ]
     assert bits[0] == bits[1] == (three().means * TURNED).flatten().tolist()
@@ -425,7 +490,8 @@ def test_an_spz_is_written_as_by_another_program(tmp_path: Path) -> None:
 
 
 def test_a_splat_byte_by_byte(tmp_path: Path) -> None:
-    """By the description of antimatter15's format; ``splat-transform`` reads this very file as the values below."""
+    """By the description of antimatter15's format; ``splat-transform`` reads this very file as the
+    values below."""
     rows = (
         "0000003f0000a0bf00000040 86ed4b3d2e1ca83dae0a963c c06a87d0 ff808080",
         "000070c00000003e0000803f ffc9dc3bb25abc3e55950a3e 29abe41e c040c0c0",
@@ -434,7 +500,8 @@ def test_a_splat_byte_by_byte(tmp_path: Path) -> None:
     content = bytes.fromhex("".join(rows))
     written = write_splats(tmp_path / "ours.splat", SplatFile(three(), up="-y"), sh_degree=0).path
     assert written.read_bytes() == content
-    found, wanted = read_splats(written).gaussians, three()
+    found = read_splats(written).gaussians
+    wanted = three()
     exactly(found.means, wanted.means)
     exactly(found.log_scales, wanted.log_scales)
     exactly(found.logit_opacities, torch.tensor([1.4873905, -2.0149031, 0.2443458]), 1e-5)
@@ -450,17 +517,23 @@ def test_a_splat_byte_by_byte(tmp_path: Path) -> None:
 def test_bytes_of_a_splat_are_the_nearest(tmp_path: Path) -> None:
     """Cut off instead of rounded, all colours would be darker, and rotations off to one side."""
     scene = cloud(200, 0)
-    rows = np.frombuffer(write_splats(tmp_path / "a.splat", SplatFile(scene)).path.read_bytes(), np.uint8)
+    rows = np.frombuffer(
+        write_splats(tmp_path / "a.splat", SplatFile(scene)).path.read_bytes(), np.uint8
+    )
     written = torch.from_numpy(rows.reshape(-1, 32)[:, 24:].astype(np.float32))
-    order = torch.argsort(scene.log_scales.double().sum(1).exp() * scene.opacities, descending=True, stable=True)
+    order = torch.argsort(
+        scene.log_scales.double().sum(1).exp() * scene.opacities, descending=True, stable=True
+    )
     colours = torch.cat([scene.base_rgb, scene.opacities[:, None]], dim=1).clamp(0, 1) * 255
     exact = torch.cat([colours, (scene.quats * 128 + 128).clamp(0, 255)], dim=1)[order]
     assert float((written - exact).abs().max()) <= 0.5 + 1e-4
 
 
 def test_a_glb_of_another_program() -> None:
-    """It stands on its side: half a turn about z. Colours are those of the harmonics, whatever ``COLOR_0`` says."""
-    found, wanted = read_splats(KNOWN / "three.glb").gaussians, three()
+    """It stands on its side: half a turn about z. Colours are those of the harmonics, whatever
+    ``COLOR_0`` says."""
+    found = read_splats(KNOWN / "three.glb").gaussians
+    wanted = three()
     exactly(found.means, wanted.means * torch.tensor([-1.0, -1.0, 1.0]))
     exactly(found.log_scales, wanted.log_scales)
     exactly(found.logit_opacities, wanted.logit_opacities)
@@ -470,23 +543,30 @@ def test_a_glb_of_another_program() -> None:
 
 
 def test_a_glb_is_written_as_by_another_program(tmp_path: Path) -> None:
-    """The same attributes; but ``COLOR_0`` is linear, as glTF has it (that program writes sRGB there)."""
+    """The same attributes; but ``COLOR_0`` is linear, as glTF has it (that program writes sRGB
+    there)."""
     path = write_splats(tmp_path / "ours.glb", SplatFile(three()), sh_degree=0).path
-    ours, theirs = attributes(path), attributes(KNOWN / "three.glb")
+    ours = attributes(path)
+    theirs = attributes(KNOWN / "three.glb")
     assert ours.keys() == theirs.keys()
     own = "KHR_gaussian_splatting"
     for name in (f"{own}:SCALE", f"{own}:OPACITY", f"{own}:SH_DEGREE_0_COEF_0"):
         np.testing.assert_allclose(ours[name], theirs[name], rtol=2e-7)  # one unit of float32
-    np.testing.assert_allclose(ours[f"{own}:ROTATION"], np.array(THREE["quats"])[:, [1, 2, 3, 0]], atol=1e-7)
+    np.testing.assert_allclose(
+        ours[f"{own}:ROTATION"], np.array(THREE["quats"])[:, [1, 2, 3, 0]], atol=1e-7
+    )
     srgb = theirs["COLOR_0"] / 255
     assert srgb[2, 2].round(3) == 0.220  # 0.5 - 0.2821: known in linear light as 0.039
     linear = [[0.52859, 0.14390, 0.24109], [0.02235, 0.40545, 0.77742], [0.21404, 0.57392, 0.03896]]
     np.testing.assert_allclose(ours["COLOR_0"][:, :3], linear, atol=1e-5)
-    np.testing.assert_allclose(((srgb[:, :3] + 0.055) / 1.055) ** 2.4, linear, atol=3e-3)  # theirs has 8 bits
+    # theirs has 8 bits
+    np.testing.assert_allclose(((srgb[:, :3] + 0.055) / 1.055) ** 2.4, linear, atol=3e-3)
     np.testing.assert_allclose(ours["COLOR_0"][:, 3], [0.81757, 0.11920, 0.56218], atol=1e-5)
 
 
-@pytest.mark.parametrize(("key", "other"), [("srgb_rec709_display", "lin_rec709_display"), ("ellipse", "splat")])
+@pytest.mark.parametrize(
+    ("key", "other"), [("srgb_rec709_display", "lin_rec709_display"), ("ellipse", "splat")]
+)
 def test_a_glb_of_another_kind_is_refused(key: str, other: str, tmp_path: Path) -> None:
     """Linear colours would be drawn too dark."""
     path = write_splats(tmp_path / "a.glb", SplatFile(three()), sh_degree=0).path
@@ -524,12 +604,15 @@ def test_a_sog_by_its_description(tmp_path: Path) -> None:
             atol=0.05,
         )
         base = np.array(THREE["sh"])[order][:, 0]
-        np.testing.assert_allclose(np.array(meta["sh0"]["codebook"])[pixels("sh0")[:, :3]], base, atol=0.02)
+        np.testing.assert_allclose(
+            np.array(meta["sh0"]["codebook"])[pixels("sh0")[:, :3]], base, atol=0.02
+        )
         assert pixels("sh0")[:, 3].tolist() == [OPACITY_BYTES[row] for row in order]
 
 
 def test_a_compressed_ply_by_its_description(tmp_path: Path) -> None:
-    """By SuperSplat's description, in a reader of a few lines; values in the middle of a range are rounded."""
+    """By SuperSplat's description, in a reader of a few lines; values in the middle of a range are
+    rounded."""
     path = write_splats(tmp_path / "a.compressed.ply", SplatFile(three(), up="-y")).path
     header, _, data = path.read_bytes().partition(b"end_header\n")
     assert b"element chunk 1\n" in header

@@ -22,14 +22,17 @@ SPZ = f"{BASE}_compression_spz_2"
 
 
 def as_cesium_writes(path: Path, own: dict[str, Any], spz: bytes) -> None:
-    """Write a document as tiles of CesiumJS hold it: accessors without data, and a node that turns it."""
+    """Write a document as tiles of CesiumJS hold it: accessors without data, and a node that turns
+    it."""
     accessor = {"componentType": 5126, "count": 400, "type": "VEC3"}
     document = {
         "asset": {"version": "2.0"},
         "extensionsUsed": [BASE, SPZ],
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "translation": [1, 2, 3]}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 0, "extensions": {BASE: own}}]}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0}, "mode": 0, "extensions": {BASE: own}}]}
+        ],
         "accessors": [accessor],
         "bufferViews": [{"buffer": 0, "byteLength": len(spz)}],
         "buffers": [{"byteLength": len(spz)}],
@@ -38,7 +41,12 @@ def as_cesium_writes(path: Path, own: dict[str, Any], spz: bytes) -> None:
     text += b" " * (-len(text) % 4)
     binary = spz + bytes(-len(spz) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
+    )
     path.write_bytes(head + chunks)
 
 
@@ -60,12 +68,22 @@ def test_gaussians_compressed_by_another_program(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("own", "problem"),
     [
-        ({"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "extensions": {"EXT_other": {}}}, "'EXT_other'"),
+        (
+            {
+                "kernel": "ellipse",
+                "colorSpace": "srgb_rec709_display",
+                "extensions": {"EXT_other": {}},
+            },
+            "'EXT_other'",
+        ),
         ({"extensions": {SPZ: {"bufferView": 7}}}, "missing buffer view"),
         ({"extensions": {SPZ: {"bufferView": "0"}}}, "names no buffer view"),
         ({"extensions": {SPZ: 3}}, "names no buffer view"),
         ({"extensions": [SPZ]}, "are no object"),
-        ({"colorSpace": "lin_rec709_display", "extensions": {SPZ: {"bufferView": 0}}}, "lin_rec709_display"),
+        (
+            {"colorSpace": "lin_rec709_display", "extensions": {SPZ: {"bufferView": 0}}},
+            "lin_rec709_display",
+        ),
     ],
 )
 def test_compressions_that_are_not_read(own: dict[str, Any], problem: str, tmp_path: Path) -> None:
@@ -76,16 +94,23 @@ def test_compressions_that_are_not_read(own: dict[str, Any], problem: str, tmp_p
 
 def test_a_damaged_spz_within_is_refused(tmp_path: Path) -> None:
     as_cesium_writes(
-        tmp_path / "a.glb", {"extensions": {SPZ: {"bufferView": 0}}}, packed_spz(SplatFile(cloud(50)))[:-50]
+        tmp_path / "a.glb",
+        {"extensions": {SPZ: {"bufferView": 0}}},
+        packed_spz(SplatFile(cloud(50)))[:-50],
     )
     with pytest.raises(DyngsError, match=r"a\.glb.*truncated"):
         read_splats(tmp_path / "a.glb")
 
 
 def test_what_is_written_compressed_comes_back(tmp_path: Path) -> None:
-    scene, path = cloud(degree=2), tmp_path / "a.glb"
+    scene = cloud(degree=2)
+    path = tmp_path / "a.glb"
     whole = write_splats(tmp_path / "whole.glb", SplatFile(scene, up="y")).path
-    write_splats(path, SplatFile(scene, RasterizeMode.ANTIALIASED, up="y", world_offset=(1, 2, 3)), own=GLB_OF_SPZ)
+    write_splats(
+        path,
+        SplatFile(scene, RasterizeMode.ANTIALIASED, up="y", world_offset=(1, 2, 3)),
+        own=GLB_OF_SPZ,
+    )
     back = read_splats(path)
     assert (back.up, back.mode, back.world_offset) == ("y", RasterizeMode.ANTIALIASED, (1, 2, 3))
     assert psnr(seen(back.gaussians), seen(scene)) > 36
@@ -99,7 +124,10 @@ def test_what_is_written_compressed_comes_back(tmp_path: Path) -> None:
     assert counts == {len(scene)}
     assert f"{BASE}:SH_DEGREE_2_COEF_4" in primitive["attributes"]
     assert f"{BASE}:SH_DEGREE_3_COEF_0" not in primitive["attributes"]
-    assert document["accessors"][primitive["attributes"]["POSITION"]]["max"] == scene.means.amax(0).tolist()
+    assert (
+        document["accessors"][primitive["attributes"]["POSITION"]]["max"]
+        == scene.means.amax(0).tolist()
+    )
 
 
 def test_options_go_with_their_format() -> None:

@@ -29,7 +29,13 @@ def make_gaussians(count: int, degree: int, seed: int = 0) -> Gaussians:
         return torch.randn(*shape, generator=random)
 
     quats = torch.nn.functional.normalize(normal(count, 4), dim=1)
-    return Gaussians(normal(count, 3), quats, normal(count, 3), normal(count), normal(count, num_sh_terms(degree), 3))
+    return Gaussians(
+        normal(count, 3),
+        quats,
+        normal(count, 3),
+        normal(count),
+        normal(count, num_sh_terms(degree), 3),
+    )
 
 
 def written(path: Path, gaussians: Gaussians) -> Path:
@@ -41,7 +47,9 @@ def assert_same(a: Gaussians, b: Gaussians) -> None:
         torch.testing.assert_close(b.tensors()[name], x, rtol=0, atol=0)
 
 
-def write_vertices(path: Path, columns: dict[str, np.ndarray], fmt: str = "binary_little_endian") -> Path:
+def write_vertices(
+    path: Path, columns: dict[str, np.ndarray], fmt: str = "binary_little_endian"
+) -> Path:
     """A .ply written by hand from named columns, each of its own dtype."""
     kinds = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
     count = len(next(iter(columns.values())))
@@ -52,7 +60,9 @@ def write_vertices(path: Path, columns: dict[str, np.ndarray], fmt: str = "binar
     for name, x in columns.items():
         rows[name] = x
     text = "".join(" ".join(repr(v.item()) for v in row) + "\n" for row in rows).encode()
-    path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + (text if fmt == "ascii" else rows.tobytes()))
+    path.write_bytes(
+        "\n".join([*lines, "end_header\n"]).encode() + (text if fmt == "ascii" else rows.tobytes())
+    )
     return path
 
 
@@ -77,7 +87,9 @@ def plain_columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
     offset=st.tuples(*[st.floats(-1e7, 1e7)] * 3),
     eps2d=st.none() | st.floats(0, 1),
 )
-def test_round_trip_keeps_everything(tmp_path_factory, count, degree, mode, seed, offset, eps2d) -> None:
+def test_round_trip_keeps_everything(
+    tmp_path_factory, count, degree, mode, seed, offset, eps2d
+) -> None:
     gaussians = make_gaussians(count, degree, seed)
     path = tmp_path_factory.mktemp("ply") / "scene.ply"
     write_splats(path, SplatFile(gaussians, mode, eps2d, offset, ("made in a test",)))
@@ -136,10 +148,15 @@ def test_file_of_another_program() -> None:
 @given(data=st.data(), fmt=st.sampled_from(["binary_little_endian", "binary_big_endian", "ascii"]))
 def test_any_property_order_type_and_extras(tmp_path_factory, data, fmt) -> None:
     gaussians = make_gaussians(4, data.draw(st.integers(0, 4)))
-    columns = plain_columns(gaussians) | {"label": np.arange(4, dtype="u1"), "id": np.arange(4, dtype="i4")}
+    columns = plain_columns(gaussians) | {
+        "label": np.arange(4, dtype="u1"),
+        "id": np.arange(4, dtype="i4"),
+    }
     names = data.draw(st.permutations(sorted(columns)))
     doubles = data.draw(st.sets(st.sampled_from(names)))
-    mixed = {name: columns[name].astype("f8") if name in doubles else columns[name] for name in names}
+    mixed = {
+        name: columns[name].astype("f8") if name in doubles else columns[name] for name in names
+    }
     path = write_vertices(tmp_path_factory.mktemp("ply") / "a.ply", mixed, fmt)
     assert_same(gaussians, read_splats(path).gaussians)
 
@@ -147,7 +164,9 @@ def test_any_property_order_type_and_extras(tmp_path_factory, data, fmt) -> None
 def test_other_elements_are_skipped(tmp_path) -> None:
     gaussians = make_gaussians(3, 0)
     header, body = written(tmp_path / "a.ply", gaussians).read_bytes().split(b"end_header\n", 1)
-    header = header.replace(b"element vertex", b"element camera 2\nproperty double f\nproperty uchar g\nelement vertex")
+    header = header.replace(
+        b"element vertex", b"element camera 2\nproperty double f\nproperty uchar g\nelement vertex"
+    )
     faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "b.ply").write_bytes(header + faces + bytes(18) + body + bytes(13))
     assert_same(gaussians, read_splats(tmp_path / "b.ply").gaussians)
@@ -165,14 +184,20 @@ def test_other_elements_are_skipped(tmp_path) -> None:
 )
 def test_render_mode_comments(tmp_path, comment, mode) -> None:
     path = write_vertices(tmp_path / "a.ply", plain_columns(make_gaussians(1, 0)))
-    path.write_bytes(path.read_bytes().replace(b"element vertex", f"comment {comment}\r\nelement vertex".encode()))
+    path.write_bytes(
+        path.read_bytes().replace(
+            b"element vertex", f"comment {comment}\r\nelement vertex".encode()
+        )
+    )
     assert read_splats(path).mode is mode
 
 
 def test_quaternions_are_normalised(tmp_path) -> None:
     gaussians = make_gaussians(4, 0)
     scale = torch.tensor([1e-30, 1e30, 0.0, 7.0])[:, None]
-    path = write_vertices(tmp_path / "a.ply", plain_columns(gaussians.replace(quats=gaussians.quats * scale)))
+    path = write_vertices(
+        tmp_path / "a.ply", plain_columns(gaussians.replace(quats=gaussians.quats * scale))
+    )
     back = read_splats(path).gaussians
     wanted = gaussians.quats.clone()
     wanted[2] = torch.tensor([1.0, 0, 0, 0])
@@ -188,7 +213,9 @@ def test_non_finite_values_are_refused_or_skipped(tmp_path) -> None:
     path = write_vertices(tmp_path / "a.ply", columns)
     with pytest.raises(DyngsError, match=r"2 of 6 Gaussians have non-finite"):
         read_splats(path)
-    assert_same(gaussians.select(torch.tensor([0, 2, 3, 5])), read_splats(path, nonfinite="skip").gaussians)
+    assert_same(
+        gaussians.select(torch.tensor([0, 2, 3, 5])), read_splats(path, nonfinite="skip").gaussians
+    )
     means = gaussians.means.clone()
     means[3, 0] = torch.nan
     before = path.read_bytes()
@@ -204,11 +231,17 @@ def test_doubles_beyond_float32_are_non_finite(tmp_path) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(fraction=st.floats(0, 1, exclude_max=True), fmt=st.sampled_from(["binary_little_endian", "ascii"]))
+@given(
+    fraction=st.floats(0, 1, exclude_max=True),
+    fmt=st.sampled_from(["binary_little_endian", "ascii"]),
+)
 def test_every_truncation_is_an_error(tmp_path_factory, fraction, fmt) -> None:
-    path = write_vertices(tmp_path_factory.mktemp("ply") / "a.ply", plain_columns(make_gaussians(3, 1)), fmt)
+    path = write_vertices(
+        tmp_path_factory.mktemp("ply") / "a.ply", plain_columns(make_gaussians(3, 1)), fmt
+    )
     whole = path.read_bytes().rstrip(b"\n") if fmt == "ascii" else path.read_bytes()
-    last = whole.rfind(b" ") if fmt == "ascii" else len(whole)  # cutting digits off the last number cannot be noticed
+    # cutting digits off the last number cannot be noticed
+    last = whole.rfind(b" ") if fmt == "ascii" else len(whole)
     path.write_bytes(whole[: int(fraction * last)])
     with pytest.raises(DyngsError, match=r"a\.ply"):
         read_splats(path)
@@ -226,9 +259,15 @@ HOSTILE = {
         ["element vertex 1", *(f"property float {i:x}" for i in range(50_000))],
         "4,097 properties",
     ),
-    "lists": (["element vertex 1", *_NEEDED, *["property list int int a"] * 40_000], "list properties"),
+    "lists": (
+        ["element vertex 1", *_NEEDED, *["property list int int a"] * 40_000],
+        "list properties",
+    ),
     "elements": ([f"element {i:x} 0" for i in range(60_000)], "asks for 257 elements"),
-    "a comment": (["comment eps2d: " + "9 " * 400_000, "element vertex 1", *_NEEDED], "should hold 1 finite"),
+    "a comment": (
+        ["comment eps2d: " + "9 " * 400_000, "element vertex 1", *_NEEDED],
+        "should hold 1 finite",
+    ),
     "a name": (["element vertex 1", *["property float " + "a" * 400_000] * 2], "twice"),
 }
 
@@ -263,15 +302,27 @@ def test_headers_of_a_megabyte_cost_little(tmp_path, case) -> None:
         (header_of("element vertex " + "9" * 5000, *_NEEDED), "bad .ply header line"),
         (header_of("element vertex 0", *_NEEDED), "holds no Gaussians"),
         (header_of("element vertex 1", *_NEEDED, _NEEDED[0]), "property x twice"),
-        (header_of("element vertex 1", "property half x"), "bad .ply header line 'property half x'"),
+        (
+            header_of("element vertex 1", "property half x"),
+            "bad .ply header line 'property half x'",
+        ),
         (header_of("element vertex 1", *_NEEDED, "property list uchar int i"), "list properties"),
         (header_of("element vertex 1", *_NEEDED[:-2]), "have no rot_2 rot_3"),
         (header_of("element vertex 1", "property uint packed_position"), "compressed"),
         (header_of("element vertex 1", *_NEEDED, "property float f_rest_0"), "f_rest properties"),
-        (header_of("element vertex 3", *_NEEDED) + bytes(100), "need 168 bytes after the header, found 100"),
+        (
+            header_of("element vertex 3", *_NEEDED) + bytes(100),
+            "need 168 bytes after the header, found 100",
+        ),
         (header_of("element vertex 999999999999999999", *_NEEDED) + bytes(56), "is truncated"),
-        (header_of("comment SplatRenderMode: 2dgs", "element vertex 1", *_NEEDED) + bytes(56), "'2dgs' is not supp"),
-        (header_of("comment world_offset: 1 2 nan", "element vertex 1", *_NEEDED) + bytes(56), "3 finite number"),
+        (
+            header_of("comment SplatRenderMode: 2dgs", "element vertex 1", *_NEEDED) + bytes(56),
+            "'2dgs' is not supp",
+        ),
+        (
+            header_of("comment world_offset: 1 2 nan", "element vertex 1", *_NEEDED) + bytes(56),
+            "3 finite number",
+        ),
     ],
 )
 def test_bad_files_end_in_one_line(tmp_path, content, message) -> None:

@@ -1,4 +1,5 @@
-"""A scene moved as a whole, seen by cameras moved with it, is the scene, to the precision of the numbers."""
+"""A scene moved as a whole, seen by cameras moved with it, is the scene, to the precision of the
+numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.splats.similarity import Similarity, far_offset, fitted
 
 _LENGTH = (0.3**2 + 0.7**2 + 0.2**2 + 0.6**2) ** 0.5
-ODD = Similarity((0.3 / _LENGTH, -0.7 / _LENGTH, 0.2 / _LENGTH, 0.6 / _LENGTH), 2.5, (3.0, -1.0, 0.5))
+ODD = Similarity(
+    (0.3 / _LENGTH, -0.7 / _LENGTH, 0.2 / _LENGTH, 0.6 / _LENGTH), 2.5, (3.0, -1.0, 0.5)
+)
 CORNERS = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0.5, 0.5, 1]])
 
 
@@ -28,9 +31,12 @@ def exact(cameras: Cameras) -> Cameras:
     return replace(cameras, cam_from_world=poses, intrinsics=cameras.intrinsics.double())
 
 
-def drawn(moved: Similarity, dtype: torch.dtype, degree: int, mode: str) -> tuple[torch.Tensor, torch.Tensor]:
+def drawn(
+    moved: Similarity, dtype: torch.dtype, degree: int, mode: str
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Images (V, H, W, 3) of Gaussians with a 3D filter, and of both moved."""
-    gaussians, cameras = cloud(150, degree).to(dtype=dtype), exact(AROUND).to(dtype=dtype)
+    gaussians = cloud(150, degree).to(dtype=dtype)
+    cameras = exact(AROUND).to(dtype=dtype)
     gaussians = filtered(gaussians, torch.linspace(0.01, 0.1, 150, dtype=dtype))
 
     def seen(cameras: Cameras, scale: float, moved: bool) -> torch.Tensor:
@@ -47,12 +53,14 @@ def test_moved_scene_and_cameras_show_the_same(degree: int, mode: str) -> None:
     torch.testing.assert_close(after, before, rtol=0, atol=1e-9)
     before, after = drawn(ODD, torch.float32, degree, mode)
     torch.testing.assert_close(after, before, rtol=0, atol=2e-4)
-    assert float((drawn(Similarity(), torch.float32, degree, mode)[1] - before).abs().max()) > 0.1  # the move is seen
+    # the move is seen
+    assert float((drawn(Similarity(), torch.float32, degree, mode)[1] - before).abs().max()) > 0.1
 
 
 def test_filters_move_with_the_scene() -> None:
     """Fused before or after, with the filter's size scaled."""
-    scene, std = cloud(50, 2).to(dtype=torch.float64), torch.linspace(0.01, 0.1, 50, dtype=torch.float64)
+    scene = cloud(50, 2).to(dtype=torch.float64)
+    std = torch.linspace(0.01, 0.1, 50, dtype=torch.float64)
     fused = ODD.gaussians(filtered(scene, std))
     for name, x in filtered(ODD.gaussians(scene), ODD.scale * std).tensors().items():
         torch.testing.assert_close(x, getattr(fused, name), rtol=1e-9, atol=1e-9)
@@ -60,7 +68,9 @@ def test_filters_move_with_the_scene() -> None:
 
 def test_one_after_another_and_back() -> None:
     other = Similarity((0.0, 1.0, 0.0, 0.0), 0.1, (-2.0, 0.0, 7.0))
-    np.testing.assert_allclose(other.after(ODD).points(CORNERS), other.points(ODD.points(CORNERS)), atol=1e-12)
+    np.testing.assert_allclose(
+        other.after(ODD).points(CORNERS), other.points(ODD.points(CORNERS)), atol=1e-12
+    )
     np.testing.assert_allclose(ODD.inverse().points(ODD.points(CORNERS)), CORNERS, atol=1e-12)
     assert ODD.inverse().after(ODD).numbers == pytest.approx(Similarity().numbers, abs=1e-12)
 
@@ -70,14 +80,18 @@ def test_control_points_give_the_similarity() -> None:
         found = fitted(CORNERS[:count], ODD.points(CORNERS[:count]))
         np.testing.assert_allclose(found.points(CORNERS), ODD.points(CORNERS), atol=1e-12)
     far = Similarity(ODD.turn, 0.02, (691000.0, 5334000.0, 520.0))
-    np.testing.assert_allclose(fitted(CORNERS, far.points(CORNERS)).points(CORNERS), far.points(CORNERS), atol=1e-6)
+    np.testing.assert_allclose(
+        fitted(CORNERS, far.points(CORNERS)).points(CORNERS), far.points(CORNERS), atol=1e-6
+    )
 
 
 def test_least_squares_never_mirror() -> None:
     """Mirrored points are met by a rotation, with residuals."""
     found = fitted(CORNERS, CORNERS * [1, 1, -1])
     assert np.linalg.det(found.rotation) == pytest.approx(1)
-    errors = [np.square(s.points(CORNERS) - CORNERS * [1, 1, -1]).sum() for s in (found, Similarity())]
+    errors = [
+        np.square(s.points(CORNERS) - CORNERS * [1, 1, -1]).sum() for s in (found, Similarity())
+    ]
     assert 0 < errors[0] < errors[1]
 
 
@@ -99,7 +113,9 @@ def test_points_near_the_origin_keep_their_coordinates() -> None:
     points = np.random.default_rng(0).normal(size=(200, 3))
     for factor in (1e-4, 1.0, 1e3):
         assert not far_offset(factor * (points + np.array([5.0, 0, 0])), 1e-3 * factor).any()
-    assert not far_offset(points + np.array([5000.0, 3000.0, 0.0]), 0.02).any(), "float32 is fine enough"
+    assert not far_offset(points + np.array([5000.0, 3000.0, 0.0]), 0.02).any(), (
+        "float32 is fine enough"
+    )
     assert not far_offset(np.full((3, 3), np.nan), 1.0).any()
 
 
@@ -109,4 +125,6 @@ def test_points_far_from_the_origin_come_near_it_in_any_unit(factor: float) -> N
     far = factor * (points + np.array([5e5, -4.6e6, 100.0]))
     offset = far_offset(far, 0.02 * factor)
     assert np.abs(far - offset).max() < 10 * factor
-    np.testing.assert_array_equal((far.astype(np.float32) - offset).astype(np.float32) + offset, far.astype(np.float32))
+    np.testing.assert_array_equal(
+        (far.astype(np.float32) - offset).astype(np.float32) + offset, far.astype(np.float32)
+    )

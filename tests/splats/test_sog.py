@@ -35,7 +35,16 @@ def test_a_folder_and_its_meta_are_the_packed_file(tmp_path: Path) -> None:
             torch.testing.assert_close(back.gaussians.tensors()[name], tensor, rtol=0, atol=0)
         assert main(["convert", str(path), str(tmp_path / "out.ply")]) == 0
         assert len(read_splats(tmp_path / "out.ply").gaussians) == 60
-        command = ["render", str(path), "--out", str(tmp_path / "drawn"), "--path", "orbit", "--frames", "1"]
+        command = [
+            "render",
+            str(path),
+            "--out",
+            str(tmp_path / "drawn"),
+            "--path",
+            "orbit",
+            "--frames",
+            "1",
+        ]
         assert main([*command, "--size", "32x24"]) == 0
         (tmp_path / "drawn" / "frame_0000.png").unlink()
     assert open_source(scene, None, None).names == ("scene",)
@@ -64,6 +73,8 @@ def test_levels_are_named(tmp_path: Path) -> None:
     scene.rename(tmp_path / "0_0")
     (tmp_path / "lod-meta.json").write_text("{}")
     for path in (tmp_path, tmp_path / "lod-meta.json"):
-        with pytest.raises(DyngsError, match=r"levels of detail; give the meta\.json of one of its folders"):
+        with pytest.raises(
+            DyngsError, match=r"levels of detail; give the meta\.json of one of its folders"
+        ):
             read_splats(path)
     assert len(read_splats(tmp_path / "0_0").gaussians) == 60

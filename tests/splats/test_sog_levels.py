@@ -1,4 +1,5 @@
-"""A scene in levels of detail as PlayCanvas streams it, read again by the description of the format."""
+"""A scene in levels of detail as PlayCanvas streams it, read again by the description of the
+format."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ def scene() -> SplatFile:
     quats = torch.nn.functional.normalize(torch.randn(N, 4, generator=generator), dim=1)
     scales = torch.rand(N, 3, generator=generator) - 4
     sh = torch.rand(N, 4, 3, generator=generator) - 0.5
-    return SplatFile(Gaussians(means, quats, scales, torch.randn(N, generator=generator), sh), up="-y")
+    return SplatFile(
+        Gaussians(means, quats, scales, torch.randn(N, generator=generator), sh), up="-y"
+    )
 
 
 def leaves(node: dict[str, Any]) -> list[dict[str, Any]]:
@@ -40,7 +43,9 @@ def leaves(node: dict[str, Any]) -> list[dict[str, Any]]:
     return [leaf for child in node["children"] for leaf in leaves(child)]
 
 
-def test_leaves_are_alternatives_of_one_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leaves_are_alternatives_of_one_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sog_levels, "PER_LEAF", 4096)
     monkeypatch.setattr(sog_levels, "PER_FILE", 8192)
     splat = scene()
@@ -49,10 +54,13 @@ def test_leaves_are_alternatives_of_one_place(tmp_path: Path, monkeypatch: pytes
     assert counts == (20_000, 5_000, 1_250)
     assert (index["version"], index["lodLevels"], index["counts"]) == (1, 3, list(counts))
     assert index["count"] == sum(counts)
-    assert index["filenames"] == [f"{name}/meta.json" for name in ("0_0", "0_1", "0_2", "1_0", "2_0")]
+    assert index["filenames"] == [
+        f"{name}/meta.json" for name in ("0_0", "0_1", "0_2", "1_0", "2_0")
+    ]
     files = []
     for name in index["filenames"]:
-        folder, path = tmp_path / "town" / Path(name).parent, tmp_path / f"{Path(name).parent}.sog"
+        folder = tmp_path / "town" / Path(name).parent
+        path = tmp_path / f"{Path(name).parent}.sog"
         with zipfile.ZipFile(path, "w") as archive:
             for part in folder.iterdir():
                 archive.write(part, part.name)
@@ -60,12 +68,16 @@ def test_leaves_are_alternatives_of_one_place(tmp_path: Path, monkeypatch: pytes
     wanted = levels_of(splat.gaussians).levels
     shown = [0] * 3
     for leaf in leaves(index["tree"]):
-        low, high = torch.tensor(leaf["bound"]["min"]), torch.tensor(leaf["bound"]["max"])
+        low = torch.tensor(leaf["bound"]["min"])
+        high = torch.tensor(leaf["bound"]["max"])
         for level, where in enumerate(leaf["lods"][str(level)] for level in range(3)):
             rows = slice(where["offset"], where["offset"] + where["count"])
-            means, first = files[where["file"]].means[rows], shown[level]
+            means = files[where["file"]].means[rows]
+            first = shown[level]
             assert len(means) == where["count"]
-            torch.testing.assert_close(means, wanted[level].means[first : first + len(means)], atol=1e-3, rtol=0)
+            torch.testing.assert_close(
+                means, wanted[level].means[first : first + len(means)], atol=1e-3, rtol=0
+            )
             assert bool(((means >= low) & (means <= high)).all())
             shown[level] += len(means)
     assert tuple(shown) == counts
@@ -74,7 +86,9 @@ def test_leaves_are_alternatives_of_one_place(tmp_path: Path, monkeypatch: pytes
 def test_equal_scenes_give_equal_folders_and_nothing_is_replaced(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_sog_levels(tmp_path / name, scene())
-    parts = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
+    parts = sorted(
+        path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file()
+    )
     assert len(parts) == 1 + 3 * 8
     for part in parts:
         assert (tmp_path / "a" / part).read_bytes() == (tmp_path / "b" / part).read_bytes()

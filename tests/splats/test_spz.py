@@ -25,7 +25,14 @@ from dyngs.splats.spz import packed_spz
 SYSTEMS = ["LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"]
 SYSTEMS += ["LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
 """By their numbers, from 1, in Niantic's library."""
-LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
+LETTERS = {
+    "R": (1, 0, 0),
+    "L": (-1, 0, 0),
+    "U": (0, 1, 0),
+    "D": (0, -1, 0),
+    "B": (0, 0, 1),
+    "F": (0, 0, -1),
+}
 
 
 def record(kind: int, value: bytes) -> bytes:
@@ -57,7 +64,9 @@ def points(means: np.ndarray) -> Gaussians:
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_points_lie_where_the_coordinate_system_says(name: str, tmp_path: Path) -> None:
     stored = np.array([[1.0, 0, 0], [0, 2, 0], [0, 0, 4], [1, 2, 4]])
-    (tmp_path / "a.spz").write_bytes(version_3(SplatFile(points(stored)), stating(1 + SYSTEMS.index(name))))
+    (tmp_path / "a.spz").write_bytes(
+        version_3(SplatFile(points(stored)), stating(1 + SYSTEMS.index(name)))
+    )
     back = read_splats(tmp_path / "a.spz")
     world = stored @ np.array([LETTERS[letter] for letter in name])
     np.testing.assert_allclose(back.gaussians.means.numpy(), world, atol=1e-6)
@@ -67,17 +76,25 @@ def test_points_lie_where_the_coordinate_system_says(name: str, tmp_path: Path) 
 
 @pytest.mark.parametrize("up", ["y", "-y", "z", "-z"])
 def test_version_4_states_its_axes(up: str, tmp_path: Path) -> None:
-    """Whichever axis is up in the file, readers of the statement find the same scene, harmonics included."""
+    """Whichever axis is up in the file, readers of the statement find the same scene, harmonics
+    included."""
     pytest.importorskip("zstandard")
-    scene, path = cloud(degree=4), tmp_path / "a.spz"
-    written = write_splats(path, upright(SplatFile(scene, RasterizeMode.ANTIALIASED, up="y"), up, path), own=SPZ_4)
+    scene = cloud(degree=4)
+    path = tmp_path / "a.spz"
+    written = write_splats(
+        path, upright(SplatFile(scene, RasterizeMode.ANTIALIASED, up="y"), up, path), own=SPZ_4
+    )
     data = path.read_bytes()
     assert struct.unpack("<4sI", data[:8]) == (b"NGSP", 4)
-    assert data[32:44] == stating(1 + SYSTEMS.index({"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}[up]))
+    assert data[32:44] == stating(
+        1 + SYSTEMS.index({"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}[up])
+    )
     back = read_splats(path)
     assert (back.up, back.mode, written.splat.up) == ("y", RasterizeMode.ANTIALIASED, "y")
     assert psnr(seen(back.gaussians), seen(scene)) > 36
-    torch.testing.assert_close(back.gaussians.means, written.splat.gaussians.means, rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        back.gaussians.means, written.splat.gaussians.means, rtol=0, atol=1e-4
+    )
 
 
 def test_version_4_holds_what_version_3_holds(tmp_path: Path) -> None:
@@ -85,24 +102,33 @@ def test_version_4_holds_what_version_3_holds(tmp_path: Path) -> None:
     for degree in (0, 2):
         scene = SplatFile(cloud(50, degree), up="y")
         old = read_splats(write_splats(tmp_path / "old.spz", scene).path).gaussians.tensors()
-        new = read_splats(write_splats(tmp_path / "new.spz", scene, own=SPZ_4).path).gaussians.tensors()
+        new = read_splats(
+            write_splats(tmp_path / "new.spz", scene, own=SPZ_4).path
+        ).gaussians.tensors()
         for name, tensor in old.items():
             torch.testing.assert_close(new[name], tensor, rtol=0, atol=0)
         # Empty streams are not stored.
         assert (tmp_path / "new.spz").read_bytes()[15] == (6 if degree else 5)
-    nothing = write_splats(tmp_path / "new.spz", SplatFile(cloud(5), up="x"), own=SPZ_4).path.read_bytes()
+    nothing = write_splats(
+        tmp_path / "new.spz", SplatFile(cloud(5), up="x"), own=SPZ_4
+    ).path.read_bytes()
     assert nothing[14] & 2 == 0  # no coordinate system has x up
 
 
 def test_extensions_that_are_unknown_or_damaged(tmp_path: Path) -> None:
-    path, splat = tmp_path / "a.spz", SplatFile(points(np.array([[1.0, 2.0, 4.0]])))
+    path = tmp_path / "a.spz"
+    splat = SplatFile(points(np.array([[1.0, 2.0, 4.0]])))
     orbit = record(0xADBE0002, bytes(12))
     path.write_bytes(version_3(splat, orbit + stating(6)))
     assert read_splats(path).gaussians.means.tolist() == [[1.0, -2.0, -4.0]]
     for kept in (orbit, stating(0), orbit + stating(4)):
         path.write_bytes(version_3(splat, kept))
         assert read_splats(path).gaussians.means.tolist() == [[1.0, 2.0, 4.0]]
-    for broken, problem in ((stating(17), "coordinate system 17"), (orbit[:-1], "damaged"), (orbit + b"x", "damaged")):
+    for broken, problem in (
+        (stating(17), "coordinate system 17"),
+        (orbit[:-1], "damaged"),
+        (orbit + b"x", "damaged"),
+    ):
         path.write_bytes(version_3(splat, broken))
         with pytest.raises(DyngsError, match=problem):
             read_splats(path)
@@ -130,7 +156,8 @@ console.log(JSON.stringify(Array.from(found.attributes.position.array)));
 def test_other_programs_read_both_versions(tmp_path: Path) -> None:
     """Spark 2.2.0 does not read version 4, and the reader of PlayCanvas 2.23.3 nothing else."""
     pytest.importorskip("zstandard")
-    scene, script = cloud(40, 1), tmp_path / "read.mjs"
+    scene = cloud(40, 1)
+    script = tmp_path / "read.mjs"
     script.write_text(READ, encoding="utf-8")
     for name, own in (("a3.spz", None), ("a4.spz", SPZ_4)):
         path = write_splats(tmp_path / name, SplatFile(scene, up="y"), own=own).path
@@ -140,6 +167,8 @@ def test_other_programs_read_both_versions(tmp_path: Path) -> None:
         torch.testing.assert_close(found.means, scene.means, rtol=0, atol=1e-4)
         assert psnr(seen(found), seen(scene)) > 36
         command = ["node", script, THREE.resolve(), path]
-        shown = subprocess.run(command, check=True, timeout=60, capture_output=True, text=True).stdout
+        shown = subprocess.run(
+            command, check=True, timeout=60, capture_output=True, text=True
+        ).stdout
         means = np.array(json.loads(shown.splitlines()[-1])).reshape(-1, 3)
         np.testing.assert_allclose(means, scene.means.numpy(), atol=1e-4)

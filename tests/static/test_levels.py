@@ -1,4 +1,5 @@
-"""A still scene in levels of detail is drawn as the scene is, by every camera in the detail that it needs."""
+"""A still scene in levels of detail is drawn as the scene is, by every camera in the detail that it
+needs."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ from dyngs.triangles.scene import TriangleOptions, TriangleScene
 
 def test_near_it_is_the_scene_itself() -> None:
     still = StaticScene(
-        gaussians=cloud(), filter_std=torch.full((400,), 0.02), background=torch.tensor([0.2, 0.5, 0.9])
+        gaussians=cloud(),
+        filter_std=torch.full((400,), 0.02),
+        background=torch.tensor([0.2, 0.5, 0.9]),
     )
     options = RenderOptions(depth="expected", mode="antialiased")  # type: ignore[arg-type]
     one, other = (x.render(AROUND, options=options) for x in (still, LevelScene.of(still)))
@@ -40,7 +43,8 @@ def test_few_are_drawn_where_few_may_be(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(levels, "BLOCK", 16)
     still = StaticScene(gaussians=cloud(2000))
     coarse = LevelScene.of(still, most=300).on_background(torch.ones(3))
-    image, truth = coarse.render(AROUND).rgb, still.on_background(torch.ones(3)).render(AROUND).rgb
+    image = coarse.render(AROUND).rgb
+    truth = still.on_background(torch.ones(3)).render(AROUND).rgb
     assert not torch.equal(image, truth)
     assert float((image - truth).abs().mean()) < 0.08
 

@@ -1,4 +1,5 @@
-"""Of Gaussians that were found from several sides a camera sees those of the side that it stands nearest to."""
+"""Of Gaussians that were found from several sides a camera sees those of the side that it stands
+nearest to."""
 
 from __future__ import annotations
 
@@ -36,11 +37,14 @@ def test_a_camera_sees_the_nearest_side_alone(camera: int, side: int) -> None:
     assert alone.depth is not None
     torch.testing.assert_close(both.depth[camera], alone.depth[0])
     assert float(alone.alpha.mean()) > 0.01
-    assert both.radii.shape == (4, 100, 2), "one row for every Gaussian: training counts in which images it is seen"
+    assert both.radii.shape == (4, 100, 2), (
+        "one row for every Gaussian: training counts in which images it is seen"
+    )
 
 
 def test_images_teach_their_own_side_alone() -> None:
-    scene, probe = two_sides(), torch.zeros(1, 100, 4, requires_grad=True)
+    scene = two_sides()
+    probe = torch.zeros(1, 100, 4, requires_grad=True)
     colours = scene.gaussians.sh.clone().requires_grad_()
     scene = scene.with_gaussians(scene.gaussians.replace(sh=colours))
     scene.render(RING.select(2), probe=probe).rgb.sum().backward()
@@ -74,6 +78,8 @@ def test_sides_follow_their_gaussians_and_are_stored() -> None:
     ],
 )
 def test_sides_that_do_not_fit_are_refused(name: str, value: torch.Tensor) -> None:
-    tensors = {name.removeprefix("model."): x for name, x in tensors_of(two_sides().state()).items()}
+    tensors = {
+        name.removeprefix("model."): x for name, x in tensors_of(two_sides().state()).items()
+    }
     with pytest.raises(ValueError, match=name):
         Sides.stored(tensors | {f"sides.{name}": value}, 100)

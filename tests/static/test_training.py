@@ -1,4 +1,5 @@
-"""How a static scene is trained: on every image, with its 3D filter kept until it is due, and rid of what is small."""
+"""How a static scene is trained: on every image, with its 3D filter kept until it is due, and rid
+of what is small."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.
 def _gaussians(z: float, n: int = 3) -> Gaussians:
     means = torch.zeros(n, 3)
     means[:, 2] = z
-    return Gaussians(means, torch.ones(n, 4), torch.full((n, 3), -3.0), torch.zeros(n), torch.zeros(n, 1, 3))
+    return Gaussians(
+        means, torch.ones(n, 4), torch.full((n, 3), -3.0), torch.zeros(n), torch.zeros(n, 1, 3)
+    )
 
 
 def _camera() -> Cameras:
@@ -32,7 +35,8 @@ def _image(time: float | None = None) -> Image:
 
 
 def test_without_filter_parameters_pass_through() -> None:
-    training, gaussians = StaticTraining(FilterUpdate()), _gaussians(2.0)
+    training = StaticTraining(FilterUpdate())
+    gaussians = _gaussians(2.0)
     scene = training.first_scene(gaussians)
     moment = training.time_step(scene, _image(), 1)
     assert moment.gaussians is gaussians
@@ -56,20 +60,29 @@ def test_nothing_depends_on_time() -> None:
 
 def test_the_set_is_left_to_the_strategy() -> None:
     training = StaticTraining(FilterUpdate())
-    assert all(training.revised(training.first_scene(_gaussians(2.0)), step) is None for step in (1, 2, 100))
+    assert all(
+        training.revised(training.first_scene(_gaussians(2.0)), step) is None
+        for step in (1, 2, 100)
+    )
 
 
 def _sized(pixels: list[float]) -> Gaussians:
-    """Faint Gaussians side by side at depth 2 that make up so many pixels, 2 pi o s^2 (50 px are a unit there)."""
-    n, std = len(pixels), 3.0
+    """Faint Gaussians side by side at depth 2 that make up so many pixels, 2 pi o s^2 (50 px are a
+    unit there)."""
+    n = len(pixels)
+    std = 3.0
     means = torch.stack([torch.linspace(-0.6, 0.6, n), torch.zeros(n), torch.full((n,), 2.0)], 1)
     opacities = torch.tensor(pixels) / (2 * torch.pi * std**2)
     scales = torch.full((n, 3), ((std**2 - 0.3) ** 0.5 / 50))
-    return Gaussians(means, torch.ones(n, 4), scales.log(), torch.logit(opacities), torch.zeros(n, 1, 3))
+    return Gaussians(
+        means, torch.ones(n, 4), scales.log(), torch.logit(opacities), torch.zeros(n, 1, 3)
+    )
 
 
 def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
-    elsewhere = replace(_camera(), cam_from_world=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None])
+    elsewhere = replace(
+        _camera(), cam_from_world=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None]
+    )
     training = StaticTraining(FilterUpdate(), SmallRemoval(7, 2.0, [elsewhere, _camera()]))
     scene = training.first_scene(_sized([1.5, 4.0, 1.0, 3.0]))
     assert training.revised(scene, 6) is None
@@ -81,14 +94,19 @@ def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
     assert result.edit is not None
     assert torch.equal(result.edit.apply(scene.gaussians.means), edited.gaussians.means)
     assert result.finding is not None
-    assert result.finding.startswith("2 of 4 Gaussians are removed: each makes up less than 2 px of every")
+    assert result.finding.startswith(
+        "2 of 4 Gaussians are removed: each makes up less than 2 px of every"
+    )
     assert training.revised(edited, 7) is None, "all that is left is large enough"
-    assert training.revised(training.first_scene(_sized([1.0, 1.5])), 7) is None, "something is left of every scene"
+    assert training.revised(training.first_scene(_sized([1.0, 1.5])), 7) is None, (
+        "something is left of every scene"
+    )
 
 
 def test_the_filter_is_kept_until_it_is_due() -> None:
     training = StaticTraining(FilterUpdate([_camera()], range(100, 200, 100)))
-    near, far = _gaussians(2.0), _gaussians(4.0)
+    near = _gaussians(2.0)
+    far = _gaussians(4.0)
     with_near, with_far = (fuse_filter(far, filter_std(x.means, [_camera()])) for x in (near, far))
 
     def drawn(scene: StaticScene) -> Gaussians:
@@ -102,7 +120,9 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
     scene = training.after_step(edited, 101, True)
     assert torch.equal(drawn(scene).log_scales, with_near.log_scales)
     scene = training.after_step(scene.with_gaussians(far), 102, True)
-    assert torch.equal(drawn(scene).log_scales, with_far.log_scales), "where cameras look may have changed"
+    assert torch.equal(drawn(scene).log_scales, with_far.log_scales), (
+        "where cameras look may have changed"
+    )
 
 
 def test_state_goes_round() -> None:
@@ -110,5 +130,7 @@ def test_state_goes_round() -> None:
     first = training.first_scene(_gaussians(2.0))
     stored = part_of(tensors_of(first.state()), "model")
     second = training.restored(_gaussians(4.0), stored)
-    drawn = (training.time_step(scene, _image(), 1).gaussians.log_scales for scene in (first, second))
+    drawn = (
+        training.time_step(scene, _image(), 1).gaussians.log_scales for scene in (first, second)
+    )
     assert torch.equal(*drawn)

@@ -34,7 +34,14 @@ from dyngs.storage.file import (
 from dyngs.storage.tensors import COARSENESS
 
 INFO = CheckpointInfo(7, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic")
-STEPS = {"means": 0.01, "quats": 0.01, "log_scales": 0.02, "logit_opacities": 0.004, "sh_base": 0.02, "sh_rest": 0.05}
+STEPS = {
+    "means": 0.01,
+    "quats": 0.01,
+    "log_scales": 0.02,
+    "logit_opacities": 0.004,
+    "sh_base": 0.02,
+    "sh_rest": 0.05,
+}
 STEPS = {f"gaussians.{name}": step for name, step in STEPS.items()}
 EXTREMES = st.sampled_from((0.0, 1.0, -1e4, 1e30, -1e30, 88.0)) | st.floats(-3, 3, width=32)
 
@@ -42,7 +49,8 @@ EXTREMES = st.sampled_from((0.0, 1.0, -1e4, 1e30, -1e30, 88.0)) | st.floats(-3, 
 @st.composite
 def scenes(draw: st.DrawFn) -> dict[str, torch.Tensor]:
     """Tensors of 0 to 5 Gaussians of any degree, some values extreme."""
-    n, degree = draw(st.integers(0, 5)), draw(st.integers(0, 4))
+    n = draw(st.integers(0, 5))
+    degree = draw(st.integers(0, 4))
     shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
     shapes["sh"] = (n, (degree + 1) ** 2, 3)
     tensors = {}
@@ -58,7 +66,10 @@ def scenes(draw: st.DrawFn) -> dict[str, torch.Tensor]:
 def small_scene(count: int = 3) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (4, 3)}
-    return {f"gaussians.{name}": torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
+    return {
+        f"gaussians.{name}": torch.randn(count, *shape, generator=generator)
+        for name, shape in shapes.items()
+    }
 
 
 def stored(tensors: dict[str, torch.Tensor], steps: Mapping[str, float] = STEPS) -> bytes:
@@ -95,9 +106,13 @@ def test_stored_again_it_is_the_same_file(tensors: dict[str, torch.Tensor]) -> N
 def test_values_come_back_within_their_steps() -> None:
     tensors = small_scene(200)
     found = decoded(stored(tensors)).tensors
-    order = [int((tensors["gaussians.means"] - mean).abs().sum(1).argmin()) for mean in found["gaussians.means"]]
+    order = [
+        int((tensors["gaussians.means"] - mean).abs().sum(1).argmin())
+        for mean in found["gaussians.means"]
+    ]
     assert sorted(order) == list(range(200))
-    for name, tolerance in (("means", 0.005), ("sh", 0.033)):  # half a step; 0.65 of one where zero is preferred
+    for name, tolerance in (("means", 0.005), ("sh", 0.033)):
+        # half a step; 0.65 of one where zero is preferred
         error = (found[f"gaussians.{name}"] - tensors[f"gaussians.{name}"][order]).abs().max()
         assert error <= tolerance + 1e-6
 
@@ -132,7 +147,9 @@ def test_a_forged_file_is_an_error_or_a_scene(source: st.DataObject) -> None:
     """Flips with a checksum that fits: whatever the reader finds, it says it in one line."""
     data = bytearray(stored(small_scene())[:-32])
     for _ in range(source.draw(st.integers(1, 4))):
-        data[source.draw(st.integers(len(MAGIC), len(data) - 1))] ^= source.draw(st.integers(1, 255))
+        data[source.draw(st.integers(len(MAGIC), len(data) - 1))] ^= source.draw(
+            st.integers(1, 255)
+        )
     told = None
     try:
         found = decoded(bytes(data) + hashlib.sha256(data).digest())

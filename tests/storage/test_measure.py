@@ -28,7 +28,8 @@ def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:
 @pytest.mark.parametrize("moves", [True, False])
 def test_what_is_stored_changes_images_by_what_is_allowed(tmp_path: Path, moves: bool) -> None:
     run_dir = write_moving_run(tmp_path, moves=moves)
-    fine, coarse = plan_of(run_dir, 0.1), plan_of(run_dir, 3.0)
+    fine = plan_of(run_dir, 0.1)
+    coarse = plan_of(run_dir, 3.0)
     for plan, most in ((fine, 0.1), (coarse, 3.0)):
         assert plan.precision.allowed == pytest.approx(most)
         assert plan.precision.change is not None
@@ -43,7 +44,8 @@ def test_what_is_stored_changes_images_by_what_is_allowed(tmp_path: Path, moves:
 
 def test_the_images_that_are_compared_are_those_of_the_run(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
-    scene, plan = load_run(run_dir).scene, plan_of(run_dir, 0.5)
+    scene = load_run(run_dir).scene
+    plan = plan_of(run_dir, 0.5)
     assert plan.images is not None
     drawn = plan.images(scene)
     assert len(drawn) == min(COMPARED, 5)
@@ -71,11 +73,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path)
-    config, checkpoint = load_resolved(run), latest_checkpoint(run)
+    config = load_resolved(run)
+    checkpoint = latest_checkpoint(run)
     exact = restored_scene(checkpoint, config.model).at(0.5).means
 
     def quality(scene: GaussianScene) -> float:
-        """Minus the sum of squares of how far the Gaussians are from where they were: their order does not matter."""
+        """Minus the sum of squares of how far the Gaussians are from where they were: their order
+        does not matter."""
         return -float((scene.at(0.5).means.sum(0) - exact.sum(0)).square().sum())
 
     every = coarsest_file(config, checkpoint, lambda scene: 1.0, 0.0)
@@ -84,7 +88,9 @@ def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
     some = coarsest_file(config, checkpoint, quality, -1e-3)
     assert some is not None
     assert some.quality >= -1e-3
-    stored = restored_scene(type(checkpoint)(checkpoint.info, decoded(some.data).tensors), config.model)
+    stored = restored_scene(
+        type(checkpoint)(checkpoint.info, decoded(some.data).tensors), config.model
+    )
     assert quality(stored) == some.quality
     assert len(every.data) <= len(some.data)
     assert coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None

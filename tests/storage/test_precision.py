@@ -14,8 +14,21 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.state import part_of
 from dyngs.static.scene import StaticScene
-from dyngs.storage.precision import Draw, Precision, assumed_precision, coarseness_of, measured_precision
-from dyngs.storage.tensors import MAX_COARSENESS, TensorKind, coding_of, completed, drawable, restored
+from dyngs.storage.precision import (
+    Draw,
+    Precision,
+    assumed_precision,
+    coarseness_of,
+    measured_precision,
+)
+from dyngs.storage.tensors import (
+    MAX_COARSENESS,
+    TensorKind,
+    coding_of,
+    completed,
+    drawable,
+    restored,
+)
 
 
 def tensors() -> dict[str, Tensor]:
@@ -37,7 +50,9 @@ def measured(stored: Mapping[str, Tensor], draw: Draw, max_change: float) -> Pre
 def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
     """One image."""
     fields = ("means", "quats", "log_scales", "logit_opacities", "sh")
-    return [render(Gaussians(**{name: state[f"gaussians.{name}"] for name in fields}), camera()).rgb[0]]
+    return [
+        render(Gaussians(**{name: state[f"gaussians.{name}"] for name in fields}), camera()).rgb[0]
+    ]
 
 
 @pytest.mark.parametrize("max_change", [0.1, 2.0])
@@ -45,7 +60,8 @@ def test_the_change_is_what_is_allowed_or_less(max_change: float) -> None:
     precision = measured(tensors(), draw, max_change)
     exact = drawable(scene_of(tensors()))
     rounded = {name: restored(x, coding_of(name, x, precision.steps)) for name, x in exact.items()}
-    before, after = draw(tensors())[0].clamp(0, 1), draw(completed(rounded))[0].clamp(0, 1)
+    before = draw(tensors())[0].clamp(0, 1)
+    after = draw(completed(rounded))[0].clamp(0, 1)
     change = 255 * float((before - after).double().square().mean().sqrt())
     assert precision.change == pytest.approx(change)
     assert max_change / 4 < change <= max_change
@@ -70,7 +86,10 @@ def test_without_images_steps_follow_the_size_of_gaussians() -> None:
     small = assumed_precision(scene_of(tensors()).gaussians).steps
     larger = tensors()
     larger["gaussians.log_scales"] = larger["gaussians.log_scales"] + 3
-    assert assumed_precision(scene_of(larger).gaussians).steps["gaussians.means"] > 10 * small["gaussians.means"]
+    assert (
+        assumed_precision(scene_of(larger).gaussians).steps["gaussians.means"]
+        > 10 * small["gaussians.means"]
+    )
 
 
 def test_coarseness_is_half_an_octave_per_octave() -> None:
@@ -80,17 +99,21 @@ def test_coarseness_is_half_an_octave_per_octave() -> None:
     assert coarseness_of(torch.zeros(3)).tolist() == [MAX_COARSENESS] * 3
 
 
-def change_after(stored: dict[str, Tensor], exact: dict[str, Tensor], steps: Mapping[str, float]) -> float:
+def change_after(
+    stored: dict[str, Tensor], exact: dict[str, Tensor], steps: Mapping[str, float]
+) -> float:
     """Grey levels by which rounding with ``steps`` changes the image."""
     rounded = {name: restored(x, coding_of(name, x, steps)) for name, x in exact.items()}
-    before, after = draw(stored)[0].clamp(0, 1), draw(completed(rounded))[0].clamp(0, 1)
+    before = draw(stored)[0].clamp(0, 1)
+    after = draw(completed(rounded))[0].clamp(0, 1)
     return 255 * float((before - after).double().square().mean().sqrt())
 
 
 @pytest.mark.parametrize("name", ["means", "sh", "log_scales"])
 def test_an_outlier_does_not_decide_the_steps_of_the_others(name: str) -> None:
     """A Gaussian far behind the camera, or of absurd colour or size there."""
-    usual, with_outlier = tensors(), tensors()
+    usual = tensors()
+    with_outlier = tensors()
     with_outlier["gaussians.means"][5] = torch.tensor([0.0, 0.0, -1e8])
     usual["gaussians.means"][5] = torch.tensor([0.0, 0.0, -50.0])
     if name != "means":
@@ -98,18 +121,21 @@ def test_an_outlier_does_not_decide_the_steps_of_the_others(name: str) -> None:
     precision = measured(with_outlier, draw, 0.5)
     assert precision.change is not None
     assert precision.change <= 0.5
-    assert change_after(with_outlier, drawable(scene_of(with_outlier)), precision.steps) == pytest.approx(
-        precision.change
-    )
+    assert change_after(
+        with_outlier, drawable(scene_of(with_outlier)), precision.steps
+    ) == pytest.approx(precision.change)
     stored = "sh_base" if name == "sh" else name
     steps = measured(usual, draw, 0.5).steps
     assert (
-        steps[f"gaussians.{stored}"] / 4 <= precision.steps[f"gaussians.{stored}"] <= 4 * steps[f"gaussians.{stored}"]
+        steps[f"gaussians.{stored}"] / 4
+        <= precision.steps[f"gaussians.{stored}"]
+        <= 4 * steps[f"gaussians.{stored}"]
     )
 
 
 def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
-    """Half of the Gaussians are 1e9 times as far away as the others, beyond what one step can serve."""
+    """Half of the Gaussians are 1e9 times as far away as the others, beyond what one step can
+    serve."""
     far = tensors()
     far["gaussians.means"][::2] *= 1e9
     precision = measured(far, draw, 0.01)

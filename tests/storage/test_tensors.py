@@ -71,12 +71,17 @@ def test_names_decide() -> None:
     assert coding_of("model.field.learned.weight12", x, steps).kind is TensorKind.GRID
     assert coding_of("model.field.learned.space0", x, steps).kind is TensorKind.HALF
     assert coding_of("model.field.learned.space0", 1e6 * x, steps).kind is TensorKind.EXACT
-    assert coding_of("model.field.box", torch.ones(2, 3), {"model.field.box": 1.0}).kind is TensorKind.EXACT
+    assert (
+        coding_of("model.field.box", torch.ones(2, 3), {"model.field.box": 1.0}).kind
+        is TensorKind.EXACT
+    )
     assert coding_of("model.rows", torch.arange(100), {}).kind is TensorKind.EXACT
     assert group_of("model.times", torch.ones(100, dtype=torch.float64)) is None
 
 
-@pytest.mark.parametrize("dtype", [torch.int64, torch.int32, torch.uint8, torch.bool, torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "dtype", [torch.int64, torch.int32, torch.uint8, torch.bool, torch.float32, torch.float64]
+)
 def test_exact_is_exact(dtype: torch.dtype) -> None:
     x = (torch.randn(5, 4, generator=torch.Generator().manual_seed(0)) * 3).abs().to(dtype)
     back = restored(x, Coding(TensorKind.EXACT))
@@ -93,7 +98,10 @@ def test_far_values_are_exact() -> None:
     x = torch.tensor([0.3, 1e30, -3e8, 5.0])
     whole = to_whole(x, Coding(TensorKind.GRID, 0.5))
     assert whole.far[:, 0].tolist() == [1, 2]
-    assert from_whole(whole, Coding(TensorKind.GRID, 0.5), torch.float32).tolist() == [0.5, *x[1:].tolist()]
+    assert from_whole(whole, Coding(TensorKind.GRID, 0.5), torch.float32).tolist() == [
+        0.5,
+        *x[1:].tolist(),
+    ]
 
 
 def test_what_hardly_shows_is_stored_more_coarsely() -> None:
@@ -111,7 +119,9 @@ def test_coarseness_is_checked(values: torch.Tensor) -> None:
 
 
 @given(
-    st.sampled_from(list(TensorKind)), st.floats(allow_nan=True, allow_infinity=True) | st.just(0.03125), st.booleans()
+    st.sampled_from(list(TensorKind)),
+    st.floats(allow_nan=True, allow_infinity=True) | st.just(0.03125),
+    st.booleans(),
 )
 @settings(deadline=None, max_examples=40)
 def test_a_coding_is_sound_or_refused(kind: TensorKind, step: float, by_coarseness: bool) -> None:
@@ -128,7 +138,9 @@ def test_coarseness_is_no_group() -> None:
     assert group_of(COARSENESS, torch.zeros(100, dtype=torch.uint8)) is None
 
 
-def read_again(x: torch.Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> torch.Tensor:
+def read_again(
+    x: torch.Tensor, coding: Coding, coarseness: np.ndarray | None = None
+) -> torch.Tensor:
     """``x`` as a file gives it back: through bytes, laid out as ``packed`` chose."""
     whole = to_whole(x, coding, coarseness)
     packing, data = packed(whole.numbers)
@@ -139,16 +151,21 @@ def read_again(x: torch.Tensor, coding: Coding, coarseness: np.ndarray | None = 
 def test_far_values_are_exact_in_columns_too() -> None:
     """Columns that repeat make ``packed`` lay the numbers out by columns."""
     x = torch.arange(3.0).repeat(400, 1) * 100
-    x[7, 1], x[399, 2] = 3e9, -4e20
+    x[7, 1] = 3e9
+    x[399, 2] = -4e20
     whole = to_whole(x, Coding(TensorKind.GRID, 0.5))
     packing, data = packed(whole.numbers)
     assert not packing.by_rows
     numbers = unpacked(packing, data, (400, 3))
-    assert torch.equal(from_whole(Whole(numbers, whole.far), Coding(TensorKind.GRID, 0.5), torch.float32), x)
+    assert torch.equal(
+        from_whole(Whole(numbers, whole.far), Coding(TensorKind.GRID, 0.5), torch.float32), x
+    )
 
 
 NUMBERS = st.floats(-3, 3, width=32) | st.floats(width=32, allow_nan=False, allow_infinity=False)
-SHAPES = st.lists(st.integers(0, 40), min_size=1, max_size=4).filter(lambda shape: np.prod(shape) <= 20_000)
+SHAPES = st.lists(st.integers(0, 40), min_size=1, max_size=4).filter(
+    lambda shape: np.prod(shape) <= 20_000
+)
 NAMES = st.sampled_from(
     [f"gaussians.{name}" for name in ("means", "log_scales", "sh_base", "sh_rest")]
     + ["model.field.learned.space0", "model.filter_std", "model.masks.times", *FIXED_STEPS]
@@ -158,7 +175,8 @@ NAMES = st.sampled_from(
 @st.composite
 def tensors_of_some_kind(draw: st.DrawFn) -> torch.Tensor:
     """Of any shape: columns or rows that repeat, values of any size among ordinary ones."""
-    shape, pool = draw(SHAPES), np.array(draw(st.lists(NUMBERS, min_size=1, max_size=8)), dtype=np.float32)
+    shape = draw(SHAPES)
+    pool = np.array(draw(st.lists(NUMBERS, min_size=1, max_size=8)), dtype=np.float32)
     generator = np.random.default_rng(draw(st.integers(0, 9)))
     x = (
         generator.choice(pool, shape)
@@ -170,8 +188,11 @@ def tensors_of_some_kind(draw: st.DrawFn) -> torch.Tensor:
 
 @given(tensors_of_some_kind(), NAMES, st.floats(1e-9, 1e9), st.booleans())
 @settings(deadline=None, max_examples=150)
-def test_any_tensor_comes_back_within_its_bound(x: torch.Tensor, name: str, step: float, by_coarseness: bool) -> None:
-    """Half a step (0.65 of one where zero is preferred), 11 bits where there is no step; exact where out of reach."""
+def test_any_tensor_comes_back_within_its_bound(
+    x: torch.Tensor, name: str, step: float, by_coarseness: bool
+) -> None:
+    """Half a step (0.65 of one where zero is preferred), 11 bits where there is no step; exact
+    where out of reach."""
     group = group_of(name, x)
     coding = coding_of(name, x, {} if group is None else {group: step}, by_coarseness=by_coarseness)
     rows = np.arange(len(x)) % (MAX_COARSENESS + 1) if coding.by_coarseness else None
@@ -189,11 +210,18 @@ def test_any_tensor_comes_back_within_its_bound(x: torch.Tensor, name: str, step
         assert bool((error[(x.double().abs() >= LIMIT * steps)] == 0).all())
 
 
-@given(st.sampled_from([torch.int64, torch.int32, torch.uint8, torch.bool, torch.float64, torch.float16]), st.data())
+@given(
+    st.sampled_from(
+        [torch.int64, torch.int32, torch.uint8, torch.bool, torch.float64, torch.float16]
+    ),
+    st.data(),
+)
 @settings(deadline=None, max_examples=60)
 def test_any_other_tensor_comes_back_as_it_was(dtype: torch.dtype, source: st.DataObject) -> None:
     shape = source.draw(SHAPES)
-    bits = np.random.default_rng(source.draw(st.integers(0, 9))).integers(-(2**63), 2**63, shape, dtype=np.int64)
+    bits = np.random.default_rng(source.draw(st.integers(0, 9))).integers(
+        -(2**63), 2**63, shape, dtype=np.int64
+    )
     bits = bits if source.draw(st.booleans()) else np.broadcast_to(bits[:1], shape).copy()
     x = torch.from_numpy(bits)
     x = (x.view(dtype) if dtype.itemsize == 8 else x.to(dtype)).nan_to_num()
@@ -218,7 +246,8 @@ def test_any_rotation_and_any_opacity_comes_back(x: torch.Tensor, step: float) -
 
 
 def _axes(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 3, 3) projectors onto the axes of unit quaternions wxyz: the same for all signs of the axes."""
+    """(N, 3, 3) projectors onto the axes of unit quaternions wxyz: the same for all signs of the
+    axes."""
     w, x, y, z = quats.unbind(1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
@@ -242,7 +271,9 @@ ROWS = (0, 2, 3, 6)
 def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
     """A scene of which some Gaussians move, and its model."""
     field = stirred_field(kind, len(ROWS))
-    scene = DynamicScene(gaussians=cloud(9), seen_at=(0.0, 1.0), field=field, moving=torch.tensor(ROWS))
+    scene = DynamicScene(
+        gaussians=cloud(9), seen_at=(0.0, 1.0), field=field, moving=torch.tensor(ROWS)
+    )
     return scene, DynamicModel(deform=tiny_options(kind))
 
 
@@ -254,7 +285,9 @@ def stored(scene: GaussianScene) -> dict[str, torch.Tensor]:
 def read(tensors: dict[str, torch.Tensor], model: DynamicModel) -> DynamicScene:
     """The scene of what a file holds."""
     full = completed(tensors)
-    return DynamicScene.restored(model, Gaussians(**part_of(full, "gaussians")), part_of(full, "model"))
+    return DynamicScene.restored(
+        model, Gaussians(**part_of(full, "gaussians")), part_of(full, "model")
+    )
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
@@ -275,7 +308,9 @@ def test_what_moves_is_in_front_and_followed() -> None:
     kept = stored(scene)
     assert kept["model.rows"].tolist() == list(range(len(ROWS)))
     place = {tuple(mean): i for i, mean in enumerate(scene.gaussians.means.tolist())}
-    came_from = [ROWS.index(place[tuple(mean)]) for mean in kept["gaussians.means"][: len(ROWS)].tolist()]
+    came_from = [
+        ROWS.index(place[tuple(mean)]) for mean in kept["gaussians.means"][: len(ROWS)].tolist()
+    ]
     name = "model.field.buffers.followed"
     assert torch.equal(kept[name], scene.state()[name].tensor[came_from])
 
@@ -291,9 +326,12 @@ def test_training_state_is_left_out(kind: str) -> None:
 
 
 def person(weights: torch.Tensor, corrections: torch.Tensor) -> HumanScene:
-    """Two Gaussians on the first two of 24 joints, with learned corrections of their weights (2, 2)."""
-    times, poses = torch.zeros(1).double(), torch.zeros(1, 24, 3)
-    zeros, clip = torch.zeros(2), MotionClip(times, poses, torch.zeros(1, 3), torch.ones(1))
+    """Two Gaussians on the first two of 24 joints, with learned corrections of their weights (2,
+    2)."""
+    times = torch.zeros(1).double()
+    poses = torch.zeros(1, 24, 3)
+    zeros = torch.zeros(2)
+    clip = MotionClip(times, poses, torch.zeros(1, 3), torch.ones(1))
     anchors = Anchors(
         points=torch.zeros(2, 3),
         size=torch.ones(2),
@@ -308,14 +346,18 @@ def person(weights: torch.Tensor, corrections: torch.Tensor) -> HumanScene:
     learned = new_corrections(clip, skeleton, anchors)
     learned.values()["weights"].copy_(corrections)
     gaussians = cloud(2).replace(sh=torch.zeros(2, 1, 3))
-    return HumanScene(gaussians=gaussians, anchors=anchors, skeleton=skeleton, clip=clip, learned=learned)
+    return HumanScene(
+        gaussians=gaussians, anchors=anchors, skeleton=skeleton, clip=clip, learned=learned
+    )
 
 
 def test_corrections_of_skinning_weights_are_applied() -> None:
     weights = torch.tensor([[0.75, 0.25], [1.0, 0.0]])
     corrections = torch.tensor([[0.0, 3.0]]).log1p().repeat(2, 1)
     full = completed(drawable(person(weights, corrections)))
-    torch.testing.assert_close(full["model.anchors.weights"], torch.tensor([[3 / 7, 4 / 7], [1.0, 0.0]]))
+    torch.testing.assert_close(
+        full["model.anchors.weights"], torch.tensor([[3 / 7, 4 / 7], [1.0, 0.0]])
+    )
     again = HumanScene.restored(Gaussians(**part_of(full, "gaussians")), part_of(full, "model"))
     assert not again.learned["weights"].any()
 
@@ -330,7 +372,9 @@ def test_what_is_not_finite_is_refused() -> None:
 def masked() -> tuple[DynamicScene, DynamicModel]:
     """As ``moving``; each Gaussian is seen at one of three key times."""
     scene, model = moving("control_nodes")
-    masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
+    masks = VisibilityMasks.pack(
+        (0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None]
+    )
     return replace(scene, masks=masks), model
 
 
@@ -367,7 +411,9 @@ def test_masks_of_other_gaussians_are_refused(name: str, value: torch.Tensor) ->
 
 FLOATS = st.floats(-(2.0**100), 2.0**100, width=32)
 STEPS = st.floats(1e-20, 1e10).map(step_below)
-QUATS = nps.arrays(np.float32, st.tuples(st.integers(0, 8), st.just(4)), elements=st.floats(-10, 10, width=32))
+QUATS = nps.arrays(
+    np.float32, st.tuples(st.integers(0, 8), st.just(4)), elements=st.floats(-10, 10, width=32)
+)
 
 
 def covariances(quats: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
@@ -401,7 +447,8 @@ def test_sparse_rounding_prefers_zero() -> None:
 
 
 @given(
-    nps.arrays(np.float32, st.integers(0, 20), elements=FLOATS), st.sampled_from((2**-12, 5 * 2**-8, 7 * 2**-6, 1 / 8))
+    nps.arrays(np.float32, st.integers(0, 20), elements=FLOATS),
+    st.sampled_from((2**-12, 5 * 2**-8, 7 * 2**-6, 1 / 8)),
 )
 def test_opacities_are_finite_near_and_stable(logits: np.ndarray, step: float) -> None:
     whole = opacities_to_grid(logits, step)
@@ -426,22 +473,27 @@ def test_rotations_are_stable_and_turn_axes_into_axes(quats: np.ndarray, step: f
     assert np.array_equal(whole, rotations_to_grid(back, step))
     usable = np.linalg.norm(quats.astype(float), axis=1) > 1e-3
     scales = np.tile([0.0, -1.0, -2.0], (int(usable.sum()), 1))
-    exact, coarse = covariances(quats[usable], scales), covariances(back[usable], scales)
+    exact = covariances(quats[usable], scales)
+    coarse = covariances(back[usable], scales)
     assert (
         np.abs(exact - coarse).max(initial=0) < 8 * step
     )  # sqrt(3)/2 step, over a scalar part of 3/8, twice the angle
 
 
 def test_zero_quaternions_are_the_identity() -> None:
-    assert rotations_from_grid(rotations_to_grid(np.zeros((1, 4)), ROTATION_STEP), ROTATION_STEP).tolist() == [
-        [1, 0, 0, 0]
-    ]
+    assert rotations_from_grid(
+        rotations_to_grid(np.zeros((1, 4)), ROTATION_STEP), ROTATION_STEP
+    ).tolist() == [[1, 0, 0, 0]]
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
+@pytest.mark.parametrize(
+    "order", [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
+)
 def test_sorting_axes_keeps_the_gaussian(order: tuple[int, int, int]) -> None:
     quats = np.random.default_rng(2).normal(size=(1, 4))
     log_scales = np.array([[-2.0, -1.0, 0.5]])[:, order]
     turned, ordered = sorted_axes(quats, log_scales)
     assert ordered.tolist() == [[-2.0, -1.0, 0.5]]
-    np.testing.assert_allclose(covariances(turned, ordered), covariances(quats, log_scales), atol=1e-12)
+    np.testing.assert_allclose(
+        covariances(turned, ordered), covariances(quats, log_scales), atol=1e-12
+    )

@@ -45,12 +45,16 @@ def test_without_ray_a_line_says_how_to_get_it() -> None:
         list(done_in_turn(reciprocal, [1.0], 1))
 
 
-def test_ray_imports_no_module_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ray_imports_no_module_of_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its processes import from the folder that is current in ``ray.init``; tasks run in ours."""
     importing: list[str] = []
     fake = SimpleNamespace(
         init=lambda: importing.append(os.getcwd()),
-        remote=lambda **_: lambda do: SimpleNamespace(remote=lambda *given: (os.chdir("/"), do(*given))[1]),
+        remote=lambda **_: (
+            lambda do: SimpleNamespace(remote=lambda *given: (os.chdir("/"), do(*given))[1])
+        ),
         wait=lambda waiting: (waiting[:1], waiting[1:]),
         get=lambda found: found,
         shutdown=lambda: None,

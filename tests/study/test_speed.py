@@ -22,7 +22,8 @@ def test_all_draw_every_image_in_turn() -> None:
     before = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
     speeds = time_interleaved(drawings, views, rounds=2)
     after = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
-    assert [b - a for a, b in zip(before, after, strict=True)] == [7, 7]  # a warm-up, and twice three views
+    # a warm-up, and twice three views
+    assert [b - a for a, b in zip(before, after, strict=True)] == [7, 7]
     assert speeds[0].gain.low == speeds[0].gain.median == speeds[0].gain.high == 1.0
     assert all(s.ms.low <= s.ms.median <= s.ms.high for s in speeds)
 

@@ -16,7 +16,9 @@ def test_another_study_is_refused_with_what_differs(tmp_path: Path) -> None:
     require_same_study(path, facts, ("models", "minutes"))
     before = path.read_bytes()
     require_same_study(path, facts | {"where": "b"}, ("models", "minutes"))
-    with pytest.raises(DyngsError, match=r"\(models is static, mip there and static here; minutes is 2.0 there"):
+    with pytest.raises(
+        DyngsError, match=r"\(models is static, mip there and static here; minutes is 2.0 there"
+    ):
         require_same_study(path, {"models": ["static"], "minutes": ""}, ("models", "minutes"))
     assert path.read_bytes() == before
 

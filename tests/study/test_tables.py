@@ -31,14 +31,20 @@ def test_html_shows_it_and_runs_nothing() -> None:
     assert sum(("class", "marked") in attrs for _, attrs in tags) == 1  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("text", ["=HYPERLINK(1)", "+1+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\t=1", "\r=1"])
+@pytest.mark.parametrize(
+    "text", ["=HYPERLINK(1)", "+1+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\t=1", "\r=1"]
+)
 def test_csv_holds_no_formulas(text: str) -> None:
-    (row,) = csv.reader(io.StringIO(csv_text([{"name": text, "dB": -1.5}]).partition("\n")[2], newline=""))
+    (row,) = csv.reader(
+        io.StringIO(csv_text([{"name": text, "dB": -1.5}]).partition("\n")[2], newline="")
+    )
     assert row == [f"'{escaped(text)}", "-1.5"]
 
 
 def test_markdown_shows_names_as_they_are() -> None:
-    (line,) = markdown_table(["name"], [["[a](javascript:b) <img src=x> **c** `d` \n\x1b e_f"]]).splitlines()[2:]
+    (line,) = markdown_table(
+        ["name"], [["[a](javascript:b) <img src=x> **c** `d` \n\x1b e_f"]]
+    ).splitlines()[2:]
     assert line == r"| \[a\](javascript:b) \<img src=x\> \*\*c\*\* \`d\` \\x1b e_f |"
 
 

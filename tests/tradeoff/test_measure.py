@@ -28,7 +28,9 @@ def image_of(drawing: Drawing, time: float = 0.0) -> Image:
 def test_options_are_those_of_the_run_but_for_what_is_changed() -> None:
     scene = replace(still_scene(), options=RenderOptions(near=0.5, eps2d=0.1))
     assert variant_drawing(Variant(), scene, BLACK).options == scene.options
-    changed = variant_drawing(Variant(mode="antialiased", alpha_min=0.02, transmittance_min=0.01), scene, BLACK).options
+    changed = variant_drawing(
+        Variant(mode="antialiased", alpha_min=0.02, transmittance_min=0.01), scene, BLACK
+    ).options
     assert (changed.near, changed.mode) == (0.5, RasterizeMode.ANTIALIASED)
     assert (changed.alpha_min, changed.transmittance_min) == (0.02, 0.01)
 

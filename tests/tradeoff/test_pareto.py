@@ -28,7 +28,10 @@ def test_every_point_is_on_the_front_or_beaten_by_one_that_is(goals: list[tuple[
     front = [goal for goal, is_best in zip(goals, best, strict=True) if is_best]
     assert front
     for goal, is_best in zip(goals, best, strict=True):
-        beaten = any(other != goal and all(x >= y for x, y in zip(other, goal, strict=True)) for other in front)
+        beaten = any(
+            other != goal and all(x >= y for x, y in zip(other, goal, strict=True))
+            for other in front
+        )
         assert beaten != is_best
 
 
@@ -40,7 +43,11 @@ def test_the_front_does_not_depend_on_the_order(goals: list[tuple[int, ...]]) ->
 
 
 def test_speed_size_and_quality_count() -> None:
-    points = [BASE, measurement(Variant(prune=0.5), 29.0, 2.0, 4.0), measurement(Variant(scale=0.5), 28.0, 2.0, 8.0)]
+    points = [
+        BASE,
+        measurement(Variant(prune=0.5), 29.0, 2.0, 4.0),
+        measurement(Variant(scale=0.5), 28.0, 2.0, 8.0),
+    ]
     assert on_front(points) == [True, True, False]
 
 
@@ -51,7 +58,9 @@ def test_slope_of_one_point_is_its_rate(loss: float, factor: float) -> None:
 
 @given(st.floats(-3, 3), st.lists(st.integers(1, 4), min_size=1, max_size=5))
 def test_slope_of_points_on_a_line_is_that_line(per_doubling: float, doublings: list[int]) -> None:
-    assert slope([(per_doubling * k, 2.0**k) for k in doublings]) == pytest.approx(per_doubling, abs=1e-9)
+    assert slope([(per_doubling * k, 2.0**k) for k in doublings]) == pytest.approx(
+        per_doubling, abs=1e-9
+    )
 
 
 def test_no_gain_has_no_price() -> None:
@@ -70,9 +79,17 @@ def test_exchange_rates_are_those_of_single_settings() -> None:
         measurement(Variant(storage="auto", prune=0.5), 20.0, 2.0, 0.5),
     ]
     prune, storage = exchange_rates(BASE, points)
-    assert (prune.setting, prune.db_per_speed, prune.db_per_size) == ("prune", pytest.approx(1.0), pytest.approx(1.0))
+    assert (prune.setting, prune.db_per_speed, prune.db_per_size) == (
+        "prune",
+        pytest.approx(1.0),
+        pytest.approx(1.0),
+    )
     assert (prune.speed, prune.size) == (4.0, 4.0)
-    assert (storage.setting, storage.db_per_speed, storage.db_per_size) == ("storage", None, pytest.approx(0.0))
+    assert (storage.setting, storage.db_per_speed, storage.db_per_size) == (
+        "storage",
+        None,
+        pytest.approx(0.0),
+    )
 
 
 def test_what_is_cheapest_is_put_together_first() -> None:
@@ -87,7 +104,9 @@ def test_what_is_cheapest_is_put_together_first() -> None:
     assert Variant(prune=0.5, alpha_min=0.01) in found
     assert Variant(prune=0.75, alpha_min=0.01) in found
     assert Variant(prune=0.5, storage="auto") in found
-    assert found.index(Variant(prune=0.5, alpha_min=0.01)) < found.index(Variant(prune=0.75, alpha_min=0.01))
+    assert found.index(Variant(prune=0.5, alpha_min=0.01)) < found.index(
+        Variant(prune=0.75, alpha_min=0.01)
+    )
     assert all(len(v.settings) > 1 and v.scale == 1 for v in found)
     assert len(set(found)) == len(found)
     assert combinations(BASE, singles, 0) == []

@@ -21,7 +21,13 @@ def row(variant: Variant, psnr: float, fps: float, mb: float) -> TableRow:
 
 
 @settings(max_examples=2)  # a drawing takes a while
-@given(st.lists(st.tuples(st.floats(-10, 100), st.floats(1e-3, 1e5), st.floats(1e-4, 1e4)), min_size=1, max_size=8))
+@given(
+    st.lists(
+        st.tuples(st.floats(-10, 100), st.floats(1e-3, 1e5), st.floats(1e-4, 1e4)),
+        min_size=1,
+        max_size=8,
+    )
+)
 def test_every_point_lies_inside(values: list[tuple[float, float, float]]) -> None:
     rows = [row(Variant(prune=i / 10), *v) for i, v in enumerate(values)]
     figure = plot(rows)
@@ -41,7 +47,9 @@ def test_points_have_names_and_nothing_is_fetched() -> None:
     assert text == svg_of(plot(rows))
     root = ElementTree.fromstring(text)
     texts = [(element.text or "").strip() for element in root.iter()]
-    assert texts.count("alpha_min=0.01: 29.00 dB, 15.0 fps, 5.00 MB") == 2, "a tooltip in each panel"
+    assert texts.count("alpha_min=0.01: 29.00 dB, 15.0 fps, 5.00 MB") == 2, (
+        "a tooltip in each panel"
+    )
     assert {"the run itself", "alpha_min", "PSNR and speed"} <= set(texts)
     assert "<image" not in text
     assert 'href="http' not in text

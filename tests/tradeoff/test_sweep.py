@@ -26,14 +26,24 @@ from dyngs.tradeoff.variant_runs import VariantRuns, field_changes, run_settings
 from dyngs.tradeoff.variants import Variant, parse_variations
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-SETTINGS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
+SETTINGS = (
+    "prune=0.5",
+    "mask_times=3",
+    "sh_degree=0",
+    "storage=2",
+    "field_step=64",
+    "alpha_min=0.02",
+    "scale=0.5",
+)
 PLAN = Plan(parse_variations(SETTINGS, trains=False), finetune=2, combine=1, rounds=1)
 
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes"))
+    return train(
+        busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +61,8 @@ def named(points: list[Measurement], variant: Variant) -> Measurement:
 
 
 def test_the_run_itself_is_what_eval_says(points: list[Measurement], run_dir: Path) -> None:
-    report, base = evaluate_run(run_dir, "test", threads=1), points[0]
+    report = evaluate_run(run_dir, "test", threads=1)
+    base = points[0]
     assert base.variant == Variant()
     assert (base.psnr, base.ssim) == pytest.approx((report.psnr, report.ssim))
     assert (base.num_views, base.num_gaussians) == (report.num_views, report.num_gaussians)
@@ -59,7 +70,8 @@ def test_the_run_itself_is_what_eval_says(points: list[Measurement], run_dir: Pa
 
 
 def test_every_setting_does_what_it_says(points: list[Measurement]) -> None:
-    base, pruned = points[0], named(points, Variant(prune=0.5))
+    base = points[0]
+    pruned = named(points, Variant(prune=0.5))
     assert pruned.num_gaussians == base.num_gaussians / 2
     assert pruned.mb < 0.75 * base.mb  # what moves is worth more and holds more numbers
     assert named(points, Variant(prune=0.5, finetune=2)).num_gaussians == pruned.num_gaussians
@@ -79,7 +91,9 @@ def test_combinations_are_measured_too(points: list[Measurement]) -> None:
     assert 0 < len(together) <= 3 * PLAN.combine
 
 
-def test_finished_points_are_not_measured_again(points: list[Measurement], runs: VariantRuns) -> None:
+def test_finished_points_are_not_measured_again(
+    points: list[Measurement], runs: VariantRuns
+) -> None:
     said: list[str] = []
     files = sorted((runs.out / "points").iterdir())
     times = [file.stat().st_mtime_ns for file in files]
@@ -89,16 +103,23 @@ def test_finished_points_are_not_measured_again(points: list[Measurement], runs:
     assert [read_measurement(file).variant.slug for file in files] == [file.stem for file in files]
 
 
-def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: VariantRuns, tmp_path: Path) -> None:
+def test_points_of_something_else_do_not_mix(
+    points: list[Measurement], runs: VariantRuns, tmp_path: Path
+) -> None:
     with pytest.raises(DyngsError, match=r"another study .split is test there and train here"):
         sweep(runs, replace(PLAN, split="train"), lambda line: None)
     with pytest.raises(DyngsError, match="no views"):
         sweep(VariantRuns(runs.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
 
 
-def test_on_a_gpu_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)  # of the CPU alone
-    briefly = replace(PLAN, settings=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
+def test_on_a_gpu_quality_is_the_same(
+    runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # of the CPU alone
+    monkeypatch.setattr("dyngs.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
+    briefly = replace(
+        PLAN, settings=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0
+    )
     expected = sweep(VariantRuns(runs.run_dir, tmp_path / "here", 1), briefly, lambda line: None)
     monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
@@ -132,8 +153,12 @@ def test_without_matplotlib_there_is_no_plot(
     assert "<svg" not in files[2].read_text()
 
 
-def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], runs: VariantRuns) -> None:
-    variant = Variant(prune=0.5, mask_times=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5)
+def test_the_chosen_run_is_drawn_as_it_was_measured(
+    points: list[Measurement], runs: VariantRuns
+) -> None:
+    variant = Variant(
+        prune=0.5, mask_times=3, storage=2.0, mode="antialiased", alpha_min=0.02, scale=0.5
+    )
     folder = write_chosen(runs, variant)
     chosen = load_run(folder)
     assert has_only_scene_file(folder)
@@ -144,7 +169,9 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], r
     assert chosen.scene.options == measured.options
     for single in (Variant(sh_degree=0), Variant(alpha_min=0.02), Variant(storage=2.0)):
         folder = write_chosen(runs, single)
-        assert evaluate_run(folder, "test", threads=1).psnr == pytest.approx(named(points, single).psnr)
+        assert evaluate_run(folder, "test", threads=1).psnr == pytest.approx(
+            named(points, single).psnr
+        )
 
 
 @pytest.mark.parametrize(
@@ -179,8 +206,12 @@ def test_free_primitives_are_tried_and_left(run_dir: Path, tmp_path: Path) -> No
     assert "model.deform.kind=hexplane" in list(field_changes(free, Variant(field="hexplane")))
 
 
-def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns, tmp_path: Path) -> None:
-    masked = VariantRuns(runs.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
+def test_masks_that_a_run_has_stay(
+    points: list[Measurement], runs: VariantRuns, tmp_path: Path
+) -> None:
+    masked = VariantRuns(
+        runs.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1
+    )
     assert run_settings(masked.run_dir)["mask_times"] == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene
@@ -190,12 +221,18 @@ def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns,
 
 def test_what_cannot_be_varied_is_named(runs: VariantRuns) -> None:
     said: list[str] = []
-    sweep(runs, replace(PLAN, settings=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
+    sweep(
+        runs,
+        replace(PLAN, settings=parse_variations(["sh_degree=3"], trains=False), combine=0),
+        said.append,
+    )
     assert said == ["nothing to vary in this run: sh_degree"]
 
 
 def test_a_stored_run_cannot_be_varied(points: list[Measurement], runs: VariantRuns) -> None:
-    with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it was exported from"):
+    with pytest.raises(
+        DyngsError, match=r"only scene\.dyngs is there; give the run that it was exported from"
+    ):
         run_settings(runs.folder(Variant(storage=2.0)))
 
 
@@ -206,9 +243,12 @@ def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
     path.write_text(point % (30.5, "null"))
     assert read_measurement(path).psnr == 30.5
     spread, zero = (f'{{"median": {n}, "low": 1, "high": 2}}' for n in (1.5, 0))
-    bad = [point % (psnr, "null") for psnr in ("NaN", "1e999", "[1]", '"x"', "[" * 5000 + "]" * 5000)]
+    bad = [
+        point % (psnr, "null") for psnr in ("NaN", "1e999", "[1]", '"x"', "[" * 5000 + "]" * 5000)
+    ]
     bad += [
-        point % (30, f'{{"ms": {ms}, "gain": {gain}}}') for ms, gain in ((zero, spread), (spread, zero), (1, spread))
+        point % (30, f'{{"ms": {ms}, "gain": {gain}}}')
+        for ms, gain in ((zero, spread), (spread, zero), (1, spread))
     ]
     for text in ("", "[]", "{}", '{"variant": {"prine": 1}, "speed": null}', *bad):
         path.write_text(text)

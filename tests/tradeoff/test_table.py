@@ -1,4 +1,5 @@
-"""Requirements are parsed without running anything, and the choice is the best of what meets them."""
+"""Requirements are parsed without running anything, and the choice is the best of what meets
+them."""
 
 from __future__ import annotations
 
@@ -12,7 +13,9 @@ from dyngs.tradeoff.variants import Variant
 
 
 def row(prune: float, psnr: float, fps: float, mb: float) -> TableRow:
-    return TableRow(Variant(prune=prune), psnr, 0.9, None, fps, 1.0, 1.0, 1.0, 1e3 / fps, mb, 100.0, 1000, True)
+    return TableRow(
+        Variant(prune=prune), psnr, 0.9, None, fps, 1.0, 1.0, 1.0, 1e3 / fps, mb, 100.0, 1000, True
+    )
 
 
 ROWS = [row(0.0, 32.0, 5.0, 9.0), row(0.5, 30.5, 18.0, 4.5), row(0.8, 27.0, 40.0, 2.0)]
@@ -26,7 +29,9 @@ def test_conditions() -> None:
     )
 
 
-@given(st.sampled_from(["psnr", "mb", "memory_mb", "gaussians"]), st.booleans(), st.floats(-1e6, 1e6))
+@given(
+    st.sampled_from(["psnr", "mb", "memory_mb", "gaussians"]), st.booleans(), st.floats(-1e6, 1e6)
+)
 def test_what_is_printed_is_read_again(name: str, at_most: bool, bound: float) -> None:
     wanted = Requirement(name, at_most, float(f"{bound:g}"))
     assert parse_requirements(str(wanted)) == (wanted,)
@@ -69,13 +74,17 @@ def test_the_binding_requirement_is_named() -> None:
         DyngsError, match=r"fps>=20 is too strict: with the others met the best is 18 \(prune=0.5\)"
     ) as caught:
         choose(ROWS, parse_requirements("psnr>=30,fps>=20,mb<=5"), Goal("mb", True))
-    assert "psnr>=30 is too strict: with the others met the best is 27 (prune=0.8)" in str(caught.value)
+    assert "psnr>=30 is too strict: with the others met the best is 27 (prune=0.8)" in str(
+        caught.value
+    )
     assert "mb<=5 is too strict" not in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_without_a_single_binding_one_the_best_of_each_is_named() -> None:
-    with pytest.raises(DyngsError, match="psnr>=50 alone: the best is 32; fps>=90 alone: the best is 40"):
+    with pytest.raises(
+        DyngsError, match="psnr>=50 alone: the best is 32; fps>=90 alone: the best is 40"
+    ):
         choose(ROWS, parse_requirements("psnr>=50,fps>=90"), Goal("psnr", False))
 
 
@@ -85,8 +94,14 @@ def test_what_is_not_known_does_not_qualify() -> None:
 
 
 @given(st.floats(20, 40), st.floats(1, 60), st.floats(1, 10))
-def test_a_choice_meets_everything_and_nothing_that_does_is_better(psnr: float, fps: float, mb: float) -> None:
-    asked = (Requirement("psnr", False, psnr), Requirement("fps", False, fps), Requirement("mb", True, mb))
+def test_a_choice_meets_everything_and_nothing_that_does_is_better(
+    psnr: float, fps: float, mb: float
+) -> None:
+    asked = (
+        Requirement("psnr", False, psnr),
+        Requirement("fps", False, fps),
+        Requirement("mb", True, mb),
+    )
     fitting = [p for p in ROWS if p.psnr >= psnr and p.fps >= fps and p.mb <= mb]
     if fitting:
         assert choose(ROWS, asked, Goal("mb", True)).mb == min(p.mb for p in fitting)

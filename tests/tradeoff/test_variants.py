@@ -65,10 +65,14 @@ def test_merging_keeps_what_the_other_changes(a: Variant, b: Variant) -> None:
 
 
 def test_what_lies_on_disk_does_not_depend_on_drawing() -> None:
-    drawn = Variant(mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5, supersampling=1)
+    drawn = Variant(
+        mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5, supersampling=1
+    )
     assert drawn.stored == Variant()
     assert replace(drawn, prune=0.5).stored == Variant(prune=0.5)
-    assert replace(drawn, colour="sh", field="mlp", prune=0.5).trained == Variant(colour="sh", field="mlp")
+    assert replace(drawn, colour="sh", field="mlp", prune=0.5).trained == Variant(
+        colour="sh", field="mlp"
+    )
 
 
 def test_the_setting_of_a_variant() -> None:
@@ -84,9 +88,14 @@ def test_the_setting_of_a_variant() -> None:
 def test_single_changes_leave_out_what_a_run_is_already() -> None:
     names = [v.name for v in single_changes(parse_variations([], trains=True), DYNAMIC, 0)]
     assert len(names) == len(set(names))
-    assert {"sh_degree=0", "sh_degree=1", "mask_times=6", "mode=antialiased", "colour=network", "field=mlp"} <= set(
-        names
-    )
+    assert {
+        "sh_degree=0",
+        "sh_degree=1",
+        "mask_times=6",
+        "mode=antialiased",
+        "colour=network",
+        "field=mlp",
+    } <= set(names)
     assert not {"sh_degree=2", "mode=classic", "colour=sh", "field=control_nodes"} & set(names)
     still = {"sh_degree": 0, "storage": None, "scale": 1.0}
     fewer = [v.name for v in single_changes(parse_variations([], trains=True), still, 0)]
@@ -95,7 +104,9 @@ def test_single_changes_leave_out_what_a_run_is_already() -> None:
 
 def test_own_values_are_the_start() -> None:
     variations = parse_variations(["alpha_min=0.008,0.016"], trains=False)
-    assert single_changes(variations, DYNAMIC | {"alpha_min": 0.008}, 0) == [Variant(alpha_min=0.016)]
+    assert single_changes(variations, DYNAMIC | {"alpha_min": 0.008}, 0) == [
+        Variant(alpha_min=0.016)
+    ]
     variations = parse_variations(["mask_times=6,16"], trains=False)
     assert single_changes(variations, DYNAMIC | {"mask_times": 6}, 0) == [Variant(mask_times=16)]
 

@@ -1,4 +1,5 @@
-"""The predicted rest of a run against simulated runs whose steps get dearer as those of real ones do."""
+"""The predicted rest of a run against simulated runs whose steps get dearer as those of real ones
+do."""
 
 from __future__ import annotations
 
@@ -44,28 +45,42 @@ class Run:
         """Of the steps after ``first`` up to ``last``."""
         return sum(
             (self.motion if s > self.moves_after else 1.0)
-            * (self.fixed + self.per_pixel * self.drawn(s) + self.per_gaussian * self.gaussians(self.share(s)))
+            * (
+                self.fixed
+                + self.per_pixel * self.drawn(s)
+                + self.per_gaussian * self.gaussians(self.share(s))
+            )
             for s in range(first + 1, last + 1)
         )
 
     def predicted(self, until: int, every: int = 20) -> tuple[float, float]:
-        """Return the seconds left after step ``until`` as predicted, and as steps so far would say."""
-        forecast, now = Forecast(0, 100.0), 100.0
+        """Return the seconds left after step ``until`` as predicted, and as steps so far would
+        say."""
+        forecast = Forecast(0, 100.0)
+        now = 100.0
         for step in range(every, until + 1, every):
             now += self.seconds(step - every, step)
-            forecast.observe(self.config, step, now, round(self.gaussians(self.share(step))), self.drawn(step))
+            forecast.observe(
+                self.config, step, now, round(self.gaussians(self.share(step))), self.drawn(step)
+            )
         steps = self.config.train.steps
         return forecast.seconds(self.config, steps), (now - 100.0) / until * (steps - until)
 
 
 def sharpening(x: float) -> float:
-    """The Gaussians of a real clip of 854x480: to 30,000 in small images, then to the cap of 60,000."""
+    """The Gaussians of a real clip of 854x480: to 30,000 in small images, then to the cap of
+    60,000."""
     return 4000 + 47000 * min(x, 0.58) + (0 if x < 0.6 else min(1.0, (x - 0.6) / 0.1) * 29000)
 
 
 @pytest.mark.parametrize(
     "machine",
-    [(6e-3, 3e-7, 7e-7, 1.8), (3e-3, 2e-7, 4e-7, 2.0), (12e-3, 6e-7, 1.4e-6, 1.9), (36e-3, 2e-6, 3e-6, 1.6)],
+    [
+        (6e-3, 3e-7, 7e-7, 1.8),
+        (3e-3, 2e-7, 4e-7, 2.0),
+        (12e-3, 6e-7, 1.4e-6, 1.9),
+        (36e-3, 2e-6, 3e-6, 1.6),
+    ],
 )
 def test_small_images_first(machine: tuple[float, float, float, float]) -> None:
     run = Run(dynamic(), sharpening, 854 * 480, *machine)
@@ -122,7 +137,8 @@ def test_no_checkpoint_is_due_without_an_interval() -> None:
 
 
 def test_the_least_that_a_run_takes() -> None:
-    """Steps of images that are whole from the start take as long as so far; with small ones first, longer."""
+    """Steps of images that are whole from the start take as long as so far; with small ones first,
+    longer."""
     forecast = Forecast(0, 0.0, 1000)
     plain = load_config("blender", ["data.root=nowhere", "train.steps=200"])
     forecast.observe(plain, 10, 5.0, 1000, 10_000)

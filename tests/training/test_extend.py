@@ -1,4 +1,5 @@
-"""A run that goes on to another number of steps: it does so to the same bytes however it is stopped, of every kind."""
+"""A run that goes on to another number of steps: it does so to the same bytes however it is
+stopped, of every kind."""
 
 from __future__ import annotations
 
@@ -52,15 +53,20 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _config(captures: Path, folder: Path, kind: str, **changes: object) -> Config:
     if kind == "control_nodes":
         return busy_config(captures / "moving", folder, kind).model_copy(update=changes)
-    person, still = kind == "human", "person" if kind == "human" else "still"
+    person = kind == "human"
+    still = "person" if kind == "human" else "still"
     strategies = {
-        "default": DefaultStrategy(start=1, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150),
+        "default": DefaultStrategy(
+            start=1, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150
+        ),
         "mcmc": McmcStrategy(start=1, stop=15_000, every=3, max_gaussians=90, min_opacity=0.45),
         "human": DefaultStrategy(grow=False),
     }
     config = Config(
         data=DataConfig(root=captures / still),
-        model=HumanModel(resolution=16, sh_degree=0, fit=False) if person else StaticModel(sh_degree=2),
+        model=HumanModel(resolution=16, sh_degree=0, fit=False)
+        if person
+        else StaticModel(sh_degree=2),
         init=RandomInit(num_random=60),
         strategy=strategies[kind],
         train=TrainConfig(steps=12, log_every=1),
@@ -86,9 +92,14 @@ def _stop_after(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_a_finished_run_goes_on_to_the_same_bytes_also_when_it_is_stopped(
-    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: str
+    captures: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    kind: str,
 ) -> None:
-    one, other = tmp_path / "one", tmp_path / "other"
+    one = tmp_path / "one"
+    other = tmp_path / "other"
     config = _config(captures, one, kind)
     done = train(config) and config.train.steps
     shutil.copytree(one, other)
@@ -108,7 +119,9 @@ def test_a_finished_run_goes_on_to_the_same_bytes_also_when_it_is_stopped(
     assert (one / "config.yaml").read_bytes() == (other / "config.yaml").read_bytes()
 
 
-def test_gaussians_are_added_again_where_the_new_schedule_says_so(captures: Path, tmp_path: Path) -> None:
+def test_gaussians_are_added_again_where_the_new_schedule_says_so(
+    captures: Path, tmp_path: Path
+) -> None:
     run = train(_config(captures, tmp_path / "run", "default"))
     before = len(load_run(run).scene)
     _to(run, 48)
@@ -132,9 +145,19 @@ def test_a_run_that_was_stopped_may_become_longer_or_shorter(
         assert load_run(copy).step == load_resolved(copy).train.steps == steps
 
 
-def test_limits_hold_on_but_that_of_time(captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_limits_hold_on_but_that_of_time(
+    captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked = BudgetConfig(max_gaussians=70, max_mb=1.0)
-    run = train(_config(captures, tmp_path / "run", "default", budget=asked, train=TrainConfig(steps=12, minutes=5)))
+    run = train(
+        _config(
+            captures,
+            tmp_path / "run",
+            "default",
+            budget=asked,
+            train=TrainConfig(steps=12, minutes=5),
+        )
+    )
     capsys.readouterr()
     _to(run, 24)
     assert "train.minutes holds no longer" in capsys.readouterr().out
@@ -162,7 +185,9 @@ def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path:
 
 def test_what_has_begun_keeps_its_step() -> None:
     options = TrainConfig(steps=1000, initial_downscale=4)
-    model = DynamicModel(time_window=0.1, time_window_grows_from=0.4, time_window_full_at=0.6, motion_from=0.35)
+    model = DynamicModel(
+        time_window=0.1, time_window_grows_from=0.4, time_window_full_at=0.6, motion_from=0.35
+    )
     config = Config(data=DataConfig(root=Path("x")), model=model, train=options)
     old = deform_schedule(model, Rates(1000))
     assert old.fine == 350

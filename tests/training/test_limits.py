@@ -52,7 +52,9 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def still_config(capture: Path, run_dir: Path, strategy: DefaultStrategy | McmcStrategy = BUSY) -> Config:
+def still_config(
+    capture: Path, run_dir: Path, strategy: DefaultStrategy | McmcStrategy = BUSY
+) -> Config:
     return Config(
         data=DataConfig(root=capture),
         model=StaticModel(sh_degree=1),
@@ -84,7 +86,9 @@ def test_none_are_added_beyond_a_cap(
 
 
 def test_a_cap_holds_where_motion_adds_some(tmp_path: Path) -> None:
-    config = busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "control_nodes")
+    config = busy_config(
+        write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "control_nodes"
+    )
     assert isinstance(config.model, DynamicModel)
     free = largest_count(assemble(config))
     cap = free - config.model.num_random_moving
@@ -103,7 +107,9 @@ def test_without_limits_the_run_is_the_same(still: Path, tmp_path: Path) -> None
 
 @given(cap=st.integers(1, 10**7), own=st.integers(1, 10**7))
 def test_limits_only_lower_and_are_settled_at_once(cap: int, own: int) -> None:
-    base = NOTHING.model_copy(update={"strategy": DefaultStrategy(max_gaussians=own), "model": DynamicModel()})
+    base = NOTHING.model_copy(
+        update={"strategy": DefaultStrategy(max_gaussians=own), "model": DynamicModel()}
+    )
     config = within_cap(limited(base, max_gaussians=cap), 5)
     assert isinstance(config.model, DynamicModel)
     assert config.strategy.max_gaussians + config.model.num_random_moving <= min(
@@ -118,14 +124,18 @@ def test_room_grows_with_the_size_and_shrinks_with_what_is_stored() -> None:
     assert room(NOTHING, 0, 10.0) == pytest.approx(2 * room(NOTHING, 0, 5.0), abs=1)
     flat = NOTHING.model_copy(update={"model": StaticModel(sh_degree=0)})
     assert room(flat, 0, 5.0) == 5e6 / 16
-    fixed = flat.model_copy(update={"model": DynamicModel(sh_degree=0, deform=tiny_options("hexplane"))})
+    fixed = flat.model_copy(
+        update={"model": DynamicModel(sh_degree=0, deform=tiny_options("hexplane"))}
+    )
     assert room(fixed, 1, 5.0) == 5e6 / 16, "nothing moves at one time"
     less = 5e6 / 16 - room(fixed, 10, 5.0)
     assert 0 < less == pytest.approx(1e7 / 16 - room(fixed, 10, 10.0), abs=1)
 
 
 @pytest.mark.parametrize("model", [StaticModel(), DynamicModel()])
-def test_a_size_without_room_is_refused_and_the_one_named_is_not(model: StaticModel | DynamicModel) -> None:
+def test_a_size_without_room_is_refused_and_the_one_named_is_not(
+    model: StaticModel | DynamicModel,
+) -> None:
     config = NOTHING.model_copy(update={"model": model})
     with pytest.raises(DyngsError, match=r"budget.max_mb=0.001: .* would do") as refused:
         within_cap(limited(config, max_mb=0.001), 20)
@@ -135,12 +145,20 @@ def test_a_size_without_room_is_refused_and_the_one_named_is_not(model: StaticMo
 
 def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     require_possible(NOTHING)
-    with pytest.raises(DyngsError, match=r"budget.max_mb: model.kind=human_predictor has no Gaussians"):
-        require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
-    both = NOTHING.model_copy(update={"prune": PruneConfig(fraction=0.5), "run": RunConfig(dir=tmp_path / "run")})
+    with pytest.raises(
+        DyngsError, match=r"budget.max_mb: model.kind=human_predictor has no Gaussians"
+    ):
+        require_possible(
+            limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0)
+        )
+    both = NOTHING.model_copy(
+        update={"prune": PruneConfig(fraction=0.5), "run": RunConfig(dir=tmp_path / "run")}
+    )
     with pytest.raises(DyngsError, match=r"train.minutes: .*dyngs prune"):
         train(timed(both, 5.0))
-    with pytest.raises(DyngsError, match=r"train.minutes: model.kind=human_predictor is trained for"):
+    with pytest.raises(
+        DyngsError, match=r"train.minutes: model.kind=human_predictor is trained for"
+    ):
         require_possible(timed(NOTHING.model_copy(update={"model": HumanPredictorModel()}), 5.0))
     assert not (tmp_path / "run").exists()
 

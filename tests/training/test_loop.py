@@ -15,11 +15,16 @@ from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TotalChanged
 from dyngs.training.loop import Interrupts, Loop
 
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+SIGNALS = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]
 
 
 def looped(
-    trainer: Counting, total: int, *listeners: Callable[[Event], None], advice: Callable[[], str] | None = None
+    trainer: Counting,
+    total: int,
+    *listeners: Callable[[Event], None],
+    advice: Callable[[], str] | None = None,
 ) -> Loop:
     loop = Loop(trainer, total, Stopwatch(), advice)
     loop.subscribe(*listeners)
@@ -27,10 +32,13 @@ def looped(
 
 
 def test_events_come_in_order_and_all_listeners_hear_them() -> None:
-    """What was found in a step is told before that the step is done; listeners are told in the order they came in."""
+    """What was found in a step is told before that the step is done; listeners are told in the
+    order they came in."""
     told: list[tuple[str, Event]] = []
     trainer = Counting(findings={2: "something"})
-    loop = looped(trainer, 3, lambda e: told.append(("first", e)), lambda e: told.append(("second", e)))
+    loop = looped(
+        trainer, 3, lambda e: told.append(("first", e)), lambda e: told.append(("second", e))
+    )
     loop.run()
     assert [name for name, _ in told] == ["first", "second"] * 5
     assert all(a[1] is b[1] for a, b in zip(told[::2], told[1::2], strict=True))
@@ -45,7 +53,9 @@ def test_a_listener_sees_every_step_as_it_is() -> None:
 
     def listener(event: Event) -> None:
         if isinstance(event, StepDone):
-            seen.append((event.step, event.is_last, event.total, event.num_gaussians, event.num_moving))
+            seen.append(
+                (event.step, event.is_last, event.total, event.num_gaussians, event.num_moving)
+            )
             assert event.loop.trainer is trainer
             assert event.report.loss == 0.5
             trainer.num_gaussians += 1  # the next listener finds it so
@@ -60,7 +70,9 @@ def test_a_listener_sees_every_step_as_it_is() -> None:
 
 def test_a_listener_may_exchange_the_trainer() -> None:
     """From the next step on the other one is trained; listeners find it in the loop."""
-    first, second, seen = Counting(num_gaussians=5), Counting(done=10, num_gaussians=7), []
+    first = Counting(num_gaussians=5)
+    second = Counting(done=10, num_gaussians=7)
+    seen = []
 
     def exchanging(event: Event) -> None:
         if isinstance(event, StepDone) and event.step == 2:

@@ -26,8 +26,13 @@ def image() -> Image:
 
 
 def test_the_loss_is_the_sum_of_its_terms(image: Image) -> None:
-    terms = {"image": torch.tensor(0.5, requires_grad=True), "alpha": torch.tensor(0.125, dtype=torch.float64)}
-    assert StepCheck(terms, random_scene().gaussians.tensors(), CPU).loss(3, image, MOVES_BY) == 0.625
+    terms = {
+        "image": torch.tensor(0.5, requires_grad=True),
+        "alpha": torch.tensor(0.125, dtype=torch.float64),
+    }
+    assert (
+        StepCheck(terms, random_scene().gaussians.tensors(), CPU).loss(3, image, MOVES_BY) == 0.625
+    )
     assert StepCheck(terms, {}, CPU).loss(3, image, MOVES_BY) == 0.625
 
 
@@ -38,25 +43,34 @@ def test_the_value_is_that_of_the_moment_of_asking(image: Image) -> None:
     assert check.loss(3, image, MOVES_BY) == 0.5
 
 
-@pytest.mark.parametrize(("name", "advice"), [("image", "look at that image"), ("alpha", "lower its weight")])
+@pytest.mark.parametrize(
+    ("name", "advice"), [("image", "look at that image"), ("alpha", "lower its weight")]
+)
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_a_term_that_is_not_finite_is_named(image: Image, name: str, advice: str, value: float) -> None:
+def test_a_term_that_is_not_finite_is_named(
+    image: Image, name: str, advice: str, value: float
+) -> None:
     terms = {"image": torch.tensor(0.5), "alpha": torch.tensor(0.1)} | {name: torch.tensor(value)}
-    with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': the loss term '{name}' is {value}; {advice}"):
+    with pytest.raises(
+        DyngsError, match=rf"^step 3, view 'r_7': the loss term '{name}' is {value}; {advice}"
+    ):
         StepCheck(terms, {}, CPU).loss(3, image, MOVES_BY)
 
 
 def test_gaussians_that_are_not_finite_come_first(image: Image) -> None:
     """They are the cause of whatever else is not."""
     gaussians = random_scene().gaussians
-    gaussians.means[3, 1], gaussians.quats[0, 0] = torch.nan, torch.inf
+    gaussians.means[3, 1] = torch.nan
+    gaussians.quats[0, 0] = torch.inf
     terms = {"image": torch.tensor(torch.nan)}
     message = r"the field makes means, quats at 0\.25 not finite; lower the rates in model\.deform$"
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': {message}"):
         StepCheck(terms, gaussians.tensors(), CPU).loss(3, image, MOVES_BY)
 
 
-def test_the_error_of_alpha_counts_where_the_mask_does_and_fully_late_in_the_run(image: Image) -> None:
+def test_the_error_of_alpha_counts_where_the_mask_does_and_fully_late_in_the_run(
+    image: Image,
+) -> None:
     """Three of four pixels are opaque, nothing is rendered, and the mask ignores one of these."""
     alpha = torch.tensor([[1.0, 1.0], [1.0, 0.0]])
     mask = torch.tensor([[0.0, 1.0], [1.0, 1.0]])

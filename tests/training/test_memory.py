@@ -1,4 +1,5 @@
-"""The forecast of memory: of the right size, told in a line, a warning with what to set where there is too little."""
+"""The forecast of memory: of the right size, told in a line, a warning with what to set where there
+is too little."""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ PLENTY = MemoryForecast(
     longest_side=1000,
 )
 BAND = 0.3, 1.1
-"""Bytes of tensors that a Gaussian adds to the peak of a step, over its forecast; an allocator needs the rest."""
+"""Bytes of tensors that a Gaussian adds to the peak of a step, over its forecast; an allocator
+needs the rest."""
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +70,20 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _config(capture: Path, **changes: object) -> Config:
-    return Config(data=DataConfig(root=capture), init=RandomInit(num_random=60)).model_copy(update=changes)
+    return Config(data=DataConfig(root=capture), init=RandomInit(num_random=60)).model_copy(
+        update=changes
+    )
 
 
-def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     monkeypatch.setattr(memory, "gpu_memory", lambda _: (3 * GB, 8 * GB))
     monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: (2000, 8 * GB))
-    config = _config(capture, strategy=DefaultStrategy(max_gaussians=10**7), train=TrainConfig(steps=30_000))
+    config = _config(
+        capture, strategy=DefaultStrategy(max_gaussians=10**7), train=TrainConfig(steps=30_000)
+    )
     with pretend_gpu():
         trainer = assemble(config)
         gpu, machine = memory_forecasts(trainer)
@@ -106,7 +114,9 @@ def test_a_run_is_forecast_before_it_begins(capture: Path) -> None:
     assert found.all_kept
     assert found.warning() is None
     none = memory_forecast(
-        assemble(_config(capture, data=DataConfig(root=capture, cache_mb=0), strategy=FixedStrategy()))
+        assemble(
+            _config(capture, data=DataConfig(root=capture, cache_mb=0), strategy=FixedStrategy())
+        )
     )
     assert none.images == 45 * 16 * 16, "what decoding one takes"
     assert not none.all_kept
@@ -150,7 +160,13 @@ def _with(forecast: MemoryForecast, advice: str) -> MemoryForecast:
 def test_with_what_a_warning_says_the_run_has_room(
     count: int, images: int, drawing: int, free: int, processes: int
 ) -> None:
-    parts = {"count": count, "images": images, "drawing": drawing, "free": free, "processes": processes}
+    parts = {
+        "count": count,
+        "images": images,
+        "drawing": drawing,
+        "free": free,
+        "processes": processes,
+    }
     forecast = replace(PLENTY, **parts)
     warning = forecast.warning()
     if warning is None:
@@ -167,7 +183,10 @@ def test_the_key_that_limits_the_gaussians_is_that_of_the_run(capture: Path) -> 
     assert found is not None
     side = int(found.split("model.resolution=")[1])
     assert replace(free, count=round(10**7 * (side / 2000) ** 2)).warning() is None
-    assert memory_forecast(assemble(_config(capture, strategy=FixedStrategy()))).limits == ("init.num_random", 60)
+    assert memory_forecast(assemble(_config(capture, strategy=FixedStrategy()))).limits == (
+        "init.num_random",
+        60,
+    )
 
 
 def test_only_what_certainly_does_not_fit_is_refused() -> None:
@@ -192,16 +211,21 @@ def test_random_gaussians_beyond_the_machine_are_refused_before_they_are_made(
     monkeypatch.setattr(memory, "whole_memory", lambda: GB)
     require_room(_config(capture))
     require_room(_config(capture, init=PointsInit()))
-    with pytest.raises(DyngsError, match=r"init[.]num_random=2000000: at least 1[.]9 GB .* gives 1: give .*=529661"):
+    with pytest.raises(
+        DyngsError, match=r"init[.]num_random=2000000: at least 1[.]9 GB .* gives 1: give .*=529661"
+    ):
         require_room(_config(capture, init=RandomInit(num_random=2_000_000)))
 
 
 def _peak(config: Config, steps: int) -> tuple[int, int]:
-    """The most bytes of tensors in a run of ``steps``, in which all may move, and the number of Gaussians."""
+    """The most bytes of tensors in a run of ``steps``, in which all may move, and the number of
+    Gaussians."""
     with TensorBytes() as found:
         trainer = assemble(config)
         if not trainer.model.scene.is_static or trainer.model.scene.times:
-            trainer.model.exchange(trainer.model.training.all_moving(trainer.model.scene, trainer.extent))
+            trainer.model.exchange(
+                trainer.model.training.all_moving(trainer.model.scene, trainer.extent)
+            )
             trainer.done = 25  # past the step at which motion begins
         found.most = found.now
         for _ in range(steps):
@@ -210,7 +234,9 @@ def _peak(config: Config, steps: int) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("kind", ["static", "mcmc", "control_nodes", "mlp", "human"])
-def test_a_gaussian_takes_what_is_forecast_within_the_band(kind: str, request: pytest.FixtureRequest) -> None:
+def test_a_gaussian_takes_what_is_forecast_within_the_band(
+    kind: str, request: pytest.FixtureRequest
+) -> None:
     found = []
     for size in (1, 3):
         match kind:
@@ -231,7 +257,13 @@ def test_a_gaussian_takes_what_is_forecast_within_the_band(kind: str, request: p
                 )
             case _:
                 field = {"kind": kind} | ({"depth": 2, "width": 64} if kind == "mlp" else {})
-                model = {"deform": field, "sh_degree": 1, "motion_from": 0.0, "time_window": 1.0, "freeze_below_px": 0}
+                model = {
+                    "deform": field,
+                    "sh_degree": 1,
+                    "motion_from": 0.0,
+                    "time_window": 1.0,
+                    "freeze_below_px": 0,
+                }
                 config = _config(
                     request.getfixturevalue("moving"),
                     model=DynamicModel.model_validate(model),

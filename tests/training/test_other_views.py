@@ -7,7 +7,17 @@ from typing import Any
 
 import pytest
 import torch
-from flat_wall import BLACK, DISTANCE, SIZE, cameras_before_wall, learned, seen_from, wall, with_block, with_depth
+from flat_wall import (
+    BLACK,
+    DISTANCE,
+    SIZE,
+    cameras_before_wall,
+    learned,
+    seen_from,
+    wall,
+    with_block,
+    with_depth,
+)
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
@@ -17,12 +27,17 @@ from dyngs.models.renderable import Rendering
 from dyngs.training.other_views import FEWEST, OtherViews, grid_of, log_gains
 
 
-def asked(count: int, step: float = 0.15, distance: float = DISTANCE, alpha: float = 1.0) -> torch.Tensor:
-    """Return the differences of other views from what a perfect model shows of view 1, for all of its cells."""
+def asked(
+    count: int, step: float = 0.15, distance: float = DISTANCE, alpha: float = 1.0
+) -> torch.Tensor:
+    """Return the differences of other views from what a perfect model shows of view 1, for all of
+    its cells."""
     cameras = cameras_before_wall(count, step)
     others = OtherViews(seen_from(cameras), cameras)  # type: ignore[arg-type]
     rgb = wall(cameras[1])
-    more = torch.stack([torch.full_like(rgb[..., 0], distance), torch.full_like(rgb[..., 0], alpha)], -1)
+    more = torch.stack(
+        [torch.full_like(rgb[..., 0], distance), torch.full_like(rgb[..., 0], alpha)], -1
+    )
     grid = grid_of(rgb.shape[1], rgb.shape[0])
     drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
     return others.difference(1, torch.ones(grid, dtype=torch.bool), drawn, BLACK).view(grid)
@@ -35,26 +50,32 @@ def test_views_of_one_wall_agree_at_its_depth() -> None:
     assert float(asked(6, distance=2 * DISTANCE)[:, 10:30].max()) > 0.02
 
 
-@pytest.mark.parametrize("case", [{"count": FEWEST}, {"count": 6, "step": 50.0}, {"count": 6, "alpha": 0.3}])
+@pytest.mark.parametrize(
+    "case", [{"count": FEWEST}, {"count": 6, "step": 50.0}, {"count": 6, "alpha": 0.3}]
+)
 def test_where_too_few_see_a_place_nothing_is_known(case: dict[str, float]) -> None:
     assert bool(asked(**case).isinf().all())  # type: ignore[arg-type]
 
 
 def test_colours_lie_on_the_background_and_masked_cells_do_not_count() -> None:
     image = seen_from(cameras_before_wall(1))[0]
-    alpha, mask = (
-        torch.zeros_like(image.rgb_premultiplied[..., 0]),
-        torch.ones_like(image.rgb_premultiplied[..., 0]),
-    )
+    alpha = torch.zeros_like(image.rgb_premultiplied[..., 0])
+    mask = torch.ones_like(image.rgb_premultiplied[..., 0])
     mask[:, :40] = 0
-    empty = type(image)("e", image.cameras, torch.zeros_like(learned(image.cameras)), alpha, mask, None)
-    colours, counts = OtherViews([empty], [image.cameras]).cells_of(0, torch.tensor([0.2, 0.4, 0.6]))  # type: ignore[arg-type]
+    empty = type(image)(
+        "e", image.cameras, torch.zeros_like(learned(image.cameras)), alpha, mask, None
+    )
+    colours, counts = OtherViews([empty], [image.cameras]).cells_of(
+        0, torch.tensor([0.2, 0.4, 0.6])
+    )  # type: ignore[arg-type]
     assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand_as(colours))
     assert not bool(counts[:, :20].any())
     assert bool(counts[:, 20:].all())
 
 
-@pytest.mark.parametrize(("size", "grid"), [((80, 60), (30, 40)), ((60, 80), (40, 30)), ((1000, 3), (1, 40))])
+@pytest.mark.parametrize(
+    ("size", "grid"), [((80, 60), (30, 40)), ((60, 80), (40, 30)), ((1000, 3), (1, 40))]
+)
 def test_the_longest_side_has_so_many_cells(size: tuple[int, int], grid: tuple[int, int]) -> None:
     assert grid_of(*size) == grid
 
@@ -72,7 +93,8 @@ def test_places_are_found_by_cameras_as_they_are_by_now() -> None:
     more = torch.stack([torch.full_like(rgb[..., 0], DISTANCE), torch.ones_like(rgb[..., 0])], -1)
     grid = grid_of(rgb.shape[1], rgb.shape[0])
     drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
-    which, images = torch.ones(grid, dtype=torch.bool), seen_from(right)
+    which = torch.ones(grid, dtype=torch.bool)
+    images = seen_from(right)
     given = OtherViews(images, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
     found = OtherViews(images, wrong, lambda i, _: right[i]).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
     assert torch.equal(found, given)
@@ -87,7 +109,8 @@ def drawn(cameras: Cameras, time: float | None) -> Rendering:
 
 
 def images_with(gains: Tensor) -> Any:
-    """Return images along a wall, so that the first and the last have nothing in common; whites are cut off."""
+    """Return images along a wall, so that the first and the last have nothing in common; whites are
+    cut off."""
     cameras = cameras_before_wall(COUNT, step=0.8)
     return [
         replace(image, rgb_premultiplied=(gain * image.rgb_premultiplied).clamp_max(1))
@@ -105,7 +128,9 @@ def test_gains_of_images_that_only_neighbours_share_places_with() -> None:
 
 
 def test_images_that_agree_have_none() -> None:
-    torch.testing.assert_close(found(images_with(torch.ones(COUNT, 3))), torch.zeros(COUNT, 3), atol=0.01, rtol=0)
+    torch.testing.assert_close(
+        found(images_with(torch.ones(COUNT, 3))), torch.zeros(COUNT, 3), atol=0.01, rtol=0
+    )
 
 
 def test_what_stands_in_front_of_some_does_not_matter() -> None:

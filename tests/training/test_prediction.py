@@ -1,4 +1,5 @@
-"""Training of networks that predict people: the same bytes, exact resuming, bad gradients, rates."""
+"""Training of networks that predict people: the same bytes, exact resuming, bad gradients,
+rates."""
 
 from __future__ import annotations
 
@@ -22,7 +23,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     middle, last = checkpoint_paths(train(config(folder, tmp_path / "whole")))
-    resumed = train(config(folder, tmp_path / "parts"), resume_from=stopped(config(folder, tmp_path / "parts"), 2))
+    resumed = train(
+        config(folder, tmp_path / "parts"),
+        resume_from=stopped(config(folder, tmp_path / "parts"), 2),
+    )
     assert checkpoint_paths(resumed)[-1].read_bytes() == last.read_bytes()
     before, after = (load_checkpoint(path).part("model.network") for path in (middle, last))
     assert any(not torch.equal(before[name], after[name]) for name in before)
@@ -31,7 +35,8 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) ->
 
 
 def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_path: Path) -> None:
-    """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the next step is good."""
+    """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the
+    next step is good."""
     trainer = network_trainer(config(folder, tmp_path))
     trainer.step()
     for count, factor in enumerate((1e25, float("nan")), 1):
@@ -40,10 +45,14 @@ def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_pa
         assert isinstance(loss, torch.Tensor)
         trainer.update(loss, 2)
         assert trainer.bad_gradients == count
-        assert all(torch.equal(x, before[name]) for name, x in trainer.learner.network.state_dict().items())
+        assert all(
+            torch.equal(x, before[name]) for name, x in trainer.learner.network.state_dict().items()
+        )
         trainer.step()
         assert trainer.bad_gradients == count
-        assert not all(torch.equal(x, before[name]) for name, x in trainer.learner.network.state_dict().items())
+        assert not all(
+            torch.equal(x, before[name]) for name, x in trainer.learner.network.state_dict().items()
+        )
 
 
 def test_the_rate_goes_up_and_down() -> None:

@@ -1,4 +1,5 @@
-"""Training where the scene lies on a device of its own: nothing of the CPU gets into it, and it learns the same."""
+"""Training where the scene lies on a device of its own: nothing of the CPU gets into it, and it
+learns the same."""
 
 from __future__ import annotations
 
@@ -48,18 +49,35 @@ DYNAMIC = (
     "init.num_random=300",
 )
 CASES = {
-    "growing": ("static", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.grad_threshold=1e-7")),
-    "mcmc": ("static_mcmc", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.min_opacity=0.09")),
-    "mip": ("mip", "still", (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.grad_threshold=1e-7")),
+    "growing": (
+        "static",
+        "still",
+        (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.grad_threshold=1e-7"),
+    ),
+    "mcmc": (
+        "static_mcmc",
+        "still",
+        (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.min_opacity=0.09"),
+    ),
+    "mip": (
+        "mip",
+        "still",
+        (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.grad_threshold=1e-7"),
+    ),
     "network": ("static", "still", (*STATIC, "colour.kind=network")),
-    "auto colour": ("static", "moving", (*STATIC, "colour.kind=auto")),  # has views enough to hold some out
+    # has views enough to hold some out
+    "auto colour": ("static", "moving", (*STATIC, "colour.kind=auto")),
     "corrections": (
         "static",
         "still",
         (*STATIC, "train.exposure=always", "camera.refine=always", "train.robust=always"),
     ),
     "nodes": ("dynamic", "moving", DYNAMIC),
-    "hexplane": ("dynamic", "moving", (*DYNAMIC, "model.deform.kind=hexplane", "model.deform.resolution=16")),
+    "hexplane": (
+        "dynamic",
+        "moving",
+        (*DYNAMIC, "model.deform.kind=hexplane", "model.deform.resolution=16"),
+    ),
     "human": ("human", "person", ("train.steps=8", "model.resolution=24", "model.fit=false")),
     "ngp": ("ngp", "still", (*NGP, "train.steps=9")),
     "ngp in time": ("ngp", "moving", (*NGP, "train.steps=6", "model.time=true")),
@@ -72,17 +90,21 @@ CASES = {
 def test_it_learns_there_what_it_learns_on_the_cpu(
     name: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same kernels compute, so that not a bit may differ; an operator given tensors of both devices raises."""
+    """The same kernels compute, so that not a bit may differ; an operator given tensors of both
+    devices raises."""
     kind, capture, more = CASES[name]
     config = config_of(kind, request.getfixturevalue(capture), *more)
-    for name, steps in (("EVERY", 2), ("WARM_UP", 4)):  # the second time, at step 6, only some cells are looked at
+    for name, steps in (("EVERY", 2), ("WARM_UP", 4)):
+        # the second time, at step 6, only some cells are looked at
         monkeypatch.setattr(f"dyngs.fields.occupancy.{name}", steps)
     expected = trained(config, monkeypatch, torch.device("cpu")).checkpoint().tensors
     with pretend_gpu():
         trainer = trained(config, monkeypatch, GPU)
         assert all(isinstance(x, OnGpu) for x in trainer.model.leaves)
         found = trainer.checkpoint().tensors
-        assert name not in ("growing", "mcmc", "mip") or len(trainer.model.scene) != 100, "the set was to change"
+        assert name not in ("growing", "mcmc", "mip") or len(trainer.model.scene) != 100, (
+            "the set was to change"
+        )
     assert found.keys() == expected.keys()
     assert [key for key, x in expected.items() if not torch.equal(found[key], x)] == []
 
@@ -90,13 +112,17 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
 def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, steps = people(tmp_path / "people", (1,)), 2
+    folder = people(tmp_path / "people", (1,))
+    steps = 2
 
     def checkpoints(device: torch.device) -> list[Checkpoint]:
         """After the last step but one and the last, which is done on what was stored."""
         monkeypatch.setattr("dyngs.human.prediction.learner.device_for", lambda _: device)
-        config = Config.model_validate({"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}})
-        trainer, resumed = build(config), build(config)
+        config = Config.model_validate(
+            {"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}}
+        )
+        trainer = build(config)
+        resumed = build(config)
         for _ in range(steps - 1):
             trainer.step()
         found = [trainer.checkpoint()]
@@ -108,10 +134,14 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
     with pretend_gpu():
         found = checkpoints(GPU)
     for there, here in zip(found, expected, strict=True):
-        assert [key for key, x in here.tensors.items() if not torch.equal(there.tensors[key], x)] == []
+        assert [
+            key for key, x in here.tensors.items() if not torch.equal(there.tensors[key], x)
+        ] == []
 
 
-def test_a_network_too_large_for_the_kernel_is_computed_by_torch(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_too_large_for_the_kernel_is_computed_by_torch(
+    still: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = config_of("static", still, *STATIC, "colour.kind=network")
     expected = trained(config, monkeypatch, torch.device("cpu")).model.colours.network
     assert expected is not None
@@ -124,10 +154,13 @@ def test_a_network_too_large_for_the_kernel_is_computed_by_torch(still: Path, mo
     torch.testing.assert_close(found, expected.layers[0].weight, rtol=1e-3, atol=1e-4)
 
 
-def test_a_run_goes_on_there_from_a_checkpoint(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_goes_on_there_from_a_checkpoint(
+    still: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = config_of("static", still, *STATIC, "camera.refine=always", "train.exposure=always")
     monkeypatch.setattr("dyngs.kinds.device_for", lambda _: torch.device("cpu"))
-    begun, expected = assemble(config), assemble(config)
+    begun = assemble(config)
+    expected = assemble(config)
     for _ in range(10):
         begun.step()
     stored = begun.checkpoint()
@@ -140,20 +173,24 @@ def test_a_run_goes_on_there_from_a_checkpoint(still: Path, monkeypatch: pytest.
             expected.step()
             resumed.step()
         found = resumed.checkpoint().tensors
-    assert [key for key, x in expected.checkpoint().tensors.items() if not torch.equal(found[key], x)] == []
+    assert [
+        key for key, x in expected.checkpoint().tensors.items() if not torch.equal(found[key], x)
+    ] == []
 
 
 @pytest.mark.parametrize("name", ["static", "nodes", "hexplane", "human", "ngp"])
 def test_how_often_the_host_waits_in_a_step(
     name: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once for the loss; the number of tile entries, which the kernels read back, is not seen here (docs/gpu.md).
+    """Once for the loss; the number of tile entries, which the kernels read back, is not seen here
+    (docs/gpu.md).
 
     Of a field also for the number of samples, and of those that are reached.
     """
     kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
     sizes = {"item": 2, "nonzero": 2} if name == "ngp" else {}
-    long = ("train.steps=60", *([] if sizes else ["strategy.kind=fixed"]))  # nothing but steps happens in those counted
+    # nothing but steps happens in those counted
+    long = ("train.steps=60", *([] if sizes else ["strategy.kind=fixed"]))
     config = config_of(kind, request.getfixturevalue(capture), *more, *long)
     with pretend_gpu() as gpu:
         monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
@@ -168,7 +205,9 @@ def test_how_often_the_host_waits_in_a_step(
         assert queued <= 2 * 12
 
 
-def test_images_that_do_not_fit_there_are_streamed(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_that_do_not_fit_there_are_streamed(
+    still: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = config_of("static", still, *STATIC)
     with pretend_gpu():
         kept = trained(config, monkeypatch, GPU).checkpoint().tensors
@@ -228,9 +267,21 @@ def test_with_limits_and_pruning_it_ends_with_the_same_bytes(
     still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run(name: str) -> list[bytes]:
-        limits = ("budget.max_gaussians=80", "budget.max_mb=0.02", "prune.fraction=0.3", "prune.steps=10")
-        folder = train(config_of("static", still, *STATIC, *limits, f"run.dir={tmp_path / name}", "run.threads=1"))
-        return [checkpoint_paths(folder)[-1].read_bytes(), (folder / EXPORT_FOLDER / SCENE_FILE).read_bytes()]
+        limits = (
+            "budget.max_gaussians=80",
+            "budget.max_mb=0.02",
+            "prune.fraction=0.3",
+            "prune.steps=10",
+        )
+        folder = train(
+            config_of(
+                "static", still, *STATIC, *limits, f"run.dir={tmp_path / name}", "run.threads=1"
+            )
+        )
+        return [
+            checkpoint_paths(folder)[-1].read_bytes(),
+            (folder / EXPORT_FOLDER / SCENE_FILE).read_bytes(),
+        ]
 
     expected = run("cpu")
     monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)

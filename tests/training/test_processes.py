@@ -1,4 +1,5 @@
-"""Several processes: sums in their order, one choice for all, and an error where they have come apart."""
+"""Several processes: sums in their order, one choice for all, and an error where they have come
+apart."""
 
 from __future__ import annotations
 
@@ -17,14 +18,18 @@ def test_views_are_shared_evenly_in_order_and_each_once() -> None:
         fractions = [Processes(rank, size).share(batch) for rank in range(size)]
         assert [view for fraction in fractions for view in fraction] == list(range(batch))
         assert len({len(fraction) for fraction in fractions}) == 1
-    with pytest.raises(DyngsError, match="batch_size=3 views cannot be shared evenly among 2 processes; give a mult"):
+    with pytest.raises(
+        DyngsError,
+        match="batch_size=3 views cannot be shared evenly among 2 processes; give a mult",
+    ):
         Processes(0, 2).share(3)
     with pytest.raises(DyngsError, match="cannot be shared"):
         Processes(0, 2).share(0)
 
 
 def test_alone_nothing_is_exchanged() -> None:
-    alone, x = Processes(), torch.ones(3, requires_grad=True)
+    alone = Processes()
+    x = torch.ones(3, requires_grad=True)
     with alone:
         alone.sum_([x])
         alone.sum_gradients_([x], torch.ones(1))
@@ -35,7 +40,13 @@ def test_alone_nothing_is_exchanged() -> None:
 
 
 def test_what_torchrun_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = {"RANK": "1", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "here", "MASTER_PORT": "1"}
+    names = {
+        "RANK": "1",
+        "WORLD_SIZE": "4",
+        "LOCAL_WORLD_SIZE": "2",
+        "MASTER_ADDR": "here",
+        "MASTER_PORT": "1",
+    }
     for name, value in names.items():
         monkeypatch.delenv(name, raising=False)
         assert numbers_of_torchrun() is None

@@ -102,7 +102,11 @@ class _Lifted(SceneTraining[_LiftedScene]):
         return True
 
     def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
-        penalties = {"height": self.penalty * scene.gaussians.means[:, 2].abs().sum()} if self.penalty else {}
+        penalties = (
+            {"height": self.penalty * scene.gaussians.means[:, 2].abs().sum()}
+            if self.penalty
+            else {}
+        )
         return replace(scene.time_step(image.time), penalties=penalties)
 
     def optimize(self, scene: _LiftedScene, step: int) -> int:
@@ -158,9 +162,12 @@ def test_a_scene_of_another_kind_is_trained(capture: Path) -> None:
 def test_penalties_of_the_training_are_part_of_the_loss(capture: Path) -> None:
     penalizing = _Lifted()
     penalizing.penalty = 0.01
-    plain, penalized = _trained_by(_trainer(capture), _Lifted()), _trained_by(_trainer(capture), penalizing)
+    plain = _trained_by(_trainer(capture), _Lifted())
+    penalized = _trained_by(_trainer(capture), penalizing)
     heights = plain.model.scene.gaussians.means.detach()[:, 2].abs()
-    assert penalized.step().loss == pytest.approx(plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5)
+    assert penalized.step().loss == pytest.approx(
+        plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5
+    )
     for _ in range(20):
         penalized.step()
     assert penalized.model.scene.gaussians.means.detach()[:, 2].abs().mean() < heights.mean()
@@ -203,8 +210,11 @@ class _Exploding(_Lifted):
     def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         if step < 3:
             return super().time_step(scene, image, step)
-        now, factor = scene.gaussians, float("nan")
-        return GaussianTimeStep(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
+        now = scene.gaussians
+        factor = float("nan")
+        return GaussianTimeStep(
+            now.replace(means=now.means * factor, quats=now.quats * factor), image.time
+        )
 
 
 class _Overweight(_Lifted):
@@ -219,18 +229,26 @@ def _stops_in_step_3(trainer: GaussianTrainer) -> str:
     """The error's message; the trainer is left as after step 2."""
     trainer.step()
     trainer.step()
-    before = {name: x.detach().clone() for name, x in trainer.model.scene.gaussians.tensors().items()}
+    before = {
+        name: x.detach().clone() for name, x in trainer.model.scene.gaussians.tensors().items()
+    }
     with pytest.raises(DyngsError) as caught:
         trainer.step()
     assert trainer.done == 2
-    assert all(torch.equal(x, before[name]) for name, x in trainer.model.scene.gaussians.tensors().items())
+    assert all(
+        torch.equal(x, before[name]) for name, x in trainer.model.scene.gaussians.tensors().items()
+    )
     return str(caught.value)
 
 
 @pytest.mark.parametrize("timed", [False, True])
-def test_what_is_not_finite_is_named_in_one_line(capture: Path, tmp_path: Path, timed: bool) -> None:
+def test_what_is_not_finite_is_named_in_one_line(
+    capture: Path, tmp_path: Path, timed: bool
+) -> None:
     """Step, view, attributes, and the time; the parameters stay as they were."""
-    trainer = _trained_by(_trainer(write_timed_capture(tmp_path / "timed") if timed else capture), _Exploding())
+    trainer = _trained_by(
+        _trainer(write_timed_capture(tmp_path / "timed") if timed else capture), _Exploding()
+    )
     time = "(0|0.25|0.5|0.75|1)" if timed else "0"
     assert re.fullmatch(
         rf"step 3, view 'train/r_00\d': the field makes means, quats at {time} not finite; lower .*model\.deform",
@@ -241,7 +259,8 @@ def test_what_is_not_finite_is_named_in_one_line(capture: Path, tmp_path: Path, 
 def test_a_term_that_is_not_finite_is_named_in_one_line(capture: Path) -> None:
     message = _stops_in_step_3(_trained_by(_trainer(capture), _Overweight()))
     assert re.fullmatch(
-        r"step 3, view 'train/r_00\d': the loss term 'height' is inf; lower its weight or rate", message
+        r"step 3, view 'train/r_00\d': the loss term 'height' is inf; lower its weight or rate",
+        message,
     )
 
 
@@ -288,7 +307,11 @@ def test_a_checkpoint_of_another_model_is_refused(capture: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
-        ("exp_avg.means", lambda x: x[1:], r"'exp_avg.means' is float32 \(49, 3\), not float32 \(50, 3\)"),
+        (
+            "exp_avg.means",
+            lambda x: x[1:],
+            r"'exp_avg.means' is float32 \(49, 3\), not float32 \(50, 3\)",
+        ),
         ("exp_avg_sq.sh", lambda x: x[:, :1], "'exp_avg_sq.sh' is float32"),
         ("exp_avg.quats", lambda x: x.double(), "'exp_avg.quats' is float64"),
         ("exp_avg_sq.means", lambda x: x / 0, "'exp_avg_sq.means' holds NaN"),
@@ -309,7 +332,9 @@ def test_a_state_that_does_not_fit_is_one_line(
     path = tmp_path / "checkpoints" / "step_0000001.safetensors"
     path.parent.mkdir()
     tensors = whole.tensors | {name: change(whole.tensors[name])}
-    write_tensors(path, _KIND, {name: x.contiguous() for name, x in tensors.items()}, asdict(whole.info))
+    write_tensors(
+        path, _KIND, {name: x.contiguous() for name, x in tensors.items()}, asdict(whole.info)
+    )
     with pytest.raises(DyngsError, match=said) as caught:
         trainer.restore(load_checkpoint(path))
     assert str(caught.value).startswith(str(path))
@@ -317,7 +342,9 @@ def test_a_state_that_does_not_fit_is_one_line(
     trainer.step()
 
 
-def with_images(capture: Path, out: Path, edit: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None) -> Path:
+def with_images(
+    capture: Path, out: Path, edit: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None
+) -> Path:
     """Return a copy of a capture whose training images are edited, and have a mask."""
     shutil.copytree(capture, out)
     frames = json.loads((out / "transforms_train.json").read_text())
@@ -338,7 +365,8 @@ def trained_state(root: Path) -> dict[str, Tensor]:
 
 
 def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> None:
-    """White counts, black is ignored: other colours below black change nothing, below white they do."""
+    """White counts, black is ignored: other colours below black change nothing, below white they
+    do."""
     mask = np.full((16, 16, 1), 255, np.uint8)
     mask[:, 8:] = 0
 
@@ -359,7 +387,8 @@ def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> N
 
 
 def test_what_is_transparent_is_trained_on_as_background(capture: Path, tmp_path: Path) -> None:
-    """Colours below transparent pixels change nothing, but transparency itself does: the scene must be empty there."""
+    """Colours below transparent pixels change nothing, but transparency itself does: the scene must
+    be empty there."""
 
     def transparent(colour: int, alpha: int) -> Callable[[np.ndarray], np.ndarray]:
         def edit(pixels: np.ndarray) -> np.ndarray:
@@ -370,7 +399,11 @@ def test_what_is_transparent_is_trained_on_as_background(capture: Path, tmp_path
 
     dark, light, opaque = (
         trained_state(with_images(capture, tmp_path / name, edit, None))
-        for name, edit in (("a", transparent(0, 0)), ("b", transparent(200, 0)), ("c", transparent(200, 255)))
+        for name, edit in (
+            ("a", transparent(0, 0)),
+            ("b", transparent(200, 0)),
+            ("c", transparent(200, 255)),
+        )
     )
     assert all(torch.equal(x, light[name]) for name, x in dark.items())
     assert not torch.equal(dark["sh"], opaque["sh"])
@@ -382,9 +415,17 @@ def test_two_equal_views_in_a_step_are_one_seen_twice(tmp_path: Path) -> None:
     states = []
     for batch in (1, 2):
         trainer = _trainer(tmp_path)
-        trainer.config = trainer.config.model_copy(update={"train": TrainConfig(steps=100, batch_size=batch)})
+        trainer.config = trainer.config.model_copy(
+            update={"train": TrainConfig(steps=100, batch_size=batch)}
+        )
         losses = [trainer.step().loss for _ in range(4)]
-        states.append((trainer.model.scene.gaussians.detach().tensors(), trainer.model.densifier.state(), losses))
+        states.append(
+            (
+                trainer.model.scene.gaussians.detach().tensors(),
+                trainer.model.densifier.state(),
+                losses,
+            )
+        )
     (one, seen, losses), (two, twice, others) = states
     assert all(torch.equal(x, two[name]) for name, x in one.items())
     assert torch.equal(2 * seen["seen"], twice["seen"])
@@ -397,26 +438,32 @@ def anything(index: int) -> bool:
 
 
 def test_each_epoch_is_a_new_permutation() -> None:
-    sampler, generator = ViewSampler(20), torch.Generator().manual_seed(0)
+    sampler = ViewSampler(20)
+    generator = torch.Generator().manual_seed(0)
     first, second = ([sampler.next(generator, anything) for _ in range(20)] for _ in range(2))
     assert sorted(first) == sorted(second) == list(range(20))
     assert first != second
 
 
 def test_a_restored_sampler_goes_on_as_if_never_stopped() -> None:
-    sampler, generator = ViewSampler(5), torch.Generator().manual_seed(1)
+    sampler = ViewSampler(5)
+    generator = torch.Generator().manual_seed(1)
     for _ in range(7):
         sampler.next(generator, anything)
-    other, again = ViewSampler(5), torch.Generator()
+    other = ViewSampler(5)
+    again = torch.Generator()
     other.load_state({name: x.clone() for name, x in sampler.state().items()})
     again.set_state(generator.get_state())
-    assert [sampler.next(generator, anything) for _ in range(9)] == [other.next(again, anything) for _ in range(9)]
+    assert [sampler.next(generator, anything) for _ in range(9)] == [
+        other.next(again, anything) for _ in range(9)
+    ]
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.sets(st.integers(0, 9), min_size=1), st.integers(0, 100))
 def test_only_what_is_wanted_is_drawn_and_each_once_per_epoch(wanted: set[int], seed: int) -> None:
-    sampler, generator = ViewSampler(10), torch.Generator().manual_seed(seed)
+    sampler = ViewSampler(10)
+    generator = torch.Generator().manual_seed(seed)
     for _ in range(3):
         epoch = [sampler.next(generator, lambda i: i in wanted) for _ in wanted]
         assert sorted(epoch) == sorted(wanted)
@@ -424,7 +471,8 @@ def test_only_what_is_wanted_is_drawn_and_each_once_per_epoch(wanted: set[int], 
 
 def test_views_that_are_not_wanted_do_not_cost_randomness() -> None:
     """As long as an epoch lasts, whatever is passed over: the generator is drawn from once."""
-    sampler, generator = ViewSampler(6), torch.Generator().manual_seed(0)
+    sampler = ViewSampler(6)
+    generator = torch.Generator().manual_seed(0)
     sampler.next(generator, lambda i: i == 3)
     state = generator.get_state()
     rest = 6 - int(sampler.state()["position"])

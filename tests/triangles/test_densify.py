@@ -48,7 +48,9 @@ def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
     points = found.of("points", patches.points)
     assert len(points) == 12
     torch.testing.assert_close(points[:4], patches.points[:4])
-    assert torch.equal(found.of("harmonics", patches.harmonics)[4:8], patches.harmonics[4].expand(4, -1, -1))
+    assert torch.equal(
+        found.of("harmonics", patches.harmonics)[4:8], patches.harmonics[4].expand(4, -1, -1)
+    )
     moments = found.of_moments("points", torch.ones_like(patches.points))
     assert moments[:4].min() == 1
     assert moments[4:].abs().max() == 0

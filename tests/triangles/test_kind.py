@@ -1,4 +1,5 @@
-"""Curved triangles through the commands: trained, resumed, evaluated, drawn, exported; what is refused, in a line."""
+"""Curved triangles through the commands: trained, resumed, evaluated, drawn, exported; what is
+refused, in a line."""
 
 from __future__ import annotations
 
@@ -48,8 +49,11 @@ def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
 
 
 def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path) -> None:
-    steps = ["train.steps=112", "train.save_every=56"]  # cut right after a change and the first texture
-    run = dyngs.train(config_of(capture, *steps, "model.texture_from=0.5", f"run.dir={tmp_path / 'run'}"))
+    # cut right after a change and the first texture
+    steps = ["train.steps=112", "train.save_every=56"]
+    run = dyngs.train(
+        config_of(capture, *steps, "model.texture_from=0.5", f"run.dir={tmp_path / 'run'}")
+    )
     path = checkpoint_paths(run)[-1]
     whole = path.read_bytes()
     path.unlink()
@@ -63,7 +67,8 @@ def test_it_is_drawn(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_file_of_it_is_as_small_as_asked(capture: Path, tmp_path: Path) -> None:
-    """Half of what its 72 values a triangle take at the usual precision: it begins with fewer, and is no larger."""
+    """Half of what its 72 values a triangle take at the usual precision: it begins with fewer, and
+    is no larger."""
     run = tmp_path / "run"
     keys = ["train.steps=60", "model.gaussian_steps=100", "model.max_triangles=1000"]
     dyngs.train(config_of(capture, *keys, "budget.max_mb=0.0125", f"run.dir={run}"))
@@ -78,7 +83,9 @@ def test_a_file_of_it_is_as_small_as_asked(capture: Path, tmp_path: Path) -> Non
 
 
 def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"budget.max_mb=0.005: has no room for 100 triangles; 0.0098 would do"):
+    with pytest.raises(
+        DyngsError, match=r"budget.max_mb=0.005: has no room for 100 triangles; 0.0098 would do"
+    ):
         dyngs.train(config_of(capture, "budget.max_mb=0.005", f"run.dir={tmp_path / 'run'}"))
     assert not (tmp_path / "run" / "config.yaml").exists()
 
@@ -96,7 +103,9 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
     assert np.ptp(np.asarray(visual.vertex_colors)[:, :3]) > 0
 
 
-def test_its_settings_are_traded(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_settings_are_traded(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("dyngs.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
     out = tmp_path / "tradeoff"
     settings = ("sh_degree=0", "storage=2", "supersampling=1", "scale=0.5", "prune")
@@ -107,9 +116,13 @@ def test_its_settings_are_traded(run: Path, tmp_path: Path, monkeypatch: pytest.
     base = points["as it is"]
     assert base["psnr"] == pytest.approx(evaluate_run(run).psnr)
     assert base["gaussians"] == len(open_run(run).renderable.state()["triangles.points"].tensor)
-    assert points["sh_degree=0"]["mb"] == pytest.approx(base["mb"] * 48 / 72, rel=1e-3)  # and a few bytes
+    # and a few bytes
+    assert points["sh_degree=0"]["mb"] == pytest.approx(base["mb"] * 48 / 72, rel=1e-3)
     assert points["storage=2"]["mb"] < base["mb"] / 2
-    assert all(points[name]["psnr"] != base["psnr"] for name in ("sh_degree=0", "supersampling=1", "scale=0.5"))
+    assert all(
+        points[name]["psnr"] != base["psnr"]
+        for name in ("sh_degree=0", "supersampling=1", "scale=0.5")
+    )
     assert not any("prune" in name for name in points)
     chosen = next((out / "chosen").iterdir())
     assert len(open_run(chosen).renderable.state()["triangles.points"].tensor) == base["gaussians"]
@@ -128,14 +141,28 @@ def test_fewer_triangles_are_trained_for_a_trade(capture: Path, tmp_path: Path) 
     ("command", "said"),
     [
         (["export", "RUN", "--out", "OUT/scene.ply"], "Gaussians"),
-        (["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"], "1 to 64"),
-        (["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"], "radiance field"),
+        (
+            ["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"],
+            "1 to 64",
+        ),
+        (
+            ["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"],
+            "radiance field",
+        ),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
-        (["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"], "model.max_triangles"),
+        (
+            ["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"],
+            "model.max_triangles",
+        ),
     ],
 )
 def test_what_does_not_go_is_refused(
-    run: Path, capture: Path, tmp_path: Path, command: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    run: Path,
+    capture: Path,
+    tmp_path: Path,
+    command: list[str],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = " ".join(command)
     for name, folder in (("RUN", run), ("CAPTURE", capture), ("OUT", tmp_path)):

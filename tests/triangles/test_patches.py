@@ -28,7 +28,9 @@ def test_quarters_are_the_same_surface() -> None:
 
 
 def test_sizes_of_a_right_triangle() -> None:
-    points = torch.cat([triangle((0, 0, 0), (3, 0, 0), (0, 4, 0)), triangle((0, 0, 0), (1, 0, 0), (40, 1, 0))])
+    points = torch.cat(
+        [triangle((0, 0, 0), (3, 0, 0), (0, 4, 0)), triangle((0, 0, 0), (1, 0, 0), (40, 1, 0))]
+    )
     patches = Patches(points, torch.zeros(2, 6, 3), torch.zeros(2, 0, 3))
     torch.testing.assert_close(patches.areas, torch.tensor([6.0, 0.5]))
     torch.testing.assert_close(patches.elongations, torch.tensor([4 / 3, 40.0]))

@@ -1,4 +1,5 @@
-"""Curved triangles drawn: colour, alpha, depth, directions, and edges that stay sharp when enlarged."""
+"""Curved triangles drawn: colour, alpha, depth, directions, and edges that stay sharp when
+enlarged."""
 
 from __future__ import annotations
 
@@ -17,14 +18,18 @@ PLAIN = TriangleOptions()
 def scene_of(*triangles: torch.Tensor) -> TriangleScene:
     """Red ones."""
     points = torch.cat(triangles)
-    return TriangleScene(Patches(points, RED.expand(len(points), 6, 3).clone(), torch.zeros(len(points), 0, 3)), 1.0)
+    return TriangleScene(
+        Patches(points, RED.expand(len(points), 6, 3).clone(), torch.zeros(len(points), 0, 3)), 1.0
+    )
 
 
 SQUARE = triangle((-1, -1, 0), (1, -1, 0), (-1, 1, 0)), triangle((1, 1, 0), (1, -1, 0), (-1, 1, 0))
 
 
 def test_a_square_of_two_triangles_is_opaque_and_of_its_colour() -> None:
-    drawn = scene_of(*SQUARE).render(camera(), background=torch.ones(3), options=replace(PLAIN, depth="expected"))
+    drawn = scene_of(*SQUARE).render(
+        camera(), background=torch.ones(3), options=replace(PLAIN, depth="expected")
+    )
     inside = slice(10, 22)  # of 32: the square covers those from 6.4 to 25.6
     torch.testing.assert_close(drawn.rgb[0, inside, inside], RED.expand(12, 12, 3))
     assert drawn.alpha[0, inside, inside].min() == 1
@@ -51,8 +56,10 @@ def test_area_is_what_is_covered() -> None:
 
 def test_harmonics_tell_directions_apart() -> None:
     patches = bent(1)
-    there, back = camera(), camera()
-    back.cam_from_world[0, 0, 0] = back.cam_from_world[0, 2, 2] = -1  # from behind, half a turn about y
+    there = camera()
+    back = camera()
+    # from behind, half a turn about y
+    back.cam_from_world[0, 0, 0] = back.cam_from_world[0, 2, 2] = -1
     front, behind = (TriangleScene(patches, 1.0).view(x, PLAIN) for x in (there, back))
     assert front.colour.sum() > 0
     assert behind.colour.sum() > 0
@@ -66,7 +73,9 @@ def test_harmonics_tell_directions_apart() -> None:
 def test_gradients_reach_everything() -> None:
     patches = bent(4)
     learned = patches.of({name: x.clone().requires_grad_() for name, x in patches.tensors.items()})
-    TriangleScene(learned, 1.0).render(camera(), background=torch.ones(3)).rgb.square().sum().backward()
+    TriangleScene(learned, 1.0).render(
+        camera(), background=torch.ones(3)
+    ).rgb.square().sum().backward()
     for x in learned.tensors.values():
         assert x.grad is not None
         assert x.grad.abs().sum() > 0
@@ -74,12 +83,19 @@ def test_gradients_reach_everything() -> None:
 
 
 def test_what_has_no_area_is_not_drawn_and_spoils_no_gradient() -> None:
-    """All points equal, on a line, not a number, behind the camera and much larger than the scene, with a good one."""
+    """All points equal, on a line, not a number, behind the camera and much larger than the scene,
+    with a good one."""
     nan = SQUARE[0].clone()
     nan[0, 2, 1] = torch.nan
     wide = triangle((-1e5, 1e5, -9), (1e5, 1e5, -9), (0, -1e5, -9))
-    useless = [triangle(*[(0.2, 0.1, -1)] * 3), triangle((-1, 0, -1), (0, 0, -1), (1, 0, -1)), nan, wide]
-    alone, together = scene_of(SQUARE[0]), scene_of(SQUARE[0], *useless)
+    useless = [
+        triangle(*[(0.2, 0.1, -1)] * 3),
+        triangle((-1, 0, -1), (0, 0, -1), (1, 0, -1)),
+        nan,
+        wide,
+    ]
+    alone = scene_of(SQUARE[0])
+    together = scene_of(SQUARE[0], *useless)
     points = together.patches.points.clone().requires_grad_()
     drawn = replace(together, patches=replace(together.patches, points=points)).render(camera())
     assert torch.equal(drawn.rgb, alone.render(camera()).rgb)
@@ -95,6 +111,8 @@ def test_one_that_is_larger_than_the_scene_fills_the_image() -> None:
 
 
 def test_nothing_in_view_is_the_background() -> None:
-    drawn = scene_of(triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))).render(camera(), background=torch.ones(3))
+    drawn = scene_of(triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))).render(
+        camera(), background=torch.ones(3)
+    )
     assert drawn.rgb.min() == 1
     assert drawn.transmittance.min() == 1

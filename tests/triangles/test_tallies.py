@@ -30,7 +30,8 @@ def test_slopes_are_those_of_a_step() -> None:
 
 
 def test_what_is_seen_is_counted() -> None:
-    places, tallies = places_of(LARGE, BEHIND), Tallies(2)
+    places = places_of(LARGE, BEHIND)
+    tallies = Tallies(2)
     tallies.count(places, torch.ones(16, 16))
     tallies.count(places, torch.zeros(16, 16))
     assert tallies.views == 2
@@ -46,7 +47,8 @@ def test_the_view_that_shows_most_counts() -> None:
     patches = Patches(points, torch.zeros(2, 6, 3), torch.zeros(2, 0, 3))
     scene = TriangleScene(patches, 1.0, TriangleOptions(supersampling=2))
     most = most_pixels(scene, [camera(distance=8), camera(), camera(distance=6)])
-    assert most[0] == pytest.approx(0.5 * 19.2**2, rel=0.03)  # half a square of 2 units, 32 * 1.2 / 4 px each
+    # half a square of 2 units, 32 * 1.2 / 4 px each
+    assert most[0] == pytest.approx(0.5 * 19.2**2, rel=0.03)
     assert most[1] == 0
     assert torch.equal(most, most_pixels(scene, [camera()]))
 

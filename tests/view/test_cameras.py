@@ -10,7 +10,9 @@ from dyngs.camera_paths.aim import look_at
 from dyngs.view.cameras import camera_at, fitting_fov, look_point, nearest_camera, pose_of
 
 
-def looking(eye: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, 0)) -> Cameras:
+def looking(
+    eye: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, 0)
+) -> Cameras:
     pose = np.linalg.inv(look_at(np.array(eye), np.array(target), np.array([0.0, 0, 1])))
     return Cameras(torch.from_numpy(pose).float()[None], camera().intrinsics, 20, 14)
 
@@ -32,7 +34,9 @@ def test_a_window_shows_the_whole_image(aspect: float) -> None:
 
 
 def test_the_point_to_orbit_lies_on_the_axis_as_deep_as_the_scene() -> None:
-    assert look_point(looking((0, -4, 0)), np.array([1.0, 0, 1]), 1.0) == pytest.approx([0, 0, 0], abs=1e-6)
+    assert look_point(looking((0, -4, 0)), np.array([1.0, 0, 1]), 1.0) == pytest.approx(
+        [0, 0, 0], abs=1e-6
+    )
     small = look_point(looking((0, -4e-5, 0)), np.array([1e-5, 0, 1e-5]), 1e-5)
     assert small == pytest.approx([0, 0, 0], abs=1e-10)
     behind = look_point(looking((0, -4, 0)), np.array([0.0, -9, 0]), 2.0)

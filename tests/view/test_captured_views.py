@@ -16,8 +16,11 @@ from dyngs.view.source import open_to_view
 
 def test_a_run_has_the_cameras_and_times_of_its_capture(tmp_path: Path) -> None:
     opened = open_scene(write_moving_run(tmp_path))
-    shown, begin = views_of(opened), viewpoint_of(opened)
-    assert sorted(time for time in shown.times if time is not None) == sorted(TRAIN_TIMES + TEST_TIMES)
+    shown = views_of(opened)
+    begin = viewpoint_of(opened)
+    assert sorted(time for time in shown.times if time is not None) == sorted(
+        TRAIN_TIMES + TEST_TIMES
+    )
     assert not opened.scene.is_static
     assert has_timeline(opened)
     assert torch.equal(begin.start.cam_from_world, shown.cameras[0].cam_from_world)

@@ -41,11 +41,16 @@ class Handle:
 
 
 class Played:
-    """A browser that is played: its widgets by name, its marks, what it was told, the files that it got."""
+    """A browser that is played: its widgets by name, its marks, what it was told, the files that it
+    got."""
 
     def __init__(self, opened: Opened) -> None:
         self.widgets, self.marks = dict[str, Handle](), dict[str, Handle]()
-        self.told, self.files, self.clicked = list[str](), dict[str, bytes](), list[Callable[[Any], None]]()
+        self.told, self.files, self.clicked = (
+            list[str](),
+            dict[str, bytes](),
+            list[Callable[[Any], None]](),
+        )
         gui = SimpleNamespace(
             add_checkbox=lambda name, value, **_: self._widget(name, value),
             add_slider=lambda name, low, high, step, value, **_: self._widget(name, value),
@@ -90,7 +95,9 @@ class Played:
         """Click where the point ``target`` is seen."""
         assert self.session.eye is not None
         origin = np.array(self.session.eye.position)
-        event = SimpleNamespace(ray_origin=tuple(origin), ray_direction=tuple(np.array(target) - origin))
+        event = SimpleNamespace(
+            ray_origin=tuple(origin), ray_direction=tuple(np.array(target) - origin)
+        )
         for call in self.clicked:
             call(event)
         self.work()
@@ -133,7 +140,9 @@ def test_a_box_deletes_and_undo_brings_back(played: Played) -> None:
     gizmo.click()
     assert played.marks["/edit/box"].position.tolist() == [1, 0, 0]
     edges = played.marks["/edit/box"].value
-    np.testing.assert_allclose(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1), [0.9] * 12, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1), [0.9] * 12, atol=1e-6
+    )
     gizmo.position = (np.nan, 0.0, 0.0)
     gizmo.click()
     played.press("Delete inside")

@@ -23,7 +23,9 @@ from dyngs.view.editing import Editing, looking_along, picked
 from dyngs.view.layers import Shot
 
 
-def editing(opened: Opened, centre: tuple[float, float, float] = (0.5, 0.0, 0.0), size: float = 1.2) -> Editing:
+def editing(
+    opened: Opened, centre: tuple[float, float, float] = (0.5, 0.0, 0.0), size: float = 1.2
+) -> Editing:
     return Editing(opened, np.array(centre), np.full(3, size))
 
 
@@ -35,14 +37,21 @@ def wall() -> Opened:
     n = len(means)
     scales = torch.log(torch.tensor([0.03, 0.03, 1e-3])).repeat(n, 1)
     quats = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
-    return opened_scene(StaticScene(gaussians=Gaussians(means, quats, scales, torch.full((n,), 6.0), means[:, None])))
+    return opened_scene(
+        StaticScene(
+            gaussians=Gaussians(means, quats, scales, torch.full((n,), 6.0), means[:, None])
+        )
+    )
 
 
 @pytest.mark.parametrize(
     ("aim", "error"), [((0.3, 0.2, 2.0), 0.003), ((0.8, 0.1, 2.0), 0.03), ((1.5, -0.6, 2.0), 0.03)]
 )
-def test_a_ray_meets_the_wall_where_geometry_says(wall: Opened, aim: tuple[float, float, float], error: float) -> None:
-    """From the side to the size of its Gaussians, 0.03, of which the nearer ones cover the others."""
+def test_a_ray_meets_the_wall_where_geometry_says(
+    wall: Opened, aim: tuple[float, float, float], error: float
+) -> None:
+    """From the side to the size of its Gaussians, 0.03, of which the nearer ones cover the
+    others."""
     origin = np.array([0.3, 0.2, -1.0])
     found = picked(wall, origin, 5 * (np.array(aim) - origin), 0.002)
     assert found is not None
@@ -60,7 +69,9 @@ def test_the_camera_of_a_ray_looks_along_it(direction: tuple[float, float, float
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_quat(looking_along(np.array(direction))[[1, 2, 3, 0]])
-    np.testing.assert_allclose(turn.apply([0, 0, 1]), np.array(direction) / np.linalg.norm(direction), atol=1e-12)
+    np.testing.assert_allclose(
+        turn.apply([0, 0, 1]), np.array(direction) / np.linalg.norm(direction), atol=1e-12
+    )
 
 
 def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
@@ -73,7 +84,9 @@ def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, [x, 0, 0], atol=0.02)
 
 
-def test_coordinates_far_from_the_origin_are_told_to_a_thousandth_of_the_box(tmp_path: Path) -> None:
+def test_coordinates_far_from_the_origin_are_told_to_a_thousandth_of_the_box(
+    tmp_path: Path,
+) -> None:
     opened = open_run(write_moving_run(tmp_path, moves=False, offset=(500_000.0, 4_600_000.0, 0.0)))
     work = editing(opened, (500_000.5, 4_600_000.0, 0.0))
     assert "box: `--crop 499999.9,4599999.4,-0.6 500001.1,4600000.6,0.6`" in work.said
@@ -82,7 +95,10 @@ def test_coordinates_far_from_the_origin_are_told_to_a_thousandth_of_the_box(tmp
 def test_distances_are_in_metres_where_the_scene_has_a_scale(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, moves=False)
     edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.5)), tell=lambda _: None)
-    for folder, said in ((run, "distance: **2 units**"), (tmp_path / "scaled", "distance: **5 m**")):
+    for folder, said in (
+        (run, "distance: **2 units**"),
+        (tmp_path / "scaled", "distance: **5 m**"),
+    ):
         work = editing(open_run(folder))
         for x in (-1.0, 1.0):
             work.pick(np.array([x, 0.0, 0.0]))
@@ -95,7 +111,8 @@ def test_distances_are_in_metres_where_the_scene_has_a_scale(tmp_path: Path) -> 
 def test_deletions_in_the_coordinates_of_the_frame_and_back(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, moves=False)
     edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.0)), tell=lambda _: None)
-    work = editing(open_run(tmp_path / "scaled"), (1.0, 0.0, 0.0), 2.2)  # x from -0.05 to 1.05 in the scene
+    # x from -0.05 to 1.05 in the scene
+    work = editing(open_run(tmp_path / "scaled"), (1.0, 0.0, 0.0), 2.2)
     assert "box: `--crop -0.1,-1.1,-1.1 2.1,1.1,1.1`" in work.said
     assert work.delete(inside=True) == 3
     assert work.left.scene.gaussians.means[:, 0].tolist() == [-1.0, -0.5]
@@ -113,13 +130,15 @@ def test_deletions_in_the_coordinates_of_the_frame_and_back(tmp_path: Path) -> N
 
 
 def test_what_is_saved(tmp_path: Path) -> None:
-    """Of a run in its frame, at the time that is shown; of a file all that its header says; both stay as they are."""
+    """Of a run in its frame, at the time that is shown; of a file all that its header says; both
+    stay as they are."""
     run = write_moving_run(tmp_path)
     work = editing(open_run(run), (1.0, 0.0, 0.0), 0.4)
     work.delete(inside=True)
     (tmp_path / "a.ply").write_bytes(work.file(0.75))
     saved = read_splats(tmp_path / "a.ply").gaussians.means
-    torch.testing.assert_close(saved[:, 0], moved_x((0, 1, 2), 0.75), rtol=0, atol=1e-5)  # the fourth goes through it
+    # the fourth goes through it
+    torch.testing.assert_close(saved[:, 0], moved_x((0, 1, 2), 0.75), rtol=0, atol=1e-5)
     assert len(open_run(run).scene) == 5
     still = write_moving_run(tmp_path / "still", moves=False)
     edit_scene(still, tmp_path / "up", Edits(frame=Frame(scale=2.0)), tell=lambda _: None)
@@ -138,7 +157,9 @@ def test_what_is_saved(tmp_path: Path) -> None:
 def test_points_of_a_file_are_in_its_own_coordinates(tmp_path: Path) -> None:
     """Also where the file says how it was turned, as `dyngs edit` takes them."""
     opened = open_run(write_moving_run(tmp_path, moves=False, offset=(100.0, 0.0, 0.0)))
-    file = write_run_splats(opened, tmp_path / "a.ply", how=Writing((0.5, 0.5, -0.5, 0.5), "-y")).path
+    file = write_run_splats(
+        opened, tmp_path / "a.ply", how=Writing((0.5, 0.5, -0.5, 0.5), "-y")
+    ).path
     work = editing(open_scene(file), (0.0, 0.0, 0.0), 0.2)
     assert work.whole.world != Similarity()
     assert "`--crop -0.1,-0.1,-0.1 0.1,0.1,0.1`" in work.said

@@ -8,7 +8,9 @@ from dyngs.errors import DyngsError
 from dyngs.view.gate import COOKIE, Gate, free_port, gate_for, guarded, is_loopback, link_to
 
 
-@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:9", "127.0.0.2:8080"])
+@pytest.mark.parametrize(
+    "host", ["localhost:8080", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:9", "127.0.0.2:8080"]
+)
 def test_this_machine_may_open_the_page(host: str) -> None:
     assert Gate().refusal("/", {"Host": host}) is None
     assert Gate().refusal("/", {"Host": host, "Origin": f"http://{host}"}) is None
@@ -18,7 +20,8 @@ def test_this_machine_may_open_the_page(host: str) -> None:
     "headers",
     [
         {"Host": "evil.example:8080"},  # a name that was made to point here
-        {"Host": "localhost:8080", "Origin": "https://evil.example"},  # a page of others that opens a websocket
+        # a page of others that opens a websocket
+        {"Host": "localhost:8080", "Origin": "https://evil.example"},
         {"Host": "localhost:8080", "Origin": "null"},
         {},
     ],
@@ -28,7 +31,8 @@ def test_pages_of_others_may_not(headers: dict[str, str]) -> None:
 
 
 def test_with_a_token_only_who_has_it_may() -> None:
-    gate, other = Gate("secret"), {"Host": "box:8080"}
+    gate = Gate("secret")
+    other = {"Host": "box:8080"}
     assert gate.refusal("/?token=secret", other) is None
     assert gate.refusal("/", other | {"Cookie": f"a=b; {COOKIE}=secret"}) is None
     for path, headers in (
@@ -49,7 +53,8 @@ def test_only_a_server_for_others_has_a_token() -> None:
     assert [is_loopback(host) for host in ("localhost", "127.0.0.1", "::1")] == [True] * 3
     assert [is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.7", "box")] == [False] * 4
     assert gate_for("127.0.0.1").token is None
-    first, second = gate_for("0.0.0.0").token, gate_for("0.0.0.0").token
+    first = gate_for("0.0.0.0").token
+    second = gate_for("0.0.0.0").token
     assert first is not None
     assert len(first) >= 24
     assert first != second
@@ -91,7 +96,9 @@ def test_the_server_asks_the_gate() -> None:
     from websockets.sync.client import connect
 
     with guarded(Gate("secret")):
-        server = viser.ViserServer(host="127.0.0.1", port=free_port("127.0.0.1", None), verbose=False)
+        server = viser.ViserServer(
+            host="127.0.0.1", port=free_port("127.0.0.1", None), verbose=False
+        )
     try:
         page = f"http://127.0.0.1:{server.get_port()}/"
         with pytest.raises(urllib.error.HTTPError) as refused:

@@ -16,7 +16,16 @@ from dyngs.runs.opened import Opened, open_run
 from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
 from dyngs.view.captured_views import views_of
-from dyngs.view.layers import LAYERS, PARTS, Shot, coarser, draw, motion_colours, shows_filled, truth_in_window
+from dyngs.view.layers import (
+    LAYERS,
+    PARTS,
+    Shot,
+    coarser,
+    draw,
+    motion_colours,
+    shows_filled,
+    truth_in_window,
+)
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +61,13 @@ def test_a_gpu_draws_every_layer_alike(run: Opened, layer: str) -> None:
         assert np.array_equal(a, b)
 
 
-def test_many_gaussians_are_drawn_in_levels_while_anything_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(levels, "BLOCK", 16)
     whole = opened_at(StaticScene(gaussians=cloud(2000)))
-    opened, shot = coarser(whole, 300), Shot(camera(80, 56))
+    opened = coarser(whole, 300)
+    shot = Shot(camera(80, 56))
     assert "at most 300 Gaussians" in opened.notes[-1]
     few = render_frame(LevelScene.of(whole.renderable, 300), camera(80, 56), None).rgb
     coarse = draw(opened, replace(shot, is_moving=True))
@@ -74,7 +86,10 @@ def test_what_moves_has_no_levels() -> None:
 
 
 def test_parts_together_are_all() -> None:
-    seen = {part: draw(balls(), Shot(camera(80, 56), 0.0, "alpha", part))[..., 0] > 128 for part in PARTS}
+    seen = {
+        part: draw(balls(), Shot(camera(80, 56), 0.0, "alpha", part))[..., 0] > 128
+        for part in PARTS
+    }
     assert np.array_equal(seen["all"], seen["moving"] | seen["still"])
     assert 0 < seen["moving"].sum() < seen["all"].sum()
 
@@ -115,7 +130,9 @@ def test_the_line_divides_render_and_truth(run: Opened) -> None:
     def shown(divide: float) -> np.ndarray:
         return draw(run, Shot(camera(64, 64), 0.0, view=2, divide=divide))
 
-    both, render, truth = shown(0.5), shown(1.0), shown(0.0)
+    both = shown(0.5)
+    render = shown(1.0)
+    truth = shown(0.0)
     assert np.array_equal(both[:, :31], render[:, :31])
     assert np.array_equal(both[:, 33:], truth[:, 33:])
     assert not np.array_equal(render, truth)

@@ -10,11 +10,14 @@ from dyngs.view.markdown import as_text
 
 
 @pytest.mark.parametrize(
-    "text", ["plain words", "Größe 12", "a_b*c <i>x</i> [y](z) `q` {k} &lt; \\ #|~", string.punctuation]
+    "text",
+    ["plain words", "Größe 12", "a_b*c <i>x</i> [y](z) `q` {k} &lt; \\ #|~", string.punctuation],
 )
 def test_every_mark_is_escaped_and_nothing_else(text: str) -> None:
     shown = as_text(text)
-    assert shown == "".join(f"\\{c}" if c in string.punctuation else c for c in text).replace("\\@", "\u200b\\@")
+    assert shown == "".join(f"\\{c}" if c in string.punctuation else c for c in text).replace(
+        "\\@", "\u200b\\@"
+    )
 
 
 def test_it_is_one_line_without_addresses() -> None:

@@ -3,8 +3,11 @@ import pytest
 from dyngs.view.pace import SMALLEST_AREA, Pace, size_within
 
 
-def run(pace: Pace, fixed: float, per_pixel: float, full: int = 800 * 600, count: int = 40) -> float:
-    """The area that settles where an image takes ``fixed + per_pixel * pixels`` seconds, refined now and then."""
+def run(
+    pace: Pace, fixed: float, per_pixel: float, full: int = 800 * 600, count: int = 40
+) -> float:
+    """The area that settles where an image takes ``fixed + per_pixel * pixels`` seconds, refined
+    now and then."""
     for i in range(count):
         area = pace.next_area(full, None)
         pace.observe(area, fixed + per_pixel * area, is_refined=False)
@@ -23,7 +26,8 @@ def test_a_fast_scene_is_always_drawn_whole() -> None:
 
 def test_images_do_not_vanish_where_gaussians_take_all_the_time() -> None:
     area = run(Pace(0.07), 0.2, 1e-6)
-    assert area == pytest.approx(0.1 / 1e-6, rel=0.1)  # half as long for the pixels as for the Gaussians
+    # half as long for the pixels as for the Gaussians
+    assert area == pytest.approx(0.1 / 1e-6, rel=0.1)
 
 
 def test_a_hopeless_scene_keeps_the_smallest_images() -> None:
@@ -31,9 +35,12 @@ def test_a_hopeless_scene_keeps_the_smallest_images() -> None:
 
 
 def test_a_still_image_is_refined_in_steps_up_to_the_whole() -> None:
-    pace, area, steps = Pace(0.07), 20_000.0, 0
+    pace = Pace(0.07)
+    area = 20_000.0
+    steps = 0
     while area < 1_000_000:
-        area, steps = pace.next_area(1_000_000, area), steps + 1
+        area = pace.next_area(1_000_000, area)
+        steps = steps + 1
     assert area == 1_000_000
     assert steps == 3
 
@@ -44,6 +51,8 @@ def test_no_image_takes_longer_than_the_longest() -> None:
     assert pace.largest == pytest.approx(0.25 / 1e-6, rel=0.05)
 
 
-@pytest.mark.parametrize(("area", "size"), [(1e9, (800, 600)), (120_000, (400, 300)), (1, (16, 16))])
+@pytest.mark.parametrize(
+    ("area", "size"), [(1e9, (800, 600)), (120_000, (400, 300)), (1, (16, 16))]
+)
 def test_size_keeps_the_aspect(area: float, size: tuple[int, int]) -> None:
     assert size_within((800, 600), area) == size

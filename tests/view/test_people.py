@@ -8,7 +8,16 @@ from view_sessions import opened_at
 
 from dyngs.errors import DyngsError
 from dyngs.runs.opened import Opened
-from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion, joint_row, motion_files, posed
+from dyngs.view.people import (
+    AS_CAPTURED,
+    AT_REST,
+    BY_SLIDERS,
+    MAIN_JOINTS,
+    in_motion,
+    joint_row,
+    motion_files,
+    posed,
+)
 
 
 @pytest.fixture
@@ -25,7 +34,9 @@ def test_sliders_at_zero_are_the_rest_pose(opened: Opened) -> None:
 
 
 def test_a_turned_joint_moves_some_of_the_person(opened: Opened) -> None:
-    rest, turned = (posed(opened, angles).scene.at(None).means for angles in ({}, {"pelvis": (0.0, 90.0, 0.0)}))
+    rest, turned = (
+        posed(opened, angles).scene.at(None).means for angles in ({}, {"pelvis": (0.0, 90.0, 0.0)})
+    )
     assert float((turned - rest).norm(dim=1).max()) > 1e-3
     back = posed(opened, {"pelvis": (0.0, 360.0, 0.0)}).scene.at(None).means
     assert torch.allclose(back, rest, atol=1e-4)

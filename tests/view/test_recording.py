@@ -19,9 +19,15 @@ def at_depth(depth: float) -> Cameras:
 
 
 @pytest.mark.parametrize("loops", [False, True])
-def test_dyngs_render_reads_what_was_recorded_and_sees_what_was_previewed(tmp_path: Path, loops: bool) -> None:
+def test_dyngs_render_reads_what_was_recorded_and_sees_what_was_previewed(
+    tmp_path: Path, loops: bool
+) -> None:
     offset = np.array([10.0, -20, 5])
-    keys = (Keyframe(at_depth(4), 0.0, 1.0), Keyframe(at_depth(6), 0.5, 2.0), Keyframe(at_depth(3), 1.0, 1.0))
+    keys = (
+        Keyframe(at_depth(4), 0.0, 1.0),
+        Keyframe(at_depth(6), 0.5, 2.0),
+        Keyframe(at_depth(3), 1.0, 1.0),
+    )
     recording = Recording(keys, loops)
     assert recording.duration == (4.0 if loops else 3.0)
     file = tmp_path / "path.json"
@@ -33,12 +39,17 @@ def test_dyngs_render_reads_what_was_recorded_and_sees_what_was_previewed(tmp_pa
     for frame in (0, 7, 10, 25, len(path) - 1):
         shown, time = recording.at(frame / 10)
         assert time == pytest.approx(path.times[frame], abs=1e-6)
-        assert torch.allclose(path.cameras.cam_from_world[frame], shown.cam_from_world[0], atol=1e-4)
-        assert path.cameras.intrinsics[frame, 1, 1] == pytest.approx(float(shown.intrinsics[0, 1, 1]) / 2)
+        assert torch.allclose(
+            path.cameras.cam_from_world[frame], shown.cam_from_world[0], atol=1e-4
+        )
+        assert path.cameras.intrinsics[frame, 1, 1] == pytest.approx(
+            float(shown.intrinsics[0, 1, 1]) / 2
+        )
 
 
 def test_a_path_through_a_moved_scene_is_in_the_axes_of_the_capture(tmp_path: Path) -> None:
-    turned, offset = Similarity((0.5, 0.5, -0.5, 0.5), 2.0), np.array([1.0, 2, 3])
+    turned = Similarity((0.5, 0.5, -0.5, 0.5), 2.0)
+    offset = np.array([1.0, 2, 3])
     file = tmp_path / "path.json"
     one = Recording((Keyframe(at_depth(4), None),))
     file.write_text(one.moved(turned.inverse()).document((40, 28), 30.0, offset))

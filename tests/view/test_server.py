@@ -63,7 +63,8 @@ def until(is_so: Callable[[], bool], page: Page | None = None, seconds: float = 
 def opened(viewer: Viewer, browser: Browser) -> tuple[Page, Browsing]:
     """A page whose image is complete."""
     known = viewer.browsing
-    page = browser.open(f"{viewer.link}?fixedDpr=1", *SIZE)  # viser draws fewer pixels where the browser is slow
+    # viser draws fewer pixels where the browser is slow
+    page = browser.open(f"{viewer.link}?fixedDpr=1", *SIZE)
     until(lambda: len(viewer.browsing) > len(known), page)
     (browsing,) = [one for one in viewer.browsing if one not in known]
     settle(page, browsing)
@@ -71,14 +72,16 @@ def opened(viewer: Viewer, browser: Browser) -> tuple[Page, Browsing]:
 
 
 def settle(page: Page, browsing: Browsing) -> None:
-    """Wait until the controls are in their place, nothing is left to be drawn, and the page has shown it."""
+    """Wait until the controls are in their place, nothing is left to be drawn, and the page has
+    shown it."""
     until(lambda: browsing.session.eye is not None and browsing.session.eye.size[0] < SIZE[0], page)
     until(lambda: browsing.num_sent > 0 and browsing.session.due() is None, page)
     page.driven.wait_for_timeout(600)
     for close in page.driven.locator(".mantine-Notification-closeButton").all():
         close.click()  # viser says, before the image, that there is no GPU
     until(lambda: browsing.session.due() is None, page)
-    until(lambda: bool((page.screenshot()[-5, 300] >= 254).all()), page)  # no longer dimmed, as before it is connected
+    # no longer dimmed, as before it is connected
+    until(lambda: bool((page.screenshot()[-5, 300] >= 254).all()), page)
 
 
 def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
@@ -101,10 +104,17 @@ def likeness(one: np.ndarray, other: np.ndarray) -> float:
 def test_impossible_cameras_are_ignored_and_said_once() -> None:
     told: list[str] = []
     camera = SimpleNamespace(
-        wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=0.7, image_width=0, image_height=0, look_at=None
+        wxyz=np.array([1.0, 0, 0, 0]),
+        position=np.zeros(3),
+        fov=0.7,
+        image_width=0,
+        image_height=0,
+        look_at=None,
     )
     client: Any = SimpleNamespace(
-        camera=camera, atomic=nullcontext, add_notification=lambda title, body, **_: told.append(title)
+        camera=camera,
+        atomic=nullcontext,
+        add_notification=lambda title, body, **_: told.append(title),
     )
     browsing = Browsing(client, balls(), Pace(1 / 14))
     browsing.go_to(None)  # a window without a size
@@ -137,11 +147,14 @@ def test_the_page_shows_what_render_draws_at_every_time(
     assert likeness(last[SEEN], first[SEEN]) < likeness(last[SEEN], later[SEEN])
     assert np.abs(later[SEEN].astype(int) - truth[SEEN]).mean() > 0.1  # something has moved
     assert page.errors == []
-    assert {address.split("/")[2] for address in page.requests} == {viewer.link.split("/")[2]}  # no other host
+    # no other host
+    assert {address.split("/")[2] for address in page.requests} == {viewer.link.split("/")[2]}
     page.close()
 
 
-def test_two_browsers_have_cameras_of_their_own_and_one_may_go(viewer: Viewer, browser: Browser) -> None:
+def test_two_browsers_have_cameras_of_their_own_and_one_may_go(
+    viewer: Viewer, browser: Browser
+) -> None:
     (one, first), (two, second) = opened(viewer, browser), opened(viewer, browser)
     threads = threading.active_count()
     before = second.session.eye
@@ -196,17 +209,22 @@ def hostile_run(folder: Path) -> Path:
             frame["file_path"] = name
         file.write_text(json.dumps(document))
     config = run / "config.yaml"
-    config.write_text(config.read_text().replace(f"root: {folder / 'capture'}", f"root: {json.dumps(str(root))}"))
+    config.write_text(
+        config.read_text().replace(f"root: {folder / 'capture'}", f"root: {json.dumps(str(root))}")
+    )
     return run
 
 
 def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: Path) -> None:
-    """Names of the run and of views, and the folder of the capture, in a note because it is gone."""
+    """Names of the run and of views, and the folder of the capture, in a note because it is
+    gone."""
     run = hostile_run(tmp_path)
     other = write_moving_run(tmp_path / "other")
     config = other / "config.yaml"
     gone = f"/nowhere/{FRAME} {SCRIPT} {LINKS}"
-    config.write_text(re.sub(r"root: .*", lambda _: f"root: {json.dumps(gone)}", config.read_text(), count=1))
+    config.write_text(
+        re.sub(r"root: .*", lambda _: f"root: {json.dumps(gone)}", config.read_text(), count=1)
+    )
     for folder, wanted in ((run, "truth: "), (other, "without the capture")):
         source = open_source(folder)
         with Viewer(source, source.load(source.names[0]), Serving()) as viewer:
@@ -218,12 +236,24 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
                 notify(browsing.client, SCRIPT, FRAME)
             else:
                 page.click("text=Help")
-            until(lambda page=page, wanted=wanted: wanted in page.evaluate("document.body.textContent"), page)
+            until(
+                lambda page=page, wanted=wanted: (
+                    wanted in page.evaluate("document.body.textContent")
+                ),
+                page,
+            )
             page.driven.wait_for_timeout(500)
             text = page.evaluate("document.body.textContent").replace("\u200b", "")
             assert SCRIPT in text
             assert "![b](x) <a href=http:" in text
             assert page.evaluate("window.ran") is None
-            assert page.evaluate("document.querySelectorAll('iframe, img[src=x], a[href*=evil]').length") == 0
-            assert not [address for address in page.requests if "evil" in address or address.endswith("/x")]
+            assert (
+                page.evaluate(
+                    "document.querySelectorAll('iframe, img[src=x], a[href*=evil]').length"
+                )
+                == 0
+            )
+            assert not [
+                address for address in page.requests if "evil" in address or address.endswith("/x")
+            ]
             page.close()

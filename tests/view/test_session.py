@@ -74,7 +74,9 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
 
 def test_only_what_moves_may_be_coarser(monkeypatch: pytest.MonkeyPatch) -> None:
     shots: list[Shot] = []
-    monkeypatch.setattr(session, "draw", lambda opened, shot: shots.append(shot) or draw(opened, shot))
+    monkeypatch.setattr(
+        session, "draw", lambda opened, shot: shots.append(shot) or draw(opened, shot)
+    )
     looked = Looked()
     looked.session.move(eye())
     looked.after(0)
@@ -154,10 +156,14 @@ def test_a_preview_shows_the_recorded_cameras_and_then_the_browser_s_own() -> No
     assert torch.allclose(shot.camera.cam_from_world, far.cam_from_world, atol=1e-6)
     assert shot.time == pytest.approx(0.5)
     looked.after(2)
-    assert torch.allclose(looked.session.shot().camera.cam_from_world, eye().camera().cam_from_world)
+    assert torch.allclose(
+        looked.session.shot().camera.cam_from_world, eye().camera().cam_from_world
+    )
 
 
-def test_an_error_is_not_drawn_again_until_something_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_is_not_drawn_again_until_something_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     looked = Looked()
     looked.session.move(eye())
     monkeypatch.setattr("dyngs.view.session.draw", lambda *_: 1 / 0)
@@ -168,7 +174,8 @@ def test_an_error_is_not_drawn_again_until_something_changes(monkeypatch: pytest
 
 
 def test_of_jobs_of_a_kind_the_newest_is_done() -> None:
-    looked, done = Looked(), list[int]()
+    looked = Looked()
+    done = list[int]()
     looked.session.move(eye())
     for number in (1, 2, 3):
         looked.session.ask(lambda number=number: done.append(number), "pose")

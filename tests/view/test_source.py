@@ -27,7 +27,9 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
 
 
 def test_levels_are_for_still_scenes(tmp_path: Path) -> None:
-    still, moving = (write_moving_run(tmp_path / name, moves=name == "moving") for name in ("still", "moving"))
+    still, moving = (
+        write_moving_run(tmp_path / name, moves=name == "moving") for name in ("still", "moving")
+    )
     assert "at most 9 Gaussians" in first_of(open_source(still, most=9)).notes[-1]
     with pytest.raises(DyngsError, match="for still scenes"):
         first_of(open_source(moving, most=9))
@@ -44,8 +46,15 @@ def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a person, and a network that has hardly been trained on them."""
     root = tmp_path_factory.mktemp("network")
-    options = [f"data.root={people(root / 'people', (1,))}", f"run.dir={root / 'net'}", "train.steps=1"]
-    options += [f"model.{name}={getattr(NET, name)}" for name in ("resolution", "source_views", "target_views")]
+    options = [
+        f"data.root={people(root / 'people', (1,))}",
+        f"run.dir={root / 'net'}",
+        "train.steps=1",
+    ]
+    options += [
+        f"model.{name}={getattr(NET, name)}"
+        for name in ("resolution", "source_views", "target_views")
+    ]
     options += ["model.source_sets=1", "model.widths=[8, 8]", "run.threads=1"]
     dyngs.train(dyngs.load_config("human_predictor", options))
     return root

@@ -15,11 +15,13 @@ from dyngs.view.training import DrawnBetweenSteps, opened_training
 
 
 class Onlooker:
-    """A browser without a browser: it looks at the training from the second step on, and never keeps still."""
+    """A browser without a browser: it looks at the training from the second step on, and never
+    keeps still."""
 
     def __init__(self) -> None:
         self.drawer = Drawer(lambda session, message: pytest.fail(message))
-        ticks = itertools.count(step=100.0)  # an image is due after each step, however fast the machine is
+        # an image is due after each step, however fast the machine is
+        ticks = itertools.count(step=100.0)
         self.clock = lambda: next(ticks)
         self.drawn = DrawnBetweenSteps(self.drawer, fraction=0.9, clock=self.clock)
         self.seen: list[bytes] = []
@@ -31,7 +33,9 @@ class Onlooker:
                 assert isinstance(trainer, Trainer)
                 if event.step == 2:
                     first = opened_training(trainer)
-                    session = Session(first, lambda sent: self.seen.append(sent.image.tobytes()), clock=self.clock)
+                    session = Session(
+                        first, lambda sent: self.seen.append(sent.image.tobytes()), clock=self.clock
+                    )
                     self.drawer.add(session)
                 for session in self.drawer.sessions:
                     session.change(divide=event.step / 1000)
@@ -43,10 +47,16 @@ class Onlooker:
 
 
 @pytest.mark.parametrize("preset", ["static", "dynamic"])
-def test_training_gives_the_same_bytes_whoever_looks(preset: str, tmp_path: Path, still: Path, moving: Path) -> None:
-    onlooker, found = Onlooker(), []
+def test_training_gives_the_same_bytes_whoever_looks(
+    preset: str, tmp_path: Path, still: Path, moving: Path
+) -> None:
+    onlooker = Onlooker()
+    found = []
     for name, listeners in (("alone", []), ("seen", [onlooker])):
-        overrides = [f"data.root={still if preset == 'static' else moving}", f"run.dir={tmp_path / name}"]
+        overrides = [
+            f"data.root={still if preset == 'static' else moving}",
+            f"run.dir={tmp_path / name}",
+        ]
         overrides += ["train.steps=12", "init.num_random=40", "run.threads=1"]
         overrides += ["model.choose=false"] if preset == "dynamic" else []
         folder = dyngs.train(dyngs.load_config(preset, overrides), listeners=listeners)
@@ -57,7 +67,8 @@ def test_training_gives_the_same_bytes_whoever_looks(preset: str, tmp_path: Path
 
 def test_images_take_no_more_than_their_share() -> None:
     threads = threading.active_count()
-    now, drawer = [0.0], Drawer(lambda session, message: None)
+    now = [0.0]
+    drawer = Drawer(lambda session, message: None)
     session, sent = looking_at_balls()
     scene = session.opened.scene
 

@@ -31,22 +31,33 @@ from dyngs.files.find import FileFinder
 MAX_LINES_PER_KIND = 5  # problems of one kind that are listed; the others are counted
 MAX_VIEWS = 300  # views, chosen at random, in which points are looked for
 MARGIN = 0.1  # fractions of the image by which a point may lie outside: lenses distort
-WIDE_BASELINE = 10.0  # degrees between neighbouring views, seen from the scene, from which they are far apart
+# degrees between neighbouring views, seen from the scene, from which they are far apart
+WIDE_BASELINE = 10.0
 CLOSE_IN_TIME, FEW_VIEWS = 0.08, 3
-"""Motion over this fraction of a clip is small; with fewer views in it, each time step is seen from one side only."""
-UNSEEN_SIDE = 200.0  # degrees around a body without a camera from which on a part of it is hardly seen
+"""Motion over this fraction of a clip is small; with fewer views in it, each time step is seen from
+one side only."""
+# degrees around a body without a camera from which on a part of it is hardly seen
+UNSEEN_SIDE = 200.0
 
 
 def before_training(capture: Capture) -> list[str]:
-    """Return one line for everything about a capture that is likely to spoil a training; only some masks are read."""
+    """Return one line for everything about a capture that is likely to spoil a training; only some
+    masks are read."""
     masks = described_masks(capture)
     line = [] if masks is None else [f"masks of {masks}"]
-    found = [*capture.warnings, *line, *mask_problems(capture), *time_problems(capture), *scene_problems(capture)]
+    found = [
+        *capture.warnings,
+        *line,
+        *mask_problems(capture),
+        *time_problems(capture),
+        *scene_problems(capture),
+    ]
     return list(dict.fromkeys([*found, *body_problems(capture)]))
 
 
 def time_problems(capture: Capture) -> list[str]:
-    """Return the problems of times and of who saw them: a moving scene must be seen from several sides."""
+    """Return the problems of times and of who saw them: a moving scene must be seen from several
+    sides."""
     views = all_views(capture.splits)
     timed = [view for view in views if view.time is not None]
     outside = [view for view in timed if not 0 <= (view.time or 0.0) <= 1]
@@ -71,13 +82,18 @@ def body_problems(capture: Capture) -> list[str]:
 
     body = about_pelvis(body, np.zeros(3) if body.pelvis is None else body.pelvis)
     rows = {frame: row for row, frame in enumerate(body.frames)}
-    seen = [(rows[v.frame], v) for v in capture.splits.get("train", ()) if v.frame in rows and pose_fault(v) is None]
+    seen = [
+        (rows[v.frame], v)
+        for v in capture.splits.get("train", ())
+        if v.frame in rows and pose_fault(v) is None
+    ]
     if not seen:
         return []
     at = [row for row, _ in seen]
     away = np.stack([camera_center(view.cam_from_world) for _, view in seen]) - body.trans[at]
     away = Rotation.from_rotvec(body.poses[at, 0]).inv().apply(away)
-    around = np.sort(np.degrees(np.arctan2(away[:, 0], away[:, 2])))  # 0 in front, 90 on the person's left
+    # 0 in front, 90 on the person's left
+    around = np.sort(np.degrees(np.arctan2(away[:, 0], away[:, 2])))
     gaps = np.diff(np.append(around, around[0] + 360))
     widest = int(gaps.argmax())
     if gaps[widest] < UNSEEN_SIDE:
@@ -91,7 +107,8 @@ def body_problems(capture: Capture) -> list[str]:
 
 
 def scene_problems(capture: Capture) -> list[str]:
-    """Return the problems of poses and points together: cameras that look away, points that no camera sees, .."""
+    """Return the problems of poses and points together: cameras that look away, points that no
+    camera sees, .."""
     views = [view for view in all_views(capture.splits) if pose_fault(view) is None]
     if not views:
         return []
@@ -99,7 +116,12 @@ def scene_problems(capture: Capture) -> list[str]:
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if len(poses) > 1 and spread < 1e-9 and capture.body is None and not _is_still_monocular(capture):
+    if (
+        len(poses) > 1
+        and spread < 1e-9
+        and capture.body is None
+        and not _is_still_monocular(capture)
+    ):
         problems.append("all cameras are at one place, so no depth can be found")
     xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
     finite = np.isfinite(xyz).all(axis=1)
@@ -126,7 +148,9 @@ def _odd_cameras(views: list[View], center: np.ndarray, what: str) -> list[str]:
     away = [view.name for view, depth in zip(views, local, strict=True) if depth <= 0]
     if not away or in_image < 0.9 * len(views):
         return []
-    return [f"{len(away)} of {len(views)} cameras look away from the centre of {what}, first '{away[0]}'"]
+    return [
+        f"{len(away)} of {len(views)} cameras look away from the centre of {what}, first '{away[0]}'"
+    ]
 
 
 def _point_problems(xyz: np.ndarray, views: list[View]) -> list[str]:
@@ -149,7 +173,9 @@ def _point_problems(xyz: np.ndarray, views: list[View]) -> list[str]:
     distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
     far = distance > 50 * max(float(np.median(distance)), 1e-12)
     if far.any():
-        problems.append(f"{int(far.sum())} of {len(xyz)} points lie more than 50 times farther off than the median one")
+        problems.append(
+            f"{int(far.sum())} of {len(xyz)} points lie more than 50 times farther off than the median one"
+        )
     return problems
 
 
@@ -168,13 +194,22 @@ def _is_still_monocular(capture: Capture) -> bool:
 
 
 def _ill_posed(capture: Capture) -> list[str]:
-    """Few images of one time each from places far apart: what moves has moved on before another side of it is seen.
+    """Few images of one time each from places far apart: what moves has moved on before another
+    side of it is seen.
 
-    Many such images are no problem (D-NeRF's are all like that): neighbours in time then show nearly the same.
+    Many such images are no problem (D-NeRF's are all like that): neighbours in time then show
+    nearly the same.
     """
-    views = sorted((v for v in capture.splits.get("train", ()) if v.time is not None), key=lambda v: v.time or 0.0)
+    views = sorted(
+        (v for v in capture.splits.get("train", ()) if v.time is not None),
+        key=lambda v: v.time or 0.0,
+    )
     times = set(distinct_times(views).values())
-    if capture.body is not None or not 3 <= len(views) == len(times) or len(times) * CLOSE_IN_TIME >= FEW_VIEWS:
+    if (
+        capture.body is not None
+        or not 3 <= len(views) == len(times)
+        or len(times) * CLOSE_IN_TIME >= FEW_VIEWS
+    ):
         return []
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     center = focus_point(poses) if capture.points is None else np.median(capture.points.xyz, axis=0)
@@ -195,33 +230,55 @@ def listed(lines: Iterable[str]) -> list[str]:
     """Return the lines, and a count of those beyond ``MAX_LINES_PER_KIND``."""
     found = list(lines)
     more = len(found) - MAX_LINES_PER_KIND
-    return [*found[:MAX_LINES_PER_KIND], f"... and {more} more like the last one"] if more > 0 else found
+    return (
+        [*found[:MAX_LINES_PER_KIND], f"... and {more} more like the last one"]
+        if more > 0
+        else found
+    )
 
 
 def problems_of(capture: Capture, deep: bool) -> list[str]:
-    """Return a line for everything suspicious, next to the capture's own warnings; ``deep``: decode every image."""
-    views, train = all_views(capture.splits), capture.splits.get("train", ())
+    """Return a line for everything suspicious, next to the capture's own warnings; ``deep``: decode
+    every image."""
+    views = all_views(capture.splits)
+    train = capture.splits.get("train", ())
     problems = []
     if not capture.splits.get("test"):
-        problems.append("the split 'test' is empty, so nothing can be measured (see data.test_every)")
+        problems.append(
+            "the split 'test' is empty, so nothing can be measured (see data.test_every)"
+        )
     if len(train) < 3:
         problems.append(f"only {len(train)} training views; a scene needs some 20 or more")
-    names, images = Counter(view.name for view in views), Counter(view.image_path for view in views)
-    problems += listed(f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1)
-    problems += listed(f"{path} is the image of {count} views" for path, count in images.items() if count > 1)
+    names = Counter(view.name for view in views)
+    images = Counter(view.image_path for view in views)
+    problems += listed(
+        f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1
+    )
+    problems += listed(
+        f"{path} is the image of {count} views" for path, count in images.items() if count > 1
+    )
     problems += listed(fault for view in views if (fault := pose_fault(view)) is not None)
     poses = Counter(view.cam_from_world.round(9).tobytes() for view in views if view.time is None)
     same = sum(count for count in poses.values() if count > 1)
     if same:
         problems.append(f"{same} views of a static scene share their pose with another one")
-    problems += listed(f"'{view.name}': {fault}" for view in views if (fault := _fault_of_intrinsics(view)) is not None)
+    problems += listed(
+        f"'{view.name}': {fault}"
+        for view in views
+        if (fault := _fault_of_intrinsics(view)) is not None
+    )
     problems += [*_image_problems(capture, deep), *mask_problems(capture)]
     return [*problems, *time_problems(capture), *scene_problems(capture), *body_problems(capture)]
 
 
 def _fault_of_intrinsics(view: View) -> str | None:
-    k, width, height = view.intrinsics, view.width, view.height
-    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+    k = view.intrinsics
+    width = view.width
+    height = view.height
+    fx = k[0, 0]
+    fy = k[1, 1]
+    cx = k[0, 2]
+    cy = k[1, 2]
     if not np.isfinite(k).all() or fx <= 0 or fy <= 0:
         return f"the focal length ({fx:g}, {fy:g}) px is not a positive number"
     if not (0 <= cx <= width and 0 <= cy <= height):
@@ -236,7 +293,9 @@ def _fault_of_intrinsics(view: View) -> str | None:
 
 
 def _image_problems(capture: Capture, deep: bool) -> list[str]:
-    unreadable, sizes, channels = [], [], Counter[int]()
+    unreadable = []
+    sizes = []
+    channels = Counter[int]()
     for view in all_views(capture.splits):
         for path in (view.image_path, view.mask_path):
             if path is None or (view.video is not None and not path.is_file()):
@@ -260,53 +319,75 @@ def _image_problems(capture: Capture, deep: bool) -> list[str]:
 
 
 def transforms_file_problems(root: Path, known: str) -> list[str]:
-    """Return the problems of ``transforms*.json`` files that no reader accepts, but for those in ``known``."""
+    """Return the problems of ``transforms*.json`` files that no reader accepts, but for those in
+    ``known``."""
     problems = []
     for file in sorted(root.glob("transforms*.json")) if root.is_dir() else []:
         try:
             with staying_within(root):
                 frames: Any = read_json_object(file).get("frames", [])
             with reading(file):
-                entries = [(str(frame["file_path"]), np.array(frame["transform_matrix"], float)) for frame in frames]
+                entries = [
+                    (str(frame["file_path"]), np.array(frame["transform_matrix"], float))
+                    for frame in frames
+                ]
                 names = Counter(name for name, _ in entries)
                 images = FileFinder(root)
-                missing = [n for n in names if not any(images.find(n + suffix).is_file() for suffix in ("", *SUFFIXES))]
+                missing = [
+                    n
+                    for n in names
+                    if not any(images.find(n + suffix).is_file() for suffix in ("", *SUFFIXES))
+                ]
         except DyngsError as error:
             if str(file) not in known:
                 why = reason(error.__cause__ or error)
-                problems.append(f"{file}: holds no frames with 'file_path' and 'transform_matrix' ({why})")
+                problems.append(
+                    f"{file}: holds no frames with 'file_path' and 'transform_matrix' ({why})"
+                )
             continue
         faults = (matrix_fault(pose, f"{file}: '{name}'") for name, pose in entries)
         if not entries:
             problems.append(f"{file} lists no frames")
         problems += listed(f"{root / n}: no such image" for n in missing)
         problems += listed(fault for fault in faults if fault is not None)
-        problems += listed(f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1)
+        problems += listed(
+            f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1
+        )
     return [line for line in problems if line not in known]
 
 
 def tallied(counter: Counter[Any]) -> str:
     """Return the most frequent keys with their counts."""
-    return ", ".join(f"{key} ({count})" if len(counter) > 1 else f"{key}" for key, count in counter.most_common(6))
+    return ", ".join(
+        f"{key} ({count})" if len(counter) > 1 else f"{key}"
+        for key, count in counter.most_common(6)
+    )
 
 
 LOOKED_AT = 4  # masks that are read
-MOST_IGNORED = 0.5  # fraction of the pixels that masks may ignore before that is suspicious: passers-by fill less
+# fraction of the pixels that masks may ignore before that is suspicious: passers-by fill less
+MOST_IGNORED = 0.5
 
 
 def described_masks(capture: Capture) -> str | None:
-    """Return how many images have masks, which value counts, and how much a few masks ignore; None without masks."""
+    """Return how many images have masks, which value counts, and how much a few masks ignore; None
+    without masks."""
     views = all_views(capture.splits)
     count = sum(view.mask_path is not None for view in views)
     if not count:
         return None
     ignored = _ignored_fractions(capture)
-    share = f": {fmean(ignored.values()):.0%} of the pixels in {len(ignored)} that were read" if ignored else ""
+    share = (
+        f": {fmean(ignored.values()):.0%} of the pixels in {len(ignored)} that were read"
+        if ignored
+        else ""
+    )
     return f"{count} of {len(views)} images; white counts, black is ignored{share}"
 
 
 def mask_problems(capture: Capture) -> list[str]:
-    """Return a line if masks ignore most of the pixels; a few masks are read, unreadable ones are passed over."""
+    """Return a line if masks ignore most of the pixels; a few masks are read, unreadable ones are
+    passed over."""
     ignored = _ignored_fractions(capture)
     if not ignored or fmean(ignored.values()) <= MOST_IGNORED:
         return []
@@ -318,12 +399,19 @@ def mask_problems(capture: Capture) -> list[str]:
     )
     fraction = fmean(ignored.values())
     first = next(iter(ignored))
-    return [f"masks ignore {fraction:.0%} of the pixels in {len(ignored)} that were looked at, first {first}; {why}"]
+    return [
+        f"masks ignore {fraction:.0%} of the pixels in {len(ignored)} that were looked at, first {first}; {why}"
+    ]
 
 
 def _ignored_fractions(capture: Capture) -> dict[Path, float]:
-    """Return which fraction of its pixels each of a few masks ignores; none if one of them is unreadable."""
-    paths = [view.mask_path for view in all_views(capture.splits) if view.mask_path and view.mask_path.is_file()]
+    """Return which fraction of its pixels each of a few masks ignores; none if one of them is
+    unreadable."""
+    paths = [
+        view.mask_path
+        for view in all_views(capture.splits)
+        if view.mask_path and view.mask_path.is_file()
+    ]
     looked_at = [paths[index] for index in evenly_spaced(len(paths), LOOKED_AT)]
     try:
         return {path: 1 - float(read_mask(path).float().mean()) for path in looked_at}

@@ -1,4 +1,5 @@
-"""Report on a capture, as ``dyngs data inspect`` shows it: facts as pairs of a name and a value, and problems."""
+"""Report on a capture, as ``dyngs data inspect`` shows it: facts as pairs of a name and a value,
+and problems."""
 
 from __future__ import annotations
 
@@ -11,7 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.capture.first_points import checked_points
-from dyngs.capture.inspection.problems import described_masks, listed, problems_of, tallied, transforms_file_problems
+from dyngs.capture.inspection.problems import (
+    described_masks,
+    listed,
+    problems_of,
+    tallied,
+    transforms_file_problems,
+)
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import camera_center, inverse_rigid, pose_fault
@@ -22,9 +29,11 @@ from dyngs.files.containment import images_up_to, leaving_links
 from dyngs.files.outputs import Inputs
 from dyngs.files.write import write_image
 
-SAME_LIGHT = 1.05  # factor between the most and the least light up to which images count as equally exposed
+# factor between the most and the least light up to which images count as equally exposed
+SAME_LIGHT = 1.05
 MUCH_LOST = 90  # per cent of an image below which a wider pinhole is worth a word
-MOST_LENSES = 20  # different lenses that are looked at; more are not needed to tell how much is lost
+# different lenses that are looked at; more are not needed to tell how much is lost
+MOST_LENSES = 20
 
 
 def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
@@ -33,12 +42,20 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
     sizes = Counter(f"{view.width}x{view.height}" for view in views)
     lenses = Counter(view.lens.model for view in views)
     focal_px = [float(f) for view in views for f in (view.intrinsics[0, 0], view.intrinsics[1, 1])]
-    fov_deg = [float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views]
-    centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3) * capture.world_scale
+    fov_deg = [
+        float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views
+    ]
+    centers = (
+        np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3)
+        * capture.world_scale
+    )
     file = "" if capture.points_file is None else f" ({capture.points_file.name})"
     facts = [
         ("format", capture.format),
-        ("views", ", ".join(f"{len(views)} {split}" for split, views in capture.splits.items() if views)),
+        (
+            "views",
+            ", ".join(f"{len(views)} {split}" for split, views in capture.splits.items() if views),
+        ),
         ("sizes", tallied(sizes)),
         ("cameras", str(len({view.camera_id for view in views}))),
         ("focal length", f"{_range(focal_px)} px"),
@@ -56,33 +73,48 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         box = ", ".join(_range(axis) for axis in centers.T)
         facts.append(("camera centres", f"{box}; within {spread:.4g} of their mean"))
     if np.any(capture.world_offset):
-        facts.append(("world offset", " ".join(f"{x:.10g}" for x in capture.world_offset) + " (rebased)"))
+        facts.append(
+            ("world offset", " ".join(f"{x:.10g}" for x in capture.world_offset) + " (rebased)")
+        )
     if capture.body is not None:
         frames = ", ".join(
-            f"{len(capture.body[name].frames)} {name}" for name in capture.splits if name in capture.body
+            f"{len(capture.body[name].frames)} {name}"
+            for name in capture.splits
+            if name in capture.body
         )
         facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
     return tuple(facts)
 
 
 def _kept(views: Sequence[View]) -> str:
-    """Return how much of the images is left after their lens distortion is removed; empty where there is none."""
-    lenses = {(view.lens, view.intrinsics.tobytes(), view.width, view.height): view for view in views}
+    """Return how much of the images is left after their lens distortion is removed; empty where
+    there is none."""
+    lenses = {
+        (view.lens, view.intrinsics.tobytes(), view.width, view.height): view for view in views
+    }
     distorted = [view for view in lenses.values() if not is_pinhole(view.lens)][:MOST_LENSES]
     if not distorted:
         return ""
-    fractions = [100 * kept_fraction(view.lens, view.intrinsics, view.width, view.height) for view in distorted]
+    fractions = [
+        100 * kept_fraction(view.lens, view.intrinsics, view.width, view.height)
+        for view in distorted
+    ]
     ratios = [view.lens.focal_ratio for view in distorted]
     if max(ratios) > 1:
         how = f"to a pinhole with {_range([1 / ratio for ratio in ratios])} of the focal length"
     else:
         how = "with the same focal length"
-    more = " (data.undistort=wide keeps more)" if max(ratios) == 1 and min(fractions) < MUCH_LOST else ""
+    more = (
+        " (data.undistort=wide keeps more)"
+        if max(ratios) == 1 and min(fractions) < MUCH_LOST
+        else ""
+    )
     return f"; undistorted {how}, which keeps {_range(fractions)} % of each image{more}"
 
 
 def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
-    """Return how much the light let in differs by the tags of images; nothing where they do not say."""
+    """Return how much the light let in differs by the tags of images; nothing where they do not
+    say."""
     known = [view.exposure for view in views if view.exposure is not None]
     if not known:
         return []
@@ -90,7 +122,12 @@ def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
     said = f"by EXIF tags of {len(known)} of {len(views)} images, "
     if factor < SAME_LIGHT:
         return [("exposure", f"{said}the same")]
-    return [("exposure", f"{said}up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters")]
+    return [
+        (
+            "exposure",
+            f"{said}up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters",
+        )
+    ]
 
 
 def _prior_facts(capture: Capture) -> Iterator[tuple[str, str]]:
@@ -108,13 +145,16 @@ def _prior_facts(capture: Capture) -> Iterator[tuple[str, str]]:
 
 
 def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
-    """Distinct times, cameras by times, the frame rate, and how many frames of videos are decoded."""
+    """Distinct times, cameras by times, the frame rate, and how many frames of videos are
+    decoded."""
     views = [view for view in all_views(capture.splits) if view.time is not None]
     if not views:
         yield "times", "none (a static scene)"
         return
     times = set(distinct_times(views).values())
-    written = "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
+    written = (
+        "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
+    )
     yield "times", f"{len(times)} in {_range(times)}{written}"
     cameras: defaultdict[int, set[bytes]] = defaultdict(set)
     for view in views:
@@ -131,7 +171,10 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
         yield "duration", f"{capture.seconds:.4g} seconds from time 0 to time 1"
     frames = [view.image_path for view in views if view.video is not None]
     if frames:
-        yield "video frames", f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already"
+        yield (
+            "video frames",
+            f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already",
+        )
 
 
 def _range(values: Iterable[float]) -> str:
@@ -139,13 +182,15 @@ def _range(values: Iterable[float]) -> str:
     listed = list(values)
     if not listed:
         return "none"
-    low, high = min(listed), max(listed)
+    low = min(listed)
+    high = max(listed)
     return f"{low:.4g}" if np.isclose(low, high) else f"{low:.4g} to {high:.4g}"
 
 
 @dataclass(frozen=True)
 class InspectReport:
-    """Facts of a capture, (name, value) pairs in order, and all that is suspicious; no ``capture`` if unreadable."""
+    """Facts of a capture, (name, value) pairs in order, and all that is suspicious; no ``capture``
+    if unreadable."""
 
     root: Path
     capture: Capture | None
@@ -154,18 +199,26 @@ class InspectReport:
 
 
 def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectReport:
-    """Return a report on the capture at ``source``; what makes a capture unreadable is a problem in it, no error.
+    """Return a report on the capture at ``source``; what makes a capture unreadable is a problem in
+    it, no error.
 
-    ``deep``: every image is decoded in full and videos to files, which is slow and finds truncated files; otherwise
-    only headers are read, and frames of videos only where they are decoded already.
+    ``deep``: every image is decoded in full and videos to files, which is slow and finds truncated
+    files; otherwise only headers are read, and frames of videos only where they are decoded
+    already.
     """
     from dyngs.data.read import read_capture
 
     options = source if isinstance(source, DataConfig) else DataConfig(root=source)
-    links = [f"{path}: a link that leads out of the capture, to {place}" for path, place in leaving_links(options.root)]
+    links = [
+        f"{path}: a link that leads out of the capture, to {place}"
+        for path, place in leaving_links(options.root)
+    ]
     try:
         capture = read_capture(options, decode_videos=deep)
-        with images_up_to(options.max_megapixels), reading(options.root, "`dyngs --debug` shows where"):
+        with (
+            images_up_to(options.max_megapixels),
+            reading(options.root, "`dyngs --debug` shows where"),
+        ):
             report = report_on(capture, deep)
     except DyngsError as error:
         more = (*listed(links), *transforms_file_problems(options.root, str(error)))
@@ -197,14 +250,21 @@ def format_report(report: InspectReport) -> str:
 
 
 BACKGROUND = (24, 26, 30)
-SPLIT_COLORS = {"train": (255, 170, 60), "val": (120, 230, 120), "test": (80, 190, 255), "pose": (80, 190, 255)}
+SPLIT_COLORS = {
+    "train": (255, 170, 60),
+    "val": (120, 230, 120),
+    "test": (80, 190, 255),
+    "pose": (80, 190, 255),
+}
 
 
 def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
-    """Write an image of 2 ``size`` x ``size`` pixels: the scene from above and from the side, orthographic.
+    """Write an image of 2 ``size`` x ``size`` pixels: the scene from above and from the side,
+    orthographic.
 
-    Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours.
-    Up is the mean of the cameras' up axes. Points far beyond the cameras, and views without a rigid pose, are left out.
+    Frusta of training cameras are orange, of validation green, of test and new poses blue; points
+    have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras, and
+    views without a rigid pose, are left out.
     """
     Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
@@ -216,7 +276,8 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     xyz, rgb = _near_points(capture, poses[:, :3, 3])
     core = np.quantile(xyz @ axes.T, [0.03, 0.97], axis=0) if len(xyz) else xyz
     reach = np.concatenate([poses[:, :3, 3] @ axes.T, core])
-    low, high = reach.min(axis=0), reach.max(axis=0)
+    low = reach.min(axis=0)
+    high = reach.max(axis=0)
     extent = max(float((high - low).max()) * 1.2, 1e-6)
     depth = extent * min(0.08, 0.4 / len(poses) ** 0.5)
     panels = []
@@ -232,7 +293,8 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
 
 
 class _Panel:
-    """One square of the plot, drawn at twice its size: ``extent`` units around ``center`` (2,), axes (2, 3)."""
+    """One square of the plot, drawn at twice its size: ``extent`` units around ``center`` (2,),
+    axes (2, 3)."""
 
     def __init__(self, size: int, axes: np.ndarray, center: np.ndarray, extent: float) -> None:
         from PIL import Image, ImageDraw
@@ -245,9 +307,15 @@ class _Panel:
         for (x, y), colour in zip(self._places(xyz), np.maximum(rgb, 60).tolist(), strict=True):
             self._draw.rectangle((x, y, x + 1, y + 1), fill=tuple(colour))
 
-    def draw_frustum(self, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]) -> None:
-        """Draw lines from the camera's centre to the corners of its image, and the image's border, ``depth`` away."""
-        corners = np.array([[0, 0, 1], [view.width, 0, 1], [view.width, view.height, 1], [0, view.height, 1]], float)
+    def draw_frustum(
+        self, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]
+    ) -> None:
+        """Draw lines from the camera's centre to the corners of its image, and the image's border,
+        ``depth`` away."""
+        corners = np.array(
+            [[0, 0, 1], [view.width, 0, 1], [view.width, view.height, 1], [0, view.height, 1]],
+            float,
+        )
         rays = corners @ np.linalg.inv(view.intrinsics).T
         rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
         tips = self._places(np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3])
@@ -279,12 +347,15 @@ def _drawing_axes(poses: np.ndarray) -> np.ndarray:
 
 
 def _near_points(capture: Capture, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Up to about 20,000 points (P, 3) and colours: those within four camera spreads, or the nearer half."""
+    """Up to about 20,000 points (P, 3) and colours: those within four camera spreads, or the nearer
+    half."""
     if capture.points is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    xyz, rgb = capture.points.xyz, capture.points.rgb
+    xyz = capture.points.xyz
+    rgb = capture.points.rgb
     finite = np.isfinite(xyz).all(axis=1)
-    xyz, rgb = xyz[finite], rgb[finite]
+    xyz = xyz[finite]
+    rgb = rgb[finite]
     middle = centers.mean(axis=0)
     distance = np.linalg.norm(xyz - middle, axis=1)
     spread = np.linalg.norm(centers - middle, axis=1).max()

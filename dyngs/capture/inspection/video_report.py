@@ -1,4 +1,5 @@
-"""Report on videos without poses: what one wants to know before structure from motion, and the next command."""
+"""Report on videos without poses: what one wants to know before structure from motion, and the next
+command."""
 
 from __future__ import annotations
 
@@ -27,14 +28,17 @@ from dyngs.files.containment import inside
 MAX_FRAMES = 3000  # frames that are looked at, from the first one on
 UNEVEN = 1.5  # longest over typical gap between frames of a rate that varies
 BLURRED = 0.5  # frames with less than this fraction of the typical sharpness are blurred
-FAST = 0.05  # fraction of the width by which the image moves from frame to frame of a camera that moves fast
-LITTLE = 0.05  # fraction of the width by which the image of a camera that hardly moves is displaced over the clip
+# fraction of the width by which the image moves from frame to frame of a camera that moves fast
+FAST = 0.05
+# fraction of the width by which the image of a camera that hardly moves is displaced over the clip
+LITTLE = 0.05
 _PAIRS = 40
 
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """Facts about a video, (name, value) pairs for people, in order, and whether its camera stands still."""
+    """Facts about a video, (name, value) pairs for people, in order, and whether its camera stands
+    still."""
 
     film: Film
     facts: tuple[tuple[str, str], ...]
@@ -73,13 +77,16 @@ def video_facts(path: Path) -> VideoFacts:
 
 
 def _look(film: Film) -> tuple[np.ndarray, np.ndarray]:
-    small, sharpness = [], []
+    small = []
+    sharpness = []
     for rgb in islice(read_frames(film.path), min(MAX_FRAMES, len(film.seconds))):
         small.append(shrunk_grey(rgb))
         step = max(max(rgb.shape[:2]) // 800, 1)
         grey = rgb[::step, ::step, 1].astype(np.float32)
         sharpness.append(
-            float(np.diff(grey, axis=0).std() + np.diff(grey, axis=1).std()) if min(grey.shape) > 1 else 0.0
+            float(np.diff(grey, axis=0).std() + np.diff(grey, axis=1).std())
+            if min(grey.shape) > 1
+            else 0.0
         )
     return np.stack(small), np.array(sharpness)
 
@@ -93,11 +100,17 @@ _ORIENTATIONS = (
 
 def _streams(path: Path) -> tuple[str, str]:
     """Return what is done to frames on reading, in brackets, and what sound there is."""
-    with reading(path, "it must be a video; copy or convert it again"), opened_video(path) as container:
+    with (
+        reading(path, "it must be a video; copy or convert it again"),
+        opened_video(path) as container,
+    ):
         first = next(container.decode(container.streams.video[0]))
         done = _ORIENTATIONS[orientation_of(first) - 1]
         audio = container.streams.audio
-        return f" ({done})" if done else "", f"{audio[0].codec_context.name}, {audio[0].rate} Hz" if audio else "none"
+        return (
+            f" ({done})" if done else "",
+            f"{audio[0].codec_context.name}, {audio[0].rate} Hz" if audio else "none",
+        )
 
 
 def _rate(film: Film) -> str:
@@ -110,7 +123,8 @@ def _rate(film: Film) -> str:
 def _sharpness(sharpness: np.ndarray) -> str:
     typical = float(np.median(sharpness))
     blurred = int((sharpness < BLURRED * typical).sum())
-    low, high = sharpness.min() / max(typical, 1e-9), sharpness.max() / max(typical, 1e-9)
+    low = sharpness.min() / max(typical, 1e-9)
+    high = sharpness.max() / max(typical, 1e-9)
     found = counted(blurred, "blurred frame") if blurred else "no blurred frames"
     return f"{low:.2f} to {high:.2f} of the typical frame; {found}"
 
@@ -132,13 +146,18 @@ def _camera(small: np.ndarray, displaced: float) -> str:
 
 def _lines(found: VideoFacts) -> list[str]:
     width = max(len(name) for name, _ in found.facts)
-    return [f"video {found.film.path}", *(f"  {name:<{width}}  {value}" for name, value in found.facts)]
+    return [
+        f"video {found.film.path}",
+        *(f"  {name:<{width}}  {value}" for name, value in found.facts),
+    ]
 
 
 def _next(path: Path, found: VideoFacts) -> list[str]:
     where = as_word(path)
     if found.stands:
-        return ["next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"]
+        return [
+            "next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"
+        ]
     return [
         f"next: dyngs train static data.root={where}     # nothing but the camera moves",
         f"      dyngs train dynamic data.root={where}    # something else moves, too",
@@ -148,10 +167,16 @@ def _next(path: Path, found: VideoFacts) -> list[str]:
 def _next_of_folder(folder: Path, reports: Sequence[VideoFacts]) -> list[str]:
     moving = [found.film.name for found in reports if not found.stands]
     if moving:
-        return [f"next: take {', '.join(moving[:5])} out: of several videos, only fixed cameras get poses"]
+        return [
+            f"next: take {', '.join(moving[:5])} out: of several videos, only fixed cameras get poses"
+        ]
     names = [found.film.name for found in reports]
     rates = {round(found.film.rate, 2) for found in reports}
-    known = "found by sound or motion" if read_given(folder, names)[0] is None else f"as {VIDEOS_FILE} says"
+    known = (
+        "found by sound or motion"
+        if read_given(folder, names)[0] is None
+        else f"as {VIDEOS_FILE} says"
+    )
     return [
         f"{len(names)} fixed cameras, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
         f"offsets between them: {known}",

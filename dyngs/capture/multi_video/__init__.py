@@ -1,1 +1,2 @@
-"""Several videos of one time step: offsets between their clocks, poses of fixed cameras, one capture of all."""
+"""Several videos of one time step: offsets between their clocks, poses of fixed cameras, one
+capture of all."""

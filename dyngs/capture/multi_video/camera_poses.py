@@ -1,4 +1,5 @@
-"""Poses of fixed cameras, one each, from one image per camera: what stands in it, of many time steps together."""
+"""Poses of fixed cameras, one each, from one image per camera: what stands in it, of many time
+steps together."""
 
 from __future__ import annotations
 
@@ -32,17 +33,21 @@ if TYPE_CHECKING:
 MOMENTS = 15
 """Frames of a video whose median shows what stands."""
 MEDIAN_BYTES = 400_000_000  # memory that these frames take at most
-STARTS = (0, 1, 2)  # random seeds of mapping: repeated patterns lead some astray, and then fewer points are seen
+# random seeds of mapping: repeated patterns lead some astray, and then fewer points are seen
+STARTS = (0, 1, 2)
 FEW_OBSERVATIONS = 400  # observations per camera below which other features are tried, too
 LARGEST_ERROR = 2.0  # observations with a larger reprojection error, in px, are left out in the end
-ENOUGH_TRACKS = 60  # points that only two cameras see are left out where each camera sees so many others
-LONE_LENSES = 1.0  # mean reprojection error in px above which cameras of one size are also tried with a lens each
+# points that only two cameras see are left out where each camera sees so many others
+ENOUGH_TRACKS = 60
+# mean reprojection error in px above which cameras of one size are also tried with a lens each
+LONE_LENSES = 1.0
 _LESS = 0.7  # lenses of their own are kept if they lower the error to this, or find more cameras
 
 
 @dataclass(frozen=True)
 class FixedModel:
-    """A model with an image ``CAMERA.png`` for each camera; ``shared``: those of one size have one lens."""
+    """A model with an image ``CAMERA.png`` for each camera; ``shared``: those of one size have one
+    lens."""
 
     model: pycolmap.Reconstruction
     shared: bool
@@ -55,7 +60,8 @@ class FixedModel:
 
 
 def image_without_movers(film: Film, num_frames: int) -> np.ndarray:
-    """Return the (H, W, 3) uint8 median of the first frames of a fixed camera: without what moves, with less noise."""
+    """Return the (H, W, 3) uint8 median of the first frames of a fixed camera: without what moves,
+    with less noise."""
     most = max(MEDIAN_BYTES // max(film.info.width * film.info.height * 3, 1), 3)
     wanted = evenly_spaced(num_frames, min(MOMENTS, most))
     frames = np.stack([rgb for _, rgb in read_numbered_frames(film.path, wanted)])
@@ -66,14 +72,20 @@ def image_without_movers(film: Film, num_frames: int) -> np.ndarray:
 
 
 def fixed_model(
-    films: Sequence[Film], images: Sequence[np.ndarray], work: Path, num_threads: int, report: ReportProgress
+    films: Sequence[Film],
+    images: Sequence[np.ndarray],
+    work: Path,
+    num_threads: int,
+    report: ReportProgress,
 ) -> FixedModel | None:
-    """Return the poses of fixed cameras by an image (H, W, 3) uint8 of each, None where no two cameras match.
+    """Return the poses of fixed cameras by an image (H, W, 3) uint8 of each, None where no two
+    cameras match.
 
-    SIFT features, all pairs matched, incremental mapping from several random seeds; of the models, that with most
-    cameras, then with most observations. Where a camera or observations are missing, features are also found with
-    affine shapes and matched under guidance, which works over wider angles. Cameras of one size share a lens unless
-    that fits badly. ``work`` is a folder for COLMAP's files.
+    SIFT features, all pairs matched, incremental mapping from several random seeds; of the models,
+    that with most cameras, then with most observations. Where a camera or observations are missing,
+    features are also found with affine shapes and matched under guidance, which works over wider
+    angles. Cameras of one size share a lens unless that fits badly. ``work`` is a folder for
+    COLMAP's files.
     """
     folder = work / "fixed"
     for film, rgb in zip(films, images, strict=True):
@@ -85,7 +97,9 @@ def fixed_model(
         for number, (features, shared) in enumerate(attempts):
             if not _worth_trying(best, features, shared, len(films)):
                 continue
-            found = _attempt(work / f"{features}_{shared}", folder, features == "affine", shared, num_threads)
+            found = _attempt(
+                work / f"{features}_{shared}", folder, features == "affine", shared, num_threads
+            )
             report("poses of the cameras, attempts", number + 1, len(attempts))
             if found is not None:
                 _refine(found, num_threads)
@@ -105,7 +119,10 @@ def _worth_trying(best: FixedModel | None, features: str, shared: bool, count: i
         return True
     if shared:
         return best.model.compute_num_observations() < FEW_OBSERVATIONS * count
-    return best.tries.startswith(features) and best.model.compute_mean_reprojection_error() > LONE_LENSES
+    return (
+        best.tries.startswith(features)
+        and best.model.compute_mean_reprojection_error() > LONE_LENSES
+    )
 
 
 def _is_better(one: FixedModel, other: FixedModel) -> bool:
@@ -117,18 +134,26 @@ def _is_better(one: FixedModel, other: FixedModel) -> bool:
     return one.model.compute_num_observations() > other.model.compute_num_observations()
 
 
-def _attempt(work: Path, images: Path, affine: bool, shared: bool, num_threads: int) -> pycolmap.Reconstruction | None:
+def _attempt(
+    work: Path, images: Path, affine: bool, shared: bool, num_threads: int
+) -> pycolmap.Reconstruction | None:
     import pycolmap
 
     work.mkdir(parents=True)
-    database, device = work / "database.db", pycolmap.Device.cpu
+    database = work / "database.db"
+    device = pycolmap.Device.cpu
     extraction = feature_options(num_threads, LONGEST_SIDE, MAX_FEATURES)
     extraction.sift.peak_threshold = 0.002
     extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = affine
     reader = pycolmap.ImageReaderOptions(camera_model=LENS)
     mode = pycolmap.CameraMode.PER_FOLDER if shared else pycolmap.CameraMode.PER_IMAGE
     pycolmap.extract_features(
-        database, images, camera_mode=mode, reader_options=reader, extraction_options=extraction, device=device
+        database,
+        images,
+        camera_mode=mode,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=device,
     )
     matching, verification = matching_options(num_threads)
     matching.guided_matching = affine
@@ -150,7 +175,8 @@ def _attempt(work: Path, images: Path, affine: bool, shared: bool, num_threads: 
 
 
 def _refine(model: pycolmap.Reconstruction, num_threads: int) -> None:
-    """Adjust poses, lenses and points once more, with a robust loss, and without what fits badly or two cameras see.
+    """Adjust poses, lenses and points once more, with a robust loss, and without what fits badly or
+    two cameras see.
 
     Repeated patterns give matches that only two cameras agree on; those bend the model.
     """
@@ -175,7 +201,8 @@ def _refine(model: pycolmap.Reconstruction, num_threads: int) -> None:
 
 
 def _drop_poor_points(model: pycolmap.Reconstruction) -> None:
-    """Remove observations with large errors, and points of two cameras where each camera has enough others."""
+    """Remove observations with large errors, and points of two cameras where each camera has enough
+    others."""
     import pycolmap
 
     manager = pycolmap.ObservationManager(model)
@@ -186,7 +213,9 @@ def _drop_poor_points(model: pycolmap.Reconstruction) -> None:
             for element in point.track.elements:
                 counts[element.image_id] += 1
     if min(counts.values(), default=0) >= ENOUGH_TRACKS:
-        for number in [number for number, point in model.points3D.items() if point.track.length() == 2]:
+        for number in [
+            number for number, point in model.points3D.items() if point.track.length() == 2
+        ]:
             model.delete_point3D(number)
 
 

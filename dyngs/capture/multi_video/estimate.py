@@ -1,4 +1,5 @@
-"""A capture of several videos that ran at once: offsets between them, poses of their cameras, frames with seconds."""
+"""A capture of several videos that ran at once: offsets between them, poses of their cameras,
+frames with seconds."""
 
 from __future__ import annotations
 
@@ -11,7 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyngs.capture.multi_video.camera_poses import FixedModel, camera_name, fixed_model, image_without_movers
+from dyngs.capture.multi_video.camera_poses import (
+    FixedModel,
+    camera_name,
+    fixed_model,
+    image_without_movers,
+)
 from dyngs.capture.multi_video.films import (
     STANDS,
     VIDEOS_FILE,
@@ -41,13 +47,18 @@ if TYPE_CHECKING:
 
 
 def poses_of_videos(
-    source: Path, out: Path, options: SfmOptions = SfmOptions(), report: ReportProgress = report_nothing
+    source: Path,
+    out: Path,
+    options: SfmOptions = SfmOptions(),
+    report: ReportProgress = report_nothing,
 ) -> str:
-    """Make a capture of a folder of videos that ran at once, of fixed cameras; return what was found, as lines.
+    """Make a capture of a folder of videos that ran at once, of fixed cameras; return what was
+    found, as lines.
 
-    All work is done in a folder next to ``out`` which is renamed at the end, so ``out`` is complete or absent. It is in
-    COLMAP's layout, with ``times.json``, and ready to be trained on. Raises DyngsError: a camera that moves, poses or
-    offsets that cannot be found, with what to do; an ``out`` in use.
+    All work is done in a folder next to ``out`` which is renamed at the end, so ``out`` is complete
+    or absent. It is in COLMAP's layout, with ``times.json``, and ready to be trained on. Raises
+    DyngsError: a camera that moves, poses or offsets that cannot be found, with what to do; an
+    ``out`` in use.
 
     Args:
         source: a folder with two videos or more, and ``videos.json`` if something is known.
@@ -113,13 +124,19 @@ def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgre
     return lines
 
 
-def _write_images(root: Path, films: Sequence[Film], taken: Sequence[Taken], report: ReportProgress) -> list[list[str]]:
-    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below ``images`` by camera."""
-    total, done = sum(len(frames.numbers) for frames in taken), 0
+def _write_images(
+    root: Path, films: Sequence[Film], taken: Sequence[Taken], report: ReportProgress
+) -> list[list[str]]:
+    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below
+    ``images`` by camera."""
+    total = sum(len(frames.numbers) for frames in taken)
+    done = 0
     names: list[list[str]] = []
     for film, frames in zip(films, taken, strict=True):
         own = []
-        for number, rgb in read_numbered_frames(film.path, [int(number) for number in frames.numbers]):
+        for number, rgb in read_numbered_frames(
+            film.path, [int(number) for number in frames.numbers]
+        ):
             own.append(f"{film.name}/frame_{number:05d}.png")
             write_image(root / "images" / own[-1], rgb)
             done += 1
@@ -129,9 +146,13 @@ def _write_images(root: Path, films: Sequence[Film], taken: Sequence[Taken], rep
 
 
 def _write_model(
-    root: Path, films: Sequence[Film], names: Sequence[Sequence[str]], standing: pycolmap.Reconstruction
+    root: Path,
+    films: Sequence[Film],
+    names: Sequence[Sequence[str]],
+    standing: pycolmap.Reconstruction,
 ) -> None:
-    """Write ``root/sparse/0``: a lens for each camera, its one pose for all its images, and the points.
+    """Write ``root/sparse/0``: a lens for each camera, its one pose for all its images, and the
+    points.
 
     The first image of each camera has the observations of the points.
     """
@@ -145,7 +166,11 @@ def _write_model(
         image = posed[film.name]
         lens = standing.cameras[image.camera_id]
         camera = pycolmap.Camera(
-            camera_id=number + 1, model=lens.model, width=lens.width, height=lens.height, params=lens.params
+            camera_id=number + 1,
+            model=lens.model,
+            width=lens.width,
+            height=lens.height,
+            params=lens.params,
         )
         full.add_camera_with_trivial_rig(camera)
         places = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
@@ -189,7 +214,11 @@ def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[np.ndarr
 
 
 def _posed(
-    work: Path, films: list[Film], small: list[np.ndarray], options: SfmOptions, report: ReportProgress
+    work: Path,
+    films: list[Film],
+    small: list[np.ndarray],
+    options: SfmOptions,
+    report: ReportProgress,
 ) -> tuple[list[Film], FixedModel, str]:
     """Return the cameras that have a pose, the poses, and a line on them."""
     images = []
@@ -199,7 +228,11 @@ def _posed(
     folder = work / "colmap"
     found = fixed_model(films, images, folder, options.num_threads, report)
     shutil.rmtree(folder)
-    names = set() if found is None else {camera_name(image) for image in found.model.images.values() if image.has_pose}
+    names = (
+        set()
+        if found is None
+        else {camera_name(image) for image in found.model.images.values() if image.has_pose}
+    )
     if found is None or len(names) < 2:
         raise DyngsError(
             f"no poses could be found for {len(films)} cameras: neighbours must show much of the same, from directions "

@@ -13,20 +13,24 @@ from dyngs.capture.multi_video.films import VIDEOS_FILE, Film
 from dyngs.data.images.video import opened_video
 from dyngs.errors import DyngsError, reading
 
-MIN_OVERLAP = 0.4  # fraction of the shorter signal that must lie within the other one at every shift that is tried
+# fraction of the shorter signal that must lie within the other one at every shift that is tried
+MIN_OVERLAP = 0.4
 MIN_SAMPLES = 8  # and least number of samples
 MIN_PEAK = 0.15  # lowest correlation of two signals that count as alike
 RIVAL = 0.8  # a peak is clear if no other one is higher than this times itself
 CERTAIN_PEAK, CERTAIN_RIVAL = 0.5, 0.6
-"""Likewise where no third recording can confirm it: 0.7 % of unrelated signals of 120 samples have such a peak,"""
-CERTAIN_DEVIATIONS = 6.0  # and none stands out by so many standard deviations of the other correlations
+"""Likewise where no third recording can confirm it: 0.7 % of unrelated signals of 120 samples have
+such a peak,"""
+# and none stands out by so many standard deviations of the other correlations
+CERTAIN_DEVIATIONS = 6.0
 PEAK_WIDTH = 2.0  # shifts within so many samples of a peak belong to it
 _ROUNDS = 20
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """Correlation of two signals: ``values`` (L,) in [-1, 1] at the whole shifts, in samples, from ``first`` on.
+    """Correlation of two signals: ``values`` (L,) in [-1, 1] at the whole shifts, in samples, from
+    ``first`` on.
 
     Time of the second signal plus the shift is time of the first one.
     """
@@ -57,11 +61,15 @@ class Correlation:
         far = np.abs(np.arange(len(self.values)) - peak_place(self.values)) > PEAK_WIDTH
         deviation = float(np.sqrt(np.mean(self.values[far] ** 2))) if far.any() else 1.0
         stands_out = peak >= CERTAIN_DEVIATIONS * deviation
-        return self.is_clear and (stands_out or (peak >= CERTAIN_PEAK and self._rival() <= CERTAIN_RIVAL * peak))
+        return self.is_clear and (
+            stands_out or (peak >= CERTAIN_PEAK and self._rival() <= CERTAIN_RIVAL * peak)
+        )
 
     def _rival(self) -> float:
-        """Return the highest local maximum that does not belong to the highest peak, 0 without any."""
-        values, inner = self.values, self.values[1:-1]
+        """Return the highest local maximum that does not belong to the highest peak, 0 without
+        any."""
+        values = self.values
+        inner = self.values[1:-1]
         is_top = (inner >= values[:-2]) & (inner >= values[2:])
         far = np.abs(np.arange(1, len(values) - 1) - peak_place(values)) > PEAK_WIDTH
         return float(max(inner[is_top & far].max(initial=0.0), 0.0))
@@ -75,8 +83,9 @@ class Alignment:
         shifts: (C,) samples, to be added to a recording's own time; the first one is 0.
         agreeing: pairs whose own best shift is this one, to a sample; of so many ``pairs``.
         correlation: mean over all pairs at these shifts.
-        holds: whether the shifts may be relied on: pairs that agree join all recordings, and of the pairs beyond those
-            that it takes to join them, which agree by themselves, half agree, too. Without such pairs, each is certain.
+        holds: whether the shifts may be relied on: pairs that agree join all recordings, and of the
+            pairs beyond those that it takes to join them, which agree by themselves, half agree,
+            too. Without such pairs, each is certain.
     """
 
     shifts: np.ndarray
@@ -87,9 +96,11 @@ class Alignment:
 
 
 def correlate(a: np.ndarray, b: np.ndarray) -> Correlation | None:
-    """Return the correlation of two signals (T, B), of one rate, over whole shifts; None where they are too short.
+    """Return the correlation of two signals (T, B), of one rate, over whole shifts; None where they
+    are too short.
 
-    Each column is taken relative to its mean. At every shift the energy of what overlaps is the norm.
+    Each column is taken relative to its mean. At every shift the energy of what overlaps is the
+    norm.
     """
     a, b = (x - x.mean(axis=0) for x in (a.astype(np.float64), b.astype(np.float64)))
     least = max(int(np.ceil(MIN_OVERLAP * min(len(a), len(b)))), MIN_SAMPLES)
@@ -100,18 +111,21 @@ def correlate(a: np.ndarray, b: np.ndarray) -> Correlation | None:
     products = np.fft.irfft(spectrum, size)
     shifts = np.arange(least - len(b), len(a) - least + 1)
     sums = [np.concatenate([[0.0], np.cumsum((x * x).sum(axis=1))]) for x in (a, b)]
-    starts, ends = np.maximum(shifts, 0), np.minimum(shifts + len(b), len(a))
+    starts = np.maximum(shifts, 0)
+    ends = np.minimum(shifts + len(b), len(a))
     energies = [sums[0][ends] - sums[0][starts], sums[1][ends - shifts] - sums[1][starts - shifts]]
     norm = np.sqrt(np.maximum(energies[0] * energies[1], 0.0))
     floor = 1e-3 * np.sqrt(sums[0][-1] * sums[1][-1])
-    return Correlation(int(shifts[0]), np.where(norm > floor, products[shifts] / np.maximum(norm, 1e-12), 0.0))
+    return Correlation(
+        int(shifts[0]), np.where(norm > floor, products[shifts] / np.maximum(norm, 1e-12), 0.0)
+    )
 
 
 def align(pairs: Mapping[tuple[int, int], Correlation], count: int) -> Alignment:
     """Return the shifts at which all pairs together correlate best.
 
-    The pairs with the highest peaks join all recordings first; then each recording is shifted to where the sum of its
-    correlations is highest, until nothing changes.
+    The pairs with the highest peaks join all recordings first; then each recording is shifted to
+    where the sum of its correlations is highest, until nothing changes.
 
     Args:
         pairs: correlation of recordings i and j, i < j: shift of j less shift of i.
@@ -125,20 +139,25 @@ def align(pairs: Mapping[tuple[int, int], Correlation], count: int) -> Alignment
         if np.abs(shifts - before).max() < 1e-3:
             break
     agree = {
-        (i, j) for (i, j), found in pairs.items() if found.is_clear and abs(found.best - (shifts[j] - shifts[i])) <= 1.0
+        (i, j)
+        for (i, j), found in pairs.items()
+        if found.is_clear and abs(found.best - (shifts[j] - shifts[i])) <= 1.0
     }
     values = [found.at(shifts[j] - shifts[i]) for (i, j), found in pairs.items()]
     correlation = float(np.mean(values)) if values else 0.0
     beyond = len(pairs) - (count - 1)
     confirmed = (
-        2 * (len(agree) - (count - 1)) >= beyond if beyond > 0 else all(pairs[pair].is_certain for pair in agree)
+        2 * (len(agree) - (count - 1)) >= beyond
+        if beyond > 0
+        else all(pairs[pair].is_certain for pair in agree)
     )
     holds = len(_reached(agree, count)) == count and confirmed
     return Alignment(shifts - shifts[0], len(agree), len(pairs), correlation, holds)
 
 
 def peak_place(values: np.ndarray) -> float:
-    """Return the place of the highest value, between whole ones by the parabola through its neighbours."""
+    """Return the place of the highest value, between whole ones by the parabola through its
+    neighbours."""
     top = int(np.argmax(values))
     if not 0 < top < len(values) - 1:
         return float(top)
@@ -148,12 +167,15 @@ def peak_place(values: np.ndarray) -> float:
 
 
 def _spanning(pairs: Mapping[tuple[int, int], Correlation], count: int) -> np.ndarray:
-    """Return shifts by the pairs with the highest peaks that join all recordings; 0 for those that none joins."""
+    """Return shifts by the pairs with the highest peaks that join all recordings; 0 for those that
+    none joins."""
     shifts = np.zeros(count)
     joined = {0}
     ranked = sorted(pairs.items(), key=lambda item: (-float(item[1].values.max()), item[0]))
     while len(joined) < count:
-        link = next(((i, j, found.best) for (i, j), found in ranked if (i in joined) != (j in joined)), None)
+        link = next(
+            ((i, j, found.best) for (i, j), found in ranked if (i in joined) != (j in joined)), None
+        )
         if link is None:
             break
         i, j, shift = link
@@ -166,7 +188,8 @@ def _spanning(pairs: Mapping[tuple[int, int], Correlation], count: int) -> np.nd
 
 
 def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Correlation]) -> float:
-    """Return the shift of recording ``i`` with the highest sum of correlations, the others as they are."""
+    """Return the shift of recording ``i`` with the highest sum of correlations, the others as they
+    are."""
     curves = []
     for (first, second), found in pairs.items():
         if i not in (first, second):
@@ -176,9 +199,12 @@ def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Corr
         curves.append((own + other, found.values if i == second else found.values[::-1]))
     if not curves:
         return float(shifts[i])
-    low, high = min(own[0] for own, _ in curves), max(own[-1] for own, _ in curves)
+    low = min(own[0] for own, _ in curves)
+    high = max(own[-1] for own, _ in curves)
     grid = np.arange(np.floor(low), np.ceil(high) + 1)
-    total = np.sum([np.interp(grid, own, values, left=0.0, right=0.0) for own, values in curves], axis=0)
+    total = np.sum(
+        [np.interp(grid, own, values, left=0.0, right=0.0) for own, values in curves], axis=0
+    )
     return float(grid[0] + peak_place(total))
 
 
@@ -198,7 +224,8 @@ _WINDOW = 256  # samples of a spectrum: 32 ms
 
 
 def onsets(path: Path) -> np.ndarray | None:
-    """Return (T, B) rises of loudness in B bands, ``RATE`` per second from the first image on; None without sound.
+    """Return (T, B) rises of loudness in B bands, ``RATE`` per second from the first image on; None
+    without sound.
 
     Silence counts as no sound.
     """
@@ -211,11 +238,15 @@ def onsets(path: Path) -> np.ndarray | None:
     edges = np.searchsorted(frequency, _BANDS_HZ)
     loudness = np.empty((len(starts), len(edges) - 1))
     for begin in range(0, len(starts), 4096):  # bounded memory
-        windows = samples[starts[begin : begin + 4096, None] + np.arange(_WINDOW)] * np.hanning(_WINDOW)
+        windows = samples[starts[begin : begin + 4096, None] + np.arange(_WINDOW)] * np.hanning(
+            _WINDOW
+        )
         power = np.abs(np.fft.rfft(windows, axis=1)) ** 2
         loudness[begin : begin + 4096] = np.add.reduceat(power, edges, axis=1)[:, :-1]
     floor = 1e-3 * loudness.mean(axis=0) + 1e-9
-    rises = np.maximum(np.diff(np.log(loudness + floor), axis=0, prepend=np.log(loudness[:1] + floor)), 0.0)
+    rises = np.maximum(
+        np.diff(np.log(loudness + floor), axis=0, prepend=np.log(loudness[:1] + floor)), 0.0
+    )
     return np.minimum(rises, 5.0)
 
 
@@ -226,7 +257,10 @@ def _samples(path: Path) -> np.ndarray | None:
 
     blocks: list[np.ndarray] = []
     count, lead = 0, 0.0
-    with reading(path, "it must be a video; copy or convert it again"), opened_video(path) as container:
+    with (
+        reading(path, "it must be a video; copy or convert it again"),
+        opened_video(path) as container,
+    ):
         if not container.streams.audio:
             return None
         image = container.streams.video[0]
@@ -249,7 +283,8 @@ def _samples(path: Path) -> np.ndarray | None:
     return np.pad(samples, (missing, 0)) if missing >= 0 else samples[-missing:]
 
 
-WHOLE = 0.2  # offsets so near to whole frames, in frames, are taken as whole: they are not known better
+# offsets so near to whole frames, in frames, are taken as whole: they are not known better
+WHOLE = 0.2
 MAX_RATE = 60.0
 _SHOWN = 12
 
@@ -257,14 +292,17 @@ _SHOWN = 12
 def found_starts(films: Sequence[Film]) -> tuple[dict[str, float], str]:
     """Estimate the seconds at which videos begin, by name, the earliest at 0, from their sound.
 
-    Returns also a line on how sure they are. Raises DyngsError: the sound does not tell; says what to give.
+    Returns also a line on how sure they are. Raises DyngsError: the sound does not tell; says what
+    to give.
     """
     found = _by_sound(films)
     rate = min(max(film.rate for film in films), MAX_RATE)
     sure = f"{found.agreeing} of {found.pairs} pairs agree, correlation {found.correlation:.2f}"
     frames = found.shifts / RATE * rate
     if np.abs(frames).max() <= WHOLE:
-        return {film.name: 0.0 for film in films}, f"the videos begin together, by the sound ({sure})"
+        return {
+            film.name: 0.0 for film in films
+        }, f"the videos begin together, by the sound ({sure})"
     rates = [film.rate for film in films]
     if max(rates) <= 1.01 * min(rates) and np.abs(frames - np.round(frames)).max() <= WHOLE:
         frames = np.round(frames)
@@ -279,13 +317,17 @@ def _by_sound(films: Sequence[Film]) -> Alignment:
     heard = [onsets(film.path) for film in films]
     silent = [film.name for film, sound in zip(films, heard, strict=True) if sound is None]
     if silent:
-        raise _unknown(films, f"{silent[0]} has no sound" if len(silent) < len(films) else "there is no sound")
+        raise _unknown(
+            films, f"{silent[0]} has no sound" if len(silent) < len(films) else "there is no sound"
+        )
     sounds = [sound for sound in heard if sound is not None]
     found = {(i, j): correlate(sounds[i], sounds[j]) for i, j in combinations(range(len(films)), 2)}
     pairs = {pair: value for pair, value in found.items() if value is not None}
     aligned = align(pairs, len(films))
     if not aligned.holds:
-        raise _unknown(films, f"the sound agrees for {aligned.agreeing} of {aligned.pairs} pairs only")
+        raise _unknown(
+            films, f"the sound agrees for {aligned.agreeing} of {aligned.pairs} pairs only"
+        )
     return aligned
 
 
@@ -300,4 +342,6 @@ def _unknown(films: Sequence[Film], reason: str) -> DyngsError:
 def describe_starts(starts: Mapping[str, float]) -> str:
     """Return the seconds by camera, in words; the first few of many."""
     named = [f"{name} +{start:.3f} s" for name, start in starts.items()]
-    return ", ".join(named[:_SHOWN]) + (f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else "")
+    return ", ".join(named[:_SHOWN]) + (
+        f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else ""
+    )

@@ -25,7 +25,8 @@ class ColourSection(Section):
         return sh_degree
 
     def measured_after(self, steps: int) -> int | None:
-        """Return the step after which it is measured whose harmonics pay; None where it never is."""
+        """Return the step after which it is measured whose harmonics pay; None where it never
+        is."""
         return None
 
 
@@ -38,7 +39,8 @@ class ShColour(ColourSection):
 
 
 class NetworkColour(ColourSection):
-    """Three base values per Gaussian and one small network for all (MEGA, Zhang et al. 2024); no harmonics."""
+    """Three base values per Gaussian and one small network for all (MEGA, Zhang et al. 2024); no
+    harmonics."""
 
     kind: Literal["network"] = Field(
         default="network",
@@ -48,7 +50,8 @@ class NetworkColour(ColourSection):
     width: int = Field(default=32, ge=1, description="neurons per hidden layer; MEGA: 64")
     depth: int = Field(default=2, ge=1, le=8, description="hidden layers")
     lr: Positive = Field(
-        default=0.01, description="learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run"
+        default=0.01,
+        description="learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run",
     )
 
     def stored_degree(self, sh_degree: int) -> int:
@@ -57,7 +60,8 @@ class NetworkColour(ColourSection):
 
 
 class AutoColour(ColourSection):
-    """Harmonics only for the Gaussians whose dependence on the view pays on held-out training views."""
+    """Harmonics only for the Gaussians whose dependence on the view pays on held-out training
+    views."""
 
     kind: Literal["auto"] = Field(
         default="auto",

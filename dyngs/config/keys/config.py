@@ -1,4 +1,5 @@
-"""All sections together: ``Config``, everything that decides a run, and those of its sections that are short."""
+"""All sections together: ``Config``, everything that decides a run, and those of its sections that
+are short."""
 
 from __future__ import annotations
 
@@ -33,11 +34,15 @@ class CameraConfig(Section):
 
 
 class PruneConfig(Section):
-    """A last stage with fewer Gaussians, after ``train.steps`` (docs/prune.md). Off where nothing is asked for."""
+    """A last stage with fewer Gaussians, after ``train.steps`` (docs/prune.md). Off where nothing
+    is asked for."""
 
-    fraction: float = Field(default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none")
+    fraction: float = Field(
+        default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none"
+    )
     score: Literal["variation", "sensitivity", "contribution"] = Field(
-        default="sensitivity", description="importance of a Gaussian (docs/prune.md); the lowest are removed"
+        default="sensitivity",
+        description="importance of a Gaussian (docs/prune.md); the lowest are removed",
     )
     mask_times: int = Field(
         default=0,
@@ -54,9 +59,13 @@ class PruneConfig(Section):
 class BudgetConfig(Section):
     """Limits that a run keeps (docs/budget.md); null: none."""
 
-    max_gaussians: int | None = Field(default=None, ge=1, description="most Gaussians at the end of the run")
+    max_gaussians: int | None = Field(
+        default=None, ge=1, description="most Gaussians at the end of the run"
+    )
     max_mb: float | None = Field(
-        default=None, gt=0, description="largest size of `export/scene.dyngs`, 1e6 bytes; the file is then written"
+        default=None,
+        gt=0,
+        description="largest size of `export/scene.dyngs`, 1e6 bytes; the file is then written",
     )
 
 
@@ -68,10 +77,12 @@ class RunConfig(Section):
     seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
     threads: int = Field(default=0, ge=0, le=1024, description="CPU threads; 0: one per core")
     device: Literal["auto", "cpu", "cuda"] = Field(
-        default="auto", description="what computes; auto: a CUDA GPU that can be used (docs/gpu.md), else the CPU"
+        default="auto",
+        description="what computes; auto: a CUDA GPU that can be used (docs/gpu.md), else the CPU",
     )
     deterministic: bool = Field(
-        default=True, description="on a GPU: the same bytes on every run; false may be faster (the CPU's always are)"
+        default=True,
+        description="on a GPU: the same bytes on every run; false may be faster (the CPU's always are)",
     )
 
 
@@ -80,16 +91,22 @@ class Config(Section):
 
     data: DataConfig
     camera: CameraConfig = CameraConfig()
-    model: Annotated[AnyModel, Field(discriminator="kind", description="what is trained")] = StaticModel()
+    model: Annotated[AnyModel, Field(discriminator="kind", description="what is trained")] = (
+        StaticModel()
+    )
     init: Annotated[
         PointsInit | RandomInit | SceneInit,
         Field(discriminator="kind", description="where the first Gaussians come from"),
     ] = PointsInit()
     colour: Annotated[
-        ShColour | NetworkColour | AutoColour, Field(discriminator="kind", description="what colours are made of")
+        ShColour | NetworkColour | AutoColour,
+        Field(discriminator="kind", description="what colours are made of"),
     ] = ShColour()
     strategy: Annotated[
-        Strategy, Field(discriminator="kind", description="how Gaussians are added and removed during training")
+        Strategy,
+        Field(
+            discriminator="kind", description="how Gaussians are added and removed during training"
+        ),
     ] = DefaultStrategy()
     optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig()
@@ -99,7 +116,9 @@ class Config(Section):
 
     @property
     def total_steps(self) -> int:
-        return self.train.steps + (self.prune.steps if self.prune.is_wanted and self.model.made_of_gaussians else 0)
+        return self.train.steps + (
+            self.prune.steps if self.prune.is_wanted and self.model.made_of_gaussians else 0
+        )
 
     @property
     def stored_sh_degree(self) -> int:

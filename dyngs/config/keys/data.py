@@ -32,9 +32,13 @@ class DataConfig(Section):
         "odm",
         "llff",
         "camera_folders",
-    ] = Field(default="auto", description="layout of the capture's files (docs/formats.md); auto: detected")
+    ] = Field(
+        default="auto",
+        description="layout of the capture's files (docs/formats.md); auto: detected",
+    )
     frames: str | None = Field(
-        default=None, description="start:stop:step over the capture's times, as a Python slice; null: all"
+        default=None,
+        description="start:stop:step over the capture's times, as a Python slice; null: all",
     )
     pose_frames: str | None = Field(
         default=None,
@@ -58,11 +62,16 @@ class DataConfig(Section):
         description="with times=order: so many numbers, or places in the order, are a second; null: not known",
     )
     skip_missing: bool = Field(
-        default=False, description="leave out views whose images are missing, instead of stopping with an error"
+        default=False,
+        description="leave out views whose images are missing, instead of stopping with an error",
     )
-    downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the images by this")
+    downscale: float = Field(
+        default=1.0, ge=1.0, description="divide width and height of the images by this"
+    )
     longest_side: int | None = Field(
-        default=None, ge=1, description="shrink images so that the longer side has at most this many px; null: do not"
+        default=None,
+        ge=1,
+        description="shrink images so that the longer side has at most this many px; null: do not",
     )
     undistort: Literal["same_focal", "wide"] = Field(
         default="same_focal",
@@ -70,7 +79,9 @@ class DataConfig(Section):
         "what lies beyond its edges is lost; wide: of a shorter one that shows all the lens saw, within 120 degrees",
     )
     test_every: int = Field(
-        default=8, ge=0, description="hold out every n-th image by name where the capture has no split; 0: none"
+        default=8,
+        ge=0,
+        description="hold out every n-th image by name where the capture has no split; 0: none",
     )
     background: Literal["auto", "white", "black", "random"] = Field(
         default="auto",
@@ -78,11 +89,17 @@ class DataConfig(Section):
         "random: another one in each step",
     )
     body: Path | None = Field(
-        default=None, description="folder of a fit by `dyngs data fit`, read in place of the capture's body parameters"
+        default=None,
+        description="folder of a fit by `dyngs data fit`, read in place of the capture's body parameters",
     )
     cache_mb: float = Field(default=4096, ge=0, description="memory for decoded images, MB")
-    frame_cache_mb: float = Field(default=4096, ge=0, description="disk space for decoded video frames, MB")
-    follow_links: bool = Field(default=False, description="allow files of the capture that lie outside its folder")
+    frame_cache_mb: float = Field(
+        default=4096, ge=0, description="disk space for decoded video frames, MB"
+    )
+    follow_links: bool = Field(
+        default=False, description="allow files of the capture that lie outside its folder"
+    )
     max_megapixels: Positive = Field(
-        default=MAX_MEGAPIXELS, description="images and videos with more megapixels are refused, not decoded"
+        default=MAX_MEGAPIXELS,
+        description="images and videos with more megapixels are refused, not decoded",
     )

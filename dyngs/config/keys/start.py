@@ -11,7 +11,8 @@ from dyngs.section import Length, Section
 
 
 class PointsInit(Section):
-    """Start from the capture's sparse points, else from triangulated ones, else from random ones."""
+    """Start from the capture's sparse points, else from triangulated ones, else from random
+    ones."""
 
     kind: Literal["auto", "points"] = Field(
         default="auto", description="the capture's points, else triangulated, else random ones"
@@ -39,7 +40,9 @@ class PointsInit(Section):
 class RandomInit(Section):
     """Start from uniformly random points in a cube around the origin (Blender scenes of 3DGS)."""
 
-    kind: Literal["random"] = Field(default="random", description="points drawn uniformly in a cube around the origin")
+    kind: Literal["random"] = Field(
+        default="random", description="points drawn uniformly in a cube around the origin"
+    )
     num_random: int = Field(
         default=20_000, ge=1, description="number of random points; auto: where there are no others"
     )
@@ -57,11 +60,15 @@ class SceneInit(Section):
     half_extent: ClassVar[Length] = "auto"
     """Of a placeholder, where a checkpoint is read instead."""
 
-    kind: Literal["scene"] = Field(default="scene", description="the Gaussians of a scene (`dyngs train --from`)")
+    kind: Literal["scene"] = Field(
+        default="scene", description="the Gaussians of a scene (`dyngs train --from`)"
+    )
     scene: Path = Field(description="run or file of Gaussians, in the world of the capture")
     trains: Literal["all", "colour"] = Field(
-        default="all", description="what is trained; colour: positions, shapes and opacities stay, none are added"
+        default="all",
+        description="what is trained; colour: positions, shapes and opacities stay, none are added",
     )
     box: tuple[float, float, float, float, float, float] | None = Field(
-        default=None, description="low and high corner [x,y,z,x,y,z]: what is outside stays as it is; null: nothing"
+        default=None,
+        description="low and high corner [x,y,z,x,y,z]: what is outside stays as it is; null: nothing",
     )

@@ -1,4 +1,5 @@
-"""Sections ``strategy`` and ``optim``: how the set of Gaussians grows and shrinks, and how fast they learn."""
+"""Sections ``strategy`` and ``optim``: how the set of Gaussians grows and shrinks, and how fast
+they learn."""
 
 from __future__ import annotations
 
@@ -16,20 +17,28 @@ class DefaultStrategy(Section):
     """Clone, split and prune by the gradient of the 2D means (3DGS, AbsGS as an option)."""
 
     kind: Literal["default"] = Field(
-        default="default", description="clone, split and prune by the gradient of the 2D means (3DGS)"
+        default="default",
+        description="clone, split and prune by the gradient of the 2D means (3DGS)",
     )
     absgrad: bool = Field(
-        default=False, description="sum absolute gradients of pixels (AbsGS, Ye et al. 2024); grad_threshold=8e-4 suits"
+        default=False,
+        description="sum absolute gradients of pixels (AbsGS, Ye et al. 2024); grad_threshold=8e-4 suits",
     )
     grad_threshold: Positive = Field(
         default=2e-4,
         description="Gaussians with a larger mean gradient of their 2D mean, NDC units, are cloned or split; lowered "
         "in runs shorter than 30,000 steps",
     )
-    start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
-    stop: int = Field(default=15_000, description=f"step {_OF_30000}, from which their number is fixed")
+    start: int = Field(
+        default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed"
+    )
+    stop: int = Field(
+        default=15_000, description=f"step {_OF_30000}, from which their number is fixed"
+    )
     every: int | None = Field(default=None, ge=1, description=_EVERY)
-    prune_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are removed")
+    prune_opacity: Fraction = Field(
+        default=0.005, description="Gaussians with a lower opacity are removed"
+    )
     reset_every: int | None = Field(
         default=3000,
         ge=1,
@@ -42,8 +51,12 @@ class DefaultStrategy(Section):
         description="when no more Gaussians are added, those are removed that make up less than so many pixels of "
         "every training view; static scenes only; 0: none",
     )
-    grow: bool = Field(default=True, description="clone and split Gaussians; false: they are only removed")
-    max_gaussians: int = Field(default=3_000_000, ge=1, description="no Gaussians are added beyond so many")
+    grow: bool = Field(
+        default=True, description="clone and split Gaussians; false: they are only removed"
+    )
+    max_gaussians: int = Field(
+        default=3_000_000, ge=1, description="no Gaussians are added beyond so many"
+    )
 
     @property
     def growth_limit(self) -> int:
@@ -62,16 +75,28 @@ class McmcStrategy(Section):
         default="mcmc",
         description="a fixed cap, relocation of transparent Gaussians, noise (3DGS-MCMC, Kheradmand et al. 2024)",
     )
-    max_gaussians: int = Field(default=300_000, ge=1, description="cap that the number of Gaussians grows to")
-    start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
-    stop: int = Field(default=25_000, description=f"step {_OF_30000}, from which their number is fixed")
+    max_gaussians: int = Field(
+        default=300_000, ge=1, description="cap that the number of Gaussians grows to"
+    )
+    start: int = Field(
+        default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed"
+    )
+    stop: int = Field(
+        default=25_000, description=f"step {_OF_30000}, from which their number is fixed"
+    )
     every: int | None = Field(default=None, ge=1, description=_EVERY)
-    min_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are relocated")
+    min_opacity: Fraction = Field(
+        default=0.005, description="Gaussians with a lower opacity are relocated"
+    )
     noise: float = Field(
-        default=5e5, ge=0, description="strength of the noise on positions, times their learning rate; 0: none"
+        default=5e5,
+        ge=0,
+        description="strength of the noise on positions, times their learning rate; 0: none",
     )
     opacity_reg: float = Field(default=0.01, ge=0, description="weight of the mean opacity")
-    scale_reg: float = Field(default=0.01, ge=0, description="weight of the mean scale, scene units")
+    scale_reg: float = Field(
+        default=0.01, ge=0, description="weight of the mean scale, scene units"
+    )
 
     @property
     def growth_limit(self) -> int:
@@ -84,7 +109,9 @@ class McmcStrategy(Section):
 class FixedStrategy(Section):
     """The first Gaussians stay: none are added, none removed."""
 
-    kind: Literal["fixed"] = Field(default="fixed", description="the first Gaussians stay, none are added or removed")
+    kind: Literal["fixed"] = Field(
+        default="fixed", description="the first Gaussians stay, none are added or removed"
+    )
 
     @property
     def start(self) -> int:
@@ -114,15 +141,22 @@ class OptimConfig(Section):
         description="multiplies all rates below, also given ones; 1: exactly these; null: in static scenes those of "
         "positions by the square root of 30000 / train.steps, all others by its cube root; from 500 to 30000 steps",
     )
-    lr_means: Positive = Field(default=1.6e-4, description="learning rate of positions, times the scene extent")
+    lr_means: Positive = Field(
+        default=1.6e-4, description="learning rate of positions, times the scene extent"
+    )
     lr_means_final: Positive = Field(
         default=1.6e-6, description="the same at the end of the run, reached exponentially"
     )
     lr_sh_dc: Positive = Field(default=2.5e-3, description="learning rate of base colours")
-    lr_sh_rest: Positive = Field(default=1.25e-4, description="learning rate of the other harmonics")
-    lr_opacities: Positive = Field(default=0.05, description="learning rate of the logits of opacities")
+    lr_sh_rest: Positive = Field(
+        default=1.25e-4, description="learning rate of the other harmonics"
+    )
+    lr_opacities: Positive = Field(
+        default=0.05, description="learning rate of the logits of opacities"
+    )
     lr_scales: Positive = Field(default=5e-3, description="learning rate of log-scales")
     lr_quats: Positive = Field(default=1e-3, description="learning rate of rotations (quaternions)")
     sparse: bool = Field(
-        default=False, description="update only Gaussians that received a gradient in the step; faster, not the same"
+        default=False,
+        description="update only Gaussians that received a gradient in the step; faster, not the same",
     )

@@ -12,7 +12,9 @@ from dyngs.section import Fraction, Section
 class TrainConfig(Section):
     """Length, loss and logging of a run."""
 
-    steps: int = Field(default=7000, ge=1, description="optimisation steps; all schedules follow this number")
+    steps: int = Field(
+        default=7000, ge=1, description="optimisation steps; all schedules follow this number"
+    )
     minutes: float | None = Field(
         default=None,
         gt=0,
@@ -27,10 +29,12 @@ class TrainConfig(Section):
         "(docs/several_processes.md), and 1 means one for each process there",
     )
     initial_downscale: Literal[1, 2, 4, 8, 16] = Field(
-        default=1, description="sides of the training images are divided by this at first; 1: full resolution"
+        default=1,
+        description="sides of the training images are divided by this at first; 1: full resolution",
     )
     resolution_grows_from: Fraction = Field(
-        default=0.4, description="fraction of the run after which initial_downscale is halved for the first time"
+        default=0.4,
+        description="fraction of the run after which initial_downscale is halved for the first time",
     )
     resolution_full_at: Fraction = Field(
         default=0.7, description="fraction of the run after which images have their full resolution"
@@ -77,9 +81,15 @@ class TrainConfig(Section):
         description="minutes of training between checkpoints, longer where saving takes more than a twentieth of that; "
         "the newest two are kept; 0: only the last",
     )
-    save_every: int = Field(default=0, ge=0, description="steps between checkpoints, in addition; 0: none by steps")
-    eval_every: int = Field(default=0, ge=0, description="steps between evaluations; 0: only by `dyngs eval`")
-    tensorboard: bool = Field(default=False, description="also log to RUN/tensorboard (pip install dyngs[tensorboard])")
+    save_every: int = Field(
+        default=0, ge=0, description="steps between checkpoints, in addition; 0: none by steps"
+    )
+    eval_every: int = Field(
+        default=0, ge=0, description="steps between evaluations; 0: only by `dyngs eval`"
+    )
+    tensorboard: bool = Field(
+        default=False, description="also log to RUN/tensorboard (pip install dyngs[tensorboard])"
+    )
 
     @field_validator("alpha_weight", mode="before")
     @classmethod

@@ -61,7 +61,9 @@ class ColourTags:
         if self.transfer == _HLG:
             return f"HLG is tone-mapped to SDR (white: {_HLG_WHITE:.0%} of the signal; brighter is clipped)"
         if self.transfer == _PQ:
-            return f"PQ is tone-mapped to SDR (white: {_REFERENCE_WHITE:g} cd/m2; brighter is clipped)"
+            return (
+                f"PQ is tone-mapped to SDR (white: {_REFERENCE_WHITE:g} cd/m2; brighter is clipped)"
+            )
         name = {BT2020: "BT.2020", _DISPLAY_P3: "Display P3"}.get(self.primaries)
         return f"colours are converted from {name} to BT.709" if name else ""
 
@@ -83,7 +85,11 @@ def to_srgb(pixels: np.ndarray, tags: ColourTags, white: int = _LEVELS) -> np.nd
 
 def srgb_encoded(linear: np.ndarray) -> np.ndarray:
     """Return the sRGB signal of linear light in [0, 1]."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.where(
+        linear <= 0.0031308,
+        12.92 * linear,
+        1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
+    )
 
 
 def srgb_decoded(signal: np.ndarray) -> np.ndarray:
@@ -115,7 +121,9 @@ def _hlg_linear(signal: np.ndarray) -> np.ndarray:
 def _pq_linear(signal: np.ndarray) -> np.ndarray:
     """Light in 10,000 cd/m2 by the EOTF of PQ, BT.2100 table 4."""
     power = signal ** (1 / 78.84375)
-    return (np.maximum(power - 0.8359375, 0.0) / (18.8515625 - 18.6875 * power)) ** (1 / 0.1593017578125)
+    return (np.maximum(power - 0.8359375, 0.0) / (18.8515625 - 18.6875 * power)) ** (
+        1 / 0.1593017578125
+    )
 
 
 @lru_cache

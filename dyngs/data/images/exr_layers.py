@@ -9,7 +9,8 @@ BEAUTY_NAMES = (
     "", "rgba", "rgb", "combined", "c", "ci", "beauty", "main", "image", "final", "color", "colour",
     "composite",
 )  # fmt: skip
-"""Last words of a layer's name that mean the beauty pass, best first; "": channels without a layer."""
+"""Last words of a layer's name that mean the beauty pass, best first; "": channels without a
+layer."""
 _SHORT = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 
 

@@ -1,8 +1,10 @@
-"""Cache of video frames as image files: decoded once, within a disk limit, found again by the video's content.
+"""Cache of video frames as image files: decoded once, within a disk limit, found again by the
+video's content.
 
-The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to them holds
-the video's size and frame rate and marks the folder as ours. Nothing is ever written to a capture. Only files named
-like ours in folders with that mark are removed, never through a link.
+The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json``
+next to them holds the video's size and frame rate and marks the folder as ours. Nothing is ever
+written to a capture. Only files named like ours in folders with that mark are removed, never
+through a link.
 """
 
 from __future__ import annotations
@@ -36,16 +38,19 @@ except ImportError:  # Windows, where a folder with an open file in it cannot be
 WHOLE_BYTES = 2**30  # larger videos are compared by samples and modification time only
 _MARK_NAME = "video.json"
 _MARK = "frames that dyngs decoded from a video; the folder may be removed"
-_NUM_SAMPLES, _SAMPLE_BYTES = 256, 2**20
+_NUM_SAMPLES = 256
+_SAMPLE_BYTES = 2**20
 _OUR_FILES = re.compile(r"\.?(frame_\d{6,}|video)(\.\d+-[0-9a-f]{6}\.dyngs)?\.(png|json)")
 _MAX_LOCKED = 256
 _locked: dict[Path, BinaryIO] = {}
-"""Marks that this process keeps open and locked, so that no other process removes frames that it reads."""
+"""Marks that this process keeps open and locked, so that no other process removes frames that it
+reads."""
 
 
 @dataclass(frozen=True)
 class VideoFrames:
-    """Image files of the frames of the video ``source``, in order; ``decode_frames`` writes those that are missing."""
+    """Image files of the frames of the video ``source``, in order; ``decode_frames`` writes those
+    that are missing."""
 
     info: VideoInfo
     source: Path
@@ -62,19 +67,24 @@ def planned_frames(video: Path) -> VideoFrames:
         raise DyngsError(f"{video}: cannot be opened ({error.strerror})") from None
     label = re.sub(r"[^A-Za-z0-9-]", "_", video.stem)[:40]
     # Two cameras may have filmed the same: the name keeps their frames apart.
-    named = hashlib.sha256(os.fsencode(video.name) + b"\0" + digest + DECODER_VERSION).hexdigest()[:32]
+    named = hashlib.sha256(os.fsencode(video.name) + b"\0" + digest + DECODER_VERSION).hexdigest()[
+        :32
+    ]
     folder = cache_folder("frames") / f"{label}.{named}"
     info = _stored_info(folder) or probe_video(video)
-    return VideoFrames(info, video, tuple(folder / f"frame_{number:06d}.png" for number in range(info.num_frames)))
+    return VideoFrames(
+        info, video, tuple(folder / f"frame_{number:06d}.png" for number in range(info.num_frames))
+    )
 
 
 def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float) -> None:
     """Decode the frames whose image is missing; every file is written atomically.
 
-    The total size is estimated from the frames written so far, from the first on, so that too much is refused early.
-    The least recently used frames of other captures are removed to make room, unless a running process uses them. All
-    may take ``limit_mb`` 1e6 bytes on disk. Raises DyngsError: a damaged video (names it and the frame), more than the
-    limit or than the disk has (says how much).
+    The total size is estimated from the frames written so far, from the first on, so that too much
+    is refused early. The least recently used frames of other captures are removed to make room,
+    unless a running process uses them. All may take ``limit_mb`` 1e6 bytes on disk. Raises
+    DyngsError: a damaged video (names it and the frame), more than the limit or than the disk has
+    (says how much).
     """
     videos = {path.parent: frame.video for path, frame in frames.items()}
     for folder in videos:
@@ -85,14 +95,17 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
             missing.setdefault(path.parent, []).append(frames[path].number)
     if not missing:
         return
-    need, count, written = sum(map(len, missing.values())), 0, 0
+    need = sum(map(len, missing.values()))
+    count = 0
+    written = 0
     space = _DiskSpace(root, frozenset(videos), limit_mb)
     for folder, numbers in missing.items():
         _make(folder, videos[folder])
         for number, rgb in read_numbered_frames(videos[folder], numbers):
             path = folder / f"frame_{number:06d}.png"
             _write_png(path, rgb)
-            count, written = count + 1, written + path.stat().st_size
+            count = count + 1
+            written = written + path.stat().st_size
             space.check(written, written * need / count)
 
 
@@ -113,14 +126,17 @@ def _make(folder: Path, video: Path) -> None:
 
 
 def _write_png(path: Path, rgb: np.ndarray) -> None:
-    """Write (H, W, 3) uint8 with little compression: a third of the time of the usual level, a tenth more bytes."""
+    """Write (H, W, 3) uint8 with little compression: a third of the time of the usual level, a
+    tenth more bytes."""
     import OpenImageIO as oiio
 
     spec = oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, oiio.UINT8)
     spec.attribute("png:compressionLevel", 1)
     with atomic_file(path) as temporary, reading(path, "the disk may be full"):
         output = oiio.ImageOutput.create(str(temporary))
-        written = output is not None and output.open(str(temporary), spec) and output.write_image(rgb)
+        written = (
+            output is not None and output.open(str(temporary), spec) and output.write_image(rgb)
+        )
         problem = image_error(oiio if output is None else output)
         if output is None or not (output.close() and written):
             raise DyngsError(f"cannot write {path}: {problem or 'the disk may be full'}")
@@ -130,7 +146,8 @@ def _write_png(path: Path, rgb: np.ndarray) -> None:
 def _digest(video: Path, size: int, changed_ns: int) -> bytes:
     """SHA-256 of size and bytes; for huge files of size, samples and modification time.
 
-    The time is included because a copy that was cut off and then completed may agree in all samples.
+    The time is included because a copy that was cut off and then completed may agree in all
+    samples.
     """
     digest = hashlib.sha256(str(size).encode())
     with video.open("rb") as file:
@@ -160,7 +177,8 @@ def _stored_info(folder: Path) -> VideoInfo | None:
 
 
 def _lock(folder: Path) -> None:
-    """Protect the folder, if it exists, from removal by other processes while this one lives, and note its use."""
+    """Protect the folder, if it exists, from removal by other processes while this one lives, and
+    note its use."""
     mark = folder / _MARK_NAME
     if _stored_info(folder) is None:
         return
@@ -173,7 +191,9 @@ def _lock(folder: Path) -> None:
             if fcntl is not None:
                 fcntl.flock(_locked[folder], fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
-        pass  # a read-only cache, or another process is removing it: what is missing then is decoded again
+        # a read-only cache, or another process is removing it: what is missing then is decoded
+        # again
+        pass
 
 
 class _DiskSpace:
@@ -189,7 +209,9 @@ class _DiskSpace:
 
         Raises DyngsError: it is more than the limit, or than other processes or the disk leave.
         """
-        total, limit, cache = self._used + end, self._limit_mb * 1e6, cache_folder("frames")
+        total = self._used + end
+        limit = self._limit_mb * 1e6
+        cache = cache_folder("frames")
         if total > limit:
             others = f", of which {self._used / 1e6:.4g} MB are there already" if self._used else ""
             raise DyngsError(
@@ -214,7 +236,8 @@ class _DiskSpace:
 
 
 def _removed(kept: frozenset[Path], too_much: float) -> int:
-    """Remove the least recently used frames, except in ``kept``, until ``too_much`` bytes are freed; return these."""
+    """Remove the least recently used frames, except in ``kept``, until ``too_much`` bytes are
+    freed; return these."""
     gone = 0
     others = [folder for folder in _our_folders() if folder not in kept and folder not in _locked]
     for folder in sorted(others, key=lambda folder: (folder / _MARK_NAME).stat().st_mtime_ns):
@@ -228,7 +251,8 @@ def _our_folders() -> list[Path]:
 
 
 def _remove(folder: Path) -> int:
-    """Remove our files from a folder, and the folder if nothing else is in it; return the bytes freed."""
+    """Remove our files from a folder, and the folder if nothing else is in it; return the bytes
+    freed."""
     freed = 0
     try:
         if fcntl is None:
@@ -250,7 +274,9 @@ def _remove(folder: Path) -> int:
 
 def _own_files(folder: Path) -> list[Path]:
     with os.scandir(folder) as entries:
-        ours = [x for x in entries if x.is_file(follow_symlinks=False) and _OUR_FILES.fullmatch(x.name)]
+        ours = [
+            x for x in entries if x.is_file(follow_symlinks=False) and _OUR_FILES.fullmatch(x.name)
+        ]
     return [Path(found.path) for found in ours]
 
 

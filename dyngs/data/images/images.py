@@ -1,4 +1,5 @@
-"""Image files: headers, EXIF tags, decoding to 8-bit sRGB with straight alpha, exact area downscaling."""
+"""Image files: headers, EXIF tags, decoding to 8-bit sRGB with straight alpha, exact area
+downscaling."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0}
 _FOCAL_RANGE = (0.1, 20.0)
-"""Plausible focal lengths in units of the image's longer side; others are taken for mistakes of a tag."""
+"""Plausible focal lengths in units of the image's longer side; others are taken for mistakes of a
+tag."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class PhotoTags:
     Attributes:
         orientation: 1 to 8; 1 = upright, 2 to 4 = mirrored or upside down, 5 to 8 = lying.
         focal_px: focal length in pixels of the stored image.
-        exposure: light let in: seconds of exposure x ISO / 100 / f-number squared, each factor 1 where its tag is
-            missing; None without a time of exposure.
+        exposure: light let in: seconds of exposure x ISO / 100 / f-number squared, each factor 1
+            where its tag is missing; None without a time of exposure.
         model: name of the camera.
     """
 
@@ -60,7 +62,8 @@ def tags_of(spec: OpenImageIO.ImageSpec) -> PhotoTags:
 
 
 def is_lying(orientation: int) -> bool:
-    """Whether width and height are exchanged when an image of this orientation is rotated upright."""
+    """Whether width and height are exchanged when an image of this orientation is rotated
+    upright."""
     return orientation >= 5
 
 
@@ -68,15 +71,19 @@ def rotated_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return the (H, W, D) image as the orientation of EXIF says it is to be shown; exact."""
     if orientation == 1:
         return pixels
-    down, across = orientation in (3, 4, 6, 7), orientation in (2, 3, 7, 8)
+    down = orientation in (3, 4, 6, 7)
+    across = orientation in (2, 3, 7, 8)
     rotated = pixels[:: -1 if down else 1, :: -1 if across else 1]
     return np.ascontiguousarray(rotated.swapaxes(0, 1) if is_lying(orientation) else rotated)
 
 
 def _focal_px(spec: OpenImageIO.ImageSpec) -> float | None:
-    """Focal length from its equivalent for 35 mm film (by the diagonals), else from the resolution of the sensor."""
+    """Focal length from its equivalent for 35 mm film (by the diagonals), else from the resolution
+    of the sensor."""
     focal = None
-    film = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", spec.get_int_attribute("Exif:FocalLengthIn35mmFilm"))
+    film = spec.get_float_attribute(
+        "Exif:FocalLengthIn35mmFilm", spec.get_int_attribute("Exif:FocalLengthIn35mmFilm")
+    )
     millimetres = spec.get_float_attribute("Exif:FocalLength")
     density = spec.get_float_attribute("Exif:FocalPlaneXResolution")
     unit = _MM_PER_UNIT.get(spec.get_int_attribute("Exif:FocalPlaneResolutionUnit", 2))
@@ -110,7 +117,8 @@ END_MARKERS = {"png": _PNG_END, "jpeg": b"\xff\xd9"}
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of an image file: size and channels as stored, whether one is alpha, the camera's tags.
+    """Header of an image file: size and channels as stored, whether one is alpha, the camera's
+    tags.
 
     Attributes:
         format_name: OpenImageIO's name of the format of the content.
@@ -136,10 +144,11 @@ class ImageHeader:
         return (self.height, self.width) if is_lying(self.tags.orientation) else self.size
 
     def size_for(self, described: tuple[int, int] | None) -> tuple[int, int]:
-        """Return the stored or the upright (width, height), that which has the shape of a camera's ``described`` one.
+        """Return the stored or the upright (width, height), that which has the shape of a camera's
+        ``described`` one.
 
-        Programs that find poses take images as stored or upright, and their cameras say which. Where both have that
-        shape it is the stored one, which is what COLMAP takes.
+        Programs that find poses take images as stored or upright, and their cameras say which.
+        Where both have that shape it is the stored one, which is what COLMAP takes.
         """
         if described is None:
             return self.upright_size
@@ -149,10 +158,13 @@ class ImageHeader:
 
 
 def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Return the files directly in a folder that end in one of the suffixes, by name; hidden files are left out."""
+    """Return the files directly in a folder that end in one of the suffixes, by name; hidden files
+    are left out."""
     found = folder.iterdir() if folder.is_dir() else ()
     return sorted(
-        path for path in found if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
+        path
+        for path in found
+        if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
     )
 
 
@@ -166,9 +178,11 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def header_if_readable(path: Path) -> ImageHeader | None:
-    """Read the header of a capture's image; None where it is missing or damaged, which the loader reports.
+    """Read the header of a capture's image; None where it is missing or damaged, which the loader
+    reports.
 
-    Raises DyngsError: the image lies outside the capture, or is larger than ``data.max_megapixels``.
+    Raises DyngsError: the image lies outside the capture, or is larger than
+    ``data.max_megapixels``.
     """
     inside(path)
     try:
@@ -182,14 +196,14 @@ def header_if_readable(path: Path) -> ImageHeader | None:
 def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
     """Read an image as (H, W, 3) or, with alpha, (H, W, 4) uint8: sRGB, straight alpha.
 
-    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear:
-    they are clamped to [0, 1] and encoded as sRGB. Premultiplied colours (EXR, TIFF with associated
-    alpha) are divided by alpha. Grey becomes RGB. Of an EXR with several layers, the beauty pass is
-    read, in its display window.
+    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are
+    linear: they are clamped to [0, 1] and encoded as sRGB. Premultiplied colours (EXR, TIFF with
+    associated alpha) are divided by alpha. Grey becomes RGB. Of an EXR with several layers, the
+    beauty pass is read, in its display window.
 
     Args:
-        size: (width, height) of its camera; an image that has this shape only when it is rotated as its EXIF tag says
-            is rotated. None: as stored.
+        size: (width, height) of its camera; an image that has this shape only when it is rotated as
+            its EXIF tag says is rotated. None: as stored.
         upright: rotate it as its EXIF tag says in any case.
     """
     import OpenImageIO as oiio
@@ -198,7 +212,9 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
         source = _open(path)
         header = _header(source)
         is_exact = not _is_float(source.spec) and not source.is_premultiplied
-        pixels = _decoded(path, source.reader, oiio.TypeDesc(oiio.UINT8 if is_exact else oiio.FLOAT))
+        pixels = _decoded(
+            path, source.reader, oiio.TypeDesc(oiio.UINT8 if is_exact else oiio.FLOAT)
+        )
         if upright or (size is not None and header.size_for(size) != header.size):
             pixels = rotated_upright(pixels, header.tags.orientation)
         return torch.as_tensor(np.ascontiguousarray(_straight_srgb(pixels, source)), device="cpu")
@@ -209,7 +225,8 @@ def _reading(path: Path) -> AbstractContextManager[None]:
 
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
-    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers."""
+    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are
+    whole numbers."""
     with _reading(path):
         reader = _open_reader(path)
         spec = reader.spec()
@@ -217,12 +234,14 @@ def read_raw(path: Path) -> tuple[np.ndarray, bool]:
 
 
 def read_mask(path: Path) -> Tensor:
-    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half."""
+    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one
+    half."""
     return read_image(path)[..., :3].float().mean(dim=-1) >= 127.5
 
 
 def check_image(path: Path) -> ImageHeader:
-    """Read the header and check that the file is very likely complete: a JPEG without end marker is decoded."""
+    """Read the header and check that the file is very likely complete: a JPEG without end marker is
+    decoded."""
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
     marker = END_MARKERS.get(header.format_name)
@@ -231,14 +250,19 @@ def check_image(path: Path) -> ImageHeader:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
             complete = marker in file.read()
         if not complete and marker == _PNG_END:  # not decoded: libpng would print lines of its own
-            raise DyngsError(f"{path}: the image is truncated or damaged (its end is missing); copy it again")
+            raise DyngsError(
+                f"{path}: the image is truncated or damaged (its end is missing); copy it again"
+            )
         if not complete:
             read_image(path)
     return header
 
 
-def target_size(width: int, height: int, downscale: float = 1.0, longest_side: int | None = None) -> tuple[int, int]:
-    """Return (width, height) divided by ``downscale`` and shrunk to at most ``longest_side``; never enlarged."""
+def target_size(
+    width: int, height: int, downscale: float = 1.0, longest_side: int | None = None
+) -> tuple[int, int]:
+    """Return (width, height) divided by ``downscale`` and shrunk to at most ``longest_side``; never
+    enlarged."""
     factor = max(1.0, downscale)
     if longest_side is not None:
         factor = max(factor, max(width, height) / longest_side)
@@ -246,23 +270,29 @@ def target_size(width: int, height: int, downscale: float = 1.0, longest_side: i
 
 
 def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
-    """Return a (height, width, D) image; each pixel is the exact mean of the area of ``pixels`` (H, W, D) it covers.
+    """Return a (height, width, D) image; each pixel is the exact mean of the area of ``pixels`` (H,
+    W, D) it covers.
 
-    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered fraction.
+    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the
+    covered fraction.
     """
     return _shrink_axis(_shrink_axis(pixels, 0, pixels.shape[0], height), 1, pixels.shape[1], width)
 
 
 def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
-    """Return ``straight_uint8(area_downscale(premultiplied(pixels), width, height))``, a strip of rows at a time.
+    """Return ``straight_uint8(area_downscale(premultiplied(pixels), width, height))``, a strip of
+    rows at a time.
 
-    A photo of 12 megapixels takes 0.6 GB as floats with what is computed from them, and strips fit into caches.
+    A photo of 12 megapixels takes 0.6 GB as floats with what is computed from them, and strips fit
+    into caches.
     """
     old = pixels.shape[0]
-    step, parts = max(1, _STRIP_PIXELS * height // (old * pixels.shape[1])), []
+    step = max(1, _STRIP_PIXELS * height // (old * pixels.shape[1]))
+    parts = []
     for begin in range(0, height, step):
         end = min(begin + step, height)
-        first, last = begin * old // height, min(-(-end * old // height), old)
+        first = begin * old // height
+        last = min(-(-end * old // height), old)
         rows = premultiplied(pixels[first:last])
         part = _shrink_axis(rows, 0, old, height, (begin, end), first)
         parts.append(straight_uint8(_shrink_axis(part, 1, part.shape[1], width)))
@@ -270,7 +300,8 @@ def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
 
 
 def premultiplied(pixels: Tensor) -> Tensor:
-    """Return (H, W, 3 or 4) float32 in [0, 1] with colours multiplied by alpha, from uint8 straight alpha."""
+    """Return (H, W, 3 or 4) float32 in [0, 1] with colours multiplied by alpha, from uint8 straight
+    alpha."""
     scaled = pixels.float() / 255
     if scaled.shape[-1] == 4:
         scaled[..., :3] *= scaled[..., 3:]
@@ -278,7 +309,8 @@ def premultiplied(pixels: Tensor) -> Tensor:
 
 
 def straight_uint8(pixels: Tensor) -> Tensor:
-    """Return (H, W, 3 or 4) uint8 with straight alpha from premultiplied floats; inverse of ``premultiplied``."""
+    """Return (H, W, 3 or 4) uint8 with straight alpha from premultiplied floats; inverse of
+    ``premultiplied``."""
     if pixels.shape[-1] == 4:
         alpha = pixels[..., 3:].clamp(0, 1)
         rgb = torch.where(alpha > 0, pixels[..., :3] / alpha.clamp(min=1e-6), 0)
@@ -288,7 +320,8 @@ def straight_uint8(pixels: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Source:
-    """An opened image at the part that is read, with the indices of its colours (three) and alpha."""
+    """An opened image at the part that is read, with the indices of its colours (three) and
+    alpha."""
 
     reader: OpenImageIO.ImageInput
     spec: OpenImageIO.ImageSpec
@@ -300,7 +333,11 @@ class _Source:
     def is_premultiplied(self) -> bool:
         """Whether colours are multiplied by alpha; formats but TIFF and EXR never are."""
         is_straight = self.spec.get_int_attribute("oiio:UnassociatedAlpha") == 1
-        return self.alpha is not None and not is_straight and self.reader.format_name() in ("openexr", "tiff")
+        return (
+            self.alpha is not None
+            and not is_straight
+            and self.reader.format_name() in ("openexr", "tiff")
+        )
 
 
 def _open(path: Path) -> _Source:
@@ -337,7 +374,8 @@ def _open_reader(path: Path) -> OpenImageIO.ImageInput:
 
 
 def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> Layer | None:
-    """Go to the part of the beauty pass and return that layer; None if the file has a single layer."""
+    """Go to the part of the beauty pass and return that layer; None if the file has a single
+    layer."""
     parts: list[tuple[str, Sequence[str]]] = []
     while reader.seek_subimage(len(parts), 0):
         spec = reader.spec()
@@ -358,7 +396,8 @@ def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> Layer | None:
 
 
 def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeDesc) -> np.ndarray:
-    """Return the pixels (H, W, D) of a part, of an EXR in its display window: 0 outside the data."""
+    """Return the pixels (H, W, D) of a part, of an EXR in its display window: 0 outside the
+    data."""
     import OpenImageIO as oiio
 
     spec = reader.spec()
@@ -375,7 +414,12 @@ def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeD
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     left = spec.full_x - spec.x
     top = spec.full_y - spec.y
-    if reader.format_name() == "openexr" and (left, top, width, height) != (0, 0, spec.width, spec.height):
+    if reader.format_name() == "openexr" and (left, top, width, height) != (
+        0,
+        0,
+        spec.width,
+        spec.height,
+    ):
         window = oiio.ROI(left, left + width, top, top + height, 0, 1, 0, spec.nchannels)
         pixels = np.asarray(oiio.ImageBufAlgo.crop(oiio.ImageBuf(pixels), window).get_pixels(kind))
     return pixels
@@ -383,7 +427,11 @@ def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeD
 
 def _shown_size(reader: OpenImageIO.ImageInput, spec: OpenImageIO.ImageSpec) -> tuple[int, int]:
     """(width, height) of the display window of an EXR, of other images as stored."""
-    return (spec.full_width, spec.full_height) if reader.format_name() == "openexr" else (spec.width, spec.height)
+    return (
+        (spec.full_width, spec.full_height)
+        if reader.format_name() == "openexr"
+        else (spec.width, spec.height)
+    )
 
 
 def _is_float(spec: OpenImageIO.ImageSpec) -> bool:
@@ -396,7 +444,9 @@ def _header(source: _Source) -> ImageHeader:
     width, height = _shown_size(source.reader, source.spec)
     has_alpha = source.alpha is not None
     name = source.reader.format_name()
-    return ImageHeader(width, height, source.spec.nchannels, has_alpha, tags_of(source.spec), name, source.layer)
+    return ImageHeader(
+        width, height, source.spec.nchannels, has_alpha, tags_of(source.spec), name, source.layer
+    )
 
 
 def _straight_srgb(pixels: np.ndarray, source: _Source) -> np.ndarray:
@@ -417,19 +467,28 @@ def _straight_srgb(pixels: np.ndarray, source: _Source) -> np.ndarray:
 
 
 def _shrink_axis(
-    pixels: Tensor, axis: int, old: int, size: int, outputs: tuple[int, int] | None = None, first_input: int = 0
+    pixels: Tensor,
+    axis: int,
+    old: int,
+    size: int,
+    outputs: tuple[int, int] | None = None,
+    first_input: int = 0,
 ) -> Tensor:
-    """Return the ``outputs`` (None: all) of an axis that shrinks from ``old`` to ``size``, of inputs from one on."""
+    """Return the ``outputs`` (None: all) of an axis that shrinks from ``old`` to ``size``, of
+    inputs from one on."""
     begin_at, end_at = outputs or (0, size)
     if size == old:
         return pixels
     if size > old:
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
     if old % size == 0:  # all taps of all outputs alike: no gathers, the same sums
-        taps = pixels.narrow(axis, begin_at * old // size - first_input, (end_at - begin_at) * old // size)
+        taps = pixels.narrow(
+            axis, begin_at * old // size - first_input, (end_at - begin_at) * old // size
+        )
         taps = taps.unflatten(axis, (-1, old // size)).unbind(axis + 1)
         return sum((tap * (size / old) for tap in taps), pixels.new_zeros(1))
-    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the fractions exact.
+    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the fractions
+    # exact.
     starts = torch.arange(begin_at, end_at + 1, device=pixels.device) * old
     first = starts[:-1] // size
     shape = [1] * pixels.ndim

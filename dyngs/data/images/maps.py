@@ -1,4 +1,5 @@
-"""Maps next to images: depth, optical flow, labels, silhouettes; raw numbers, taken at pixels by the nearest sample."""
+"""Maps next to images: depth, optical flow, labels, silhouettes; raw numbers, taken at pixels by
+the nearest sample."""
 
 from __future__ import annotations
 
@@ -23,27 +24,33 @@ _NEAREST = 1e-9
 
 
 def read_depth(path: Path) -> Tensor:
-    """Read a depth map as (h, w) float32, 0 where it is unknown (there the file holds NaN, infinity, 0 or less).
+    """Read a depth map as (h, w) float32, 0 where it is unknown (there the file holds NaN,
+    infinity, 0 or less).
 
-    Images of whole numbers (PNG, TIFF of 16 bits) are in millimetres and become metres; floats (``.exr``, ``.npy``,
-    ``.npz`` with one array or one named ``depth``) are taken as they are. The first channel counts.
+    Images of whole numbers (PNG, TIFF of 16 bits) are in millimetres and become metres; floats
+    (``.exr``, ``.npy``, ``.npz`` with one array or one named ``depth``) are taken as they are. The
+    first channel counts.
     """
     if path.suffix.lower() in (".npy", ".npz"):
-        values, unit = read_map(path, "depth"), 1.0
+        values = read_map(path, "depth")
+        unit = 1.0
     else:
         values, is_integer = read_raw(path)
         unit = MILLIMETRE if is_integer else 1.0
     if values.ndim == 3:
         values = values[..., 0]
     if values.ndim != 2 or not values.size:
-        raise DyngsError(f"{path}: a depth map must be (height, width), got {values.shape}; export it again")
+        raise DyngsError(
+            f"{path}: a depth map must be (height, width), got {values.shape}; export it again"
+        )
     depth = np.where(np.isfinite(values), values, 0.0) * unit
     known = (depth > _NEAREST) & (depth < _FARTHEST)
     return torch.as_tensor(np.where(known, depth, 0.0).astype(np.float32), device="cpu")
 
 
 def read_labels(path: Path) -> Tensor:
-    """Read a label image as (h, w) int64, 0 = none: the number of a grey image, or one per colour; alpha is ignored."""
+    """Read a label image as (h, w) int64, 0 = none: the number of a grey image, or one per colour;
+    alpha is ignored."""
     values = np.nan_to_num(read_raw(path)[0]).clip(0, 65535).astype(np.int64)
     colours = values[..., : 1 if values.shape[-1] < 3 else 3]
     return torch.as_tensor(colours @ (1 << 16 * np.arange(colours.shape[-1])), device="cpu")
@@ -56,11 +63,14 @@ _LONGEST = 1e5  # longer displacements in pixels mean "unknown"; Middlebury writ
 def read_flow(path: Path) -> Tensor:
     """Read a flow field as (h, w, 2) float32, displacements (x, y) in pixels, NaN where unknown.
 
-    ``.npy``, ``.npz`` with one array or one named ``flow``, or ``.flo`` (Baker et al. 2011, Middlebury).
+    ``.npy``, ``.npz`` with one array or one named ``flow``, or ``.flo`` (Baker et al. 2011,
+    Middlebury).
     """
     values = _read_flo(path) if path.suffix.lower() == ".flo" else read_map(path, "flow")
     if values.ndim != 3 or values.shape[2] != 2 or not values.size:
-        raise DyngsError(f"{path}: a flow field must be (height, width, 2), got {values.shape}; export it again")
+        raise DyngsError(
+            f"{path}: a flow field must be (height, width, 2), got {values.shape}; export it again"
+        )
     known = (np.abs(values) < _LONGEST).all(-1, keepdims=True)  # phrased so that NaN fails it
     return torch.as_tensor(np.where(known, values, np.nan).astype(np.float32), device="cpu")
 
@@ -69,7 +79,10 @@ def _read_flo(path: Path) -> np.ndarray:
     """Read width, height and float32 displacements, little endian, row by row."""
     if not inside(path).is_file():
         raise DyngsError(f"{path}: no such flow field; restore it or remove it from the capture")
-    with reading(path, "it must be a .flo file of Middlebury; export it again"), path.open("rb") as file:
+    with (
+        reading(path, "it must be a .flo file of Middlebury; export it again"),
+        path.open("rb") as file,
+    ):
         magic, width, height = struct.unpack("<fii", file.read(12))
         if magic != _MAGIC or width < 1 or height < 1:
             raise ValueError("its first bytes are not those of a .flo file")
@@ -83,7 +96,8 @@ MASKS = "masks"
 
 
 def cut_out(pixels: Tensor, silhouette: Silhouette) -> Tensor:
-    """Return the (H, W, 4) uint8 image of the person alone, straight alpha, from ``pixels`` (H, W, 3 or 4) uint8."""
+    """Return the (H, W, 4) uint8 image of the person alone, straight alpha, from ``pixels`` (H, W,
+    3 or 4) uint8."""
     alpha = _read_alpha(silhouette)
     if alpha.shape != pixels.shape[:2]:
         raise DyngsError(
@@ -99,11 +113,17 @@ def _read_alpha(silhouette: Silhouette) -> Tensor:
     """Read the silhouette as (H, W) uint8 alpha, 255 where the person is."""
     if silhouette.row is None:
         levels = read_image(silhouette.path)[..., :3]
-        levels = levels.amax(-1) if silhouette.person == "nonzero" else levels.float().mean(-1).round().to(torch.uint8)
+        levels = (
+            levels.amax(-1)
+            if silhouette.person == "nonzero"
+            else levels.float().mean(-1).round().to(torch.uint8)
+        )
     else:
         row = read_hdf5(silhouette.path, MASKS, silhouette.row)
         if row.ndim != 2 or row.dtype not in (np.uint8, np.bool_):
-            raise DyngsError(f"{silhouette.path}: '{MASKS}' must hold bytes in the shape (F, H, W); export it again")
+            raise DyngsError(
+                f"{silhouette.path}: '{MASKS}' must hold bytes in the shape (F, H, W); export it again"
+            )
         levels = torch.as_tensor(row.astype(np.uint8), device="cpu")
     if silhouette.person == "nonzero":
         return (levels > 0).to(torch.uint8) * 255
@@ -111,14 +131,20 @@ def _read_alpha(silhouette: Silhouette) -> Tensor:
 
 
 def silhouette_box(alpha: Tensor, above: float = 0.0) -> tuple[slice, slice] | None:
-    """Return rows and columns of the smallest box around the pixels of alpha (H, W) above a limit; None without any."""
+    """Return rows and columns of the smallest box around the pixels of alpha (H, W) above a limit;
+    None without any."""
     shown = alpha > above
     rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
-    return (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)) if len(rows) else None
+    return (
+        (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+        if len(rows)
+        else None
+    )
 
 
 def nearest_positions(width: int, height: int, grid: Tensor | None = None) -> Tensor:
-    """Return where the pixels of a (height, width) image lie, (height, width, 2) in [-1, 1] from edge to edge.
+    """Return where the pixels of a (height, width) image lie, (height, width, 2) in [-1, 1] from
+    edge to edge.
 
     In a distorted image if its ``LensMap.grid`` is passed.
     """
@@ -128,7 +154,8 @@ def nearest_positions(width: int, height: int, grid: Tensor | None = None) -> Te
 
 
 def taken_at(values: Tensor, positions: Tensor) -> Tensor:
-    """Return the (H, W, D) nearest of the ``values`` (h, w, D) at ``positions`` (H, W, 2) in [-1, 1]."""
+    """Return the (H, W, D) nearest of the ``values`` (h, w, D) at ``positions`` (H, W, 2) in [-1,
+    1]."""
     size = values.new_tensor([values.shape[1], values.shape[0]])
     index = ((positions + 1) / 2 * size).floor().long()
     x, y = (index[..., i].clamp(0, values.shape[1 - i] - 1) for i in (0, 1))
@@ -136,15 +163,18 @@ def taken_at(values: Tensor, positions: Tensor) -> Tensor:
 
 
 def resized(flow: Tensor, width: int, height: int) -> Tensor:
-    """Return the (height, width, 2) flow of a smaller image, in its pixels, from ``flow`` (H, W, 2)."""
+    """Return the (height, width, 2) flow of a smaller image, in its pixels, from ``flow`` (H, W,
+    2)."""
     scale = flow.new_tensor([width / flow.shape[1], height / flow.shape[0]])
     return taken_at(flow, nearest_positions(width, height)) * scale
 
 
 def flow_at(flow: Tensor, view: View, size: tuple[int, int], lens_map: LensMap | None) -> Tensor:
-    """Return the flow of the undistorted image of ``size`` (width, height), in its pixels, from that as stored.
+    """Return the flow of the undistorted image of ``size`` (width, height), in its pixels, from
+    that as stored.
 
-    Both ends are undistorted by the lens of ``view``, if it has a ``lens_map``; NaN where that has no such pixel.
+    Both ends are undistorted by the lens of ``view``, if it has a ``lens_map``; NaN where that has
+    no such pixel.
     """
     if lens_map is None:
         return resized(flow, *size)

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
 MAX_FRAMES = 1_000_000  # limit on the frames of one video: ten hours
-_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
+_CONTAINERS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
+)
 """FFmpeg's names for files that hold images themselves, whatever their suffix says."""
 
 
@@ -62,7 +64,9 @@ def videos_in(folder: Path) -> list[Path]:
     names: dict[str, Path] = {}
     for path in videos:
         if names.setdefault(path.stem, path) != path:
-            raise DyngsError(f"{folder}: {names[path.stem].name} and {path.name} are one camera; remove one of them")
+            raise DyngsError(
+                f"{folder}: {names[path.stem].name} and {path.name} are one camera; remove one of them"
+            )
     return videos
 
 
@@ -76,12 +80,14 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
 
 
 def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the frames of these ``numbers``, counted from 0, in ascending order, as ``read_frames`` does.
+    """Yield the frames of these ``numbers``, counted from 0, in ascending order, as ``read_frames``
+    does.
 
-    One image is in memory at a time. Nothing behind the last one is decoded; others before it are (each image builds
-    on others), but not converted.
+    One image is in memory at a time. Nothing behind the last one is decoded; others before it are
+    (each image builds on others), but not converted.
     """
-    requested, last = set(numbers), max(numbers, default=-1)
+    requested = set(numbers)
+    last = max(numbers, default=-1)
     index = -1
     for index, frame, tags in _decoded(path) if requested else ():
         if index in requested:
@@ -95,7 +101,8 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """Read size, length and frame rate of a video; the first frame is decoded, and the packets are counted."""
+    """Read size, length and frame rate of a video; the first frame is decoded, and the packets are
+    counted."""
     decoded = next(_decoded(path), None)
     if decoded is None:
         raise _broken(path, 0, "it holds no image")
@@ -103,11 +110,14 @@ def probe_video(path: Path) -> VideoInfo:
     height, width = _rotated_rgb(path, first, tags).shape[:2]
     with _reading(path), opened_video(path) as container:
         stream = container.streams.video[0]
-        fps, hidden = float(stream.average_rate or 0), [packet.is_discard for packet in _packets(container)]
+        fps = float(stream.average_rate or 0)
+        hidden = [packet.is_discard for packet in _packets(container)]
         # of a truncated file, what the header promises is what there should be
         count = max(stream.frames, len(hidden)) - sum(hidden)
     if count > MAX_FRAMES:
-        raise DyngsError(f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up")
+        raise DyngsError(
+            f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up"
+        )
     note = tags.conversion
     is_untagged = {tags.primaries, tags.transfer, tags.matrix} == {UNSPECIFIED}
     if is_untagged and _matrix_of(first, tags) == BT709_MATRIX:
@@ -122,10 +132,11 @@ def colour_notes(videos: Iterable[VideoInfo]) -> list[str]:
 
 
 def frame_seconds(path: Path, num_frames: int) -> list[float]:
-    """Return the second at which each of the first ``num_frames`` frames is shown, the first one at 0.
+    """Return the second at which each of the first ``num_frames`` frames is shown, the first one at
+    0.
 
-    Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or too few, the mean
-    rate does, and 30 frames per second where the file names none either.
+    Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or
+    too few, the mean rate does, and 30 frames per second where the file names none either.
     """
     stamps: list[float] = []
     with _reading(path), opened_video(path) as container:
@@ -140,7 +151,8 @@ def frame_seconds(path: Path, num_frames: int) -> list[float]:
 
 
 def _packets(container: InputContainer) -> Iterator[av.Packet]:
-    """Yield the packets of frames, up to where the file is cut off; discarded ones, by an edit list, are not shown."""
+    """Yield the packets of frames, up to where the file is cut off; discarded ones, by an edit
+    list, are not shown."""
     from av.error import FFmpegError
 
     with suppress(FFmpegError):
@@ -154,7 +166,8 @@ def _decoded(
 ) -> Iterator[tuple[int, av.VideoFrame, ColourTags]]:
     """Yield number, frame and colour tags, in order; damage is an error that names the frame.
 
-    With "AUTO", which is faster, several frames are decoded at once, and damage takes those before it along.
+    With "AUTO", which is faster, several frames are decoded at once, and damage takes those before
+    it along.
     """
     from av.error import FFmpegError
 
@@ -166,7 +179,8 @@ def _decoded(
             with opened_video(path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = threads
-                # Decoders of HEVC and ProRes overwrite what the container says, even by "unspecified".
+                # Decoders of HEVC and ProRes overwrite what the container says, even by
+                # "unspecified".
                 container_tags = _tags_of(stream.codec_context)
                 for frame in container.decode(stream):
                     if (frame.width, frame.height) != (stream.width, stream.height):
@@ -175,13 +189,16 @@ def _decoded(
                     index += 1
         except FFmpegError as error:
             if index == 0:
-                raise DyngsError(f"cannot read the video {path}: {error.strerror or reason(error)}") from error
+                raise DyngsError(
+                    f"cannot read the video {path}: {error.strerror or reason(error)}"
+                ) from error
             raise _broken(path, index, error.strerror or reason(error)) from error
 
 
 @contextmanager
 def opened_video(path: Path) -> Iterator[InputContainer]:
-    """Open the file for PyAV, which must contain the video itself: playlists, which name other files, are refused.
+    """Open the file for PyAV, which must contain the video itself: playlists, which name other
+    files, are refused.
 
     Raises:
         DyngsError: no video in it, or one larger than ``data.max_megapixels``.
@@ -210,7 +227,8 @@ def _broken(path: Path, index: int, why: str) -> DyngsError:
 
 
 def orientation_of(frame: av.VideoFrame) -> int:
-    """Return how a frame is to be shown, as EXIF numbers it: 1 upright, 2 mirrored, 3 by 180 degrees, and so on to 8.
+    """Return how a frame is to be shown, as EXIF numbers it: 1 upright, 2 mirrored, 3 by 180
+    degrees, and so on to 8.
 
     By its display matrix, which maps (x, y) to (a x + c y, b x + d y), rounded to quarter turns.
     """
@@ -220,7 +238,9 @@ def orientation_of(frame: av.VideoFrame) -> int:
         return 1
     a, b, _, c, d = struct.unpack("9i", matrix[:36])[:5]
     if abs(a) + abs(d) >= abs(b) + abs(c):
-        return {(False, False): 1, (True, False): 2, (True, True): 3, (False, True): 4}[a < 0, d < 0]
+        return {(False, False): 1, (True, False): 2, (True, True): 3, (False, True): 4}[
+            a < 0, d < 0
+        ]
     return {(False, False): 5, (False, True): 6, (True, True): 7, (True, False): 8}[b < 0, c < 0]
 
 
@@ -261,6 +281,10 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
             # swscale expands limited range to 255 levels of 256 steps each.
             white = 65535 if tags.is_full_range else 255 * 256
             is_deep = frame.format.components[0].bits > 8
-            wide = convert(format="rgb48le") if is_deep else convert(format="rgb24") * np.uint16(white // 255)
+            wide = (
+                convert(format="rgb48le")
+                if is_deep
+                else convert(format="rgb24") * np.uint16(white // 255)
+            )
             rgb = to_srgb(wide, tags, white)
         return rotated_upright(rgb, orientation_of(frame))

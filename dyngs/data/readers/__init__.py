@@ -1,1 +1,2 @@
-"""Readers of captures, one module per format; each declares its ``FORMAT``, listed in ``dyngs.data.read``."""
+"""Readers of captures, one module per format; each declares its ``FORMAT``, listed in
+``dyngs.data.read``."""

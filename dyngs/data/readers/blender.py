@@ -1,4 +1,5 @@
-"""Readers of transforms files: Blender (NeRF-synthetic, D-NeRF), nerfstudio and instant-ngp, people with body files."""
+"""Readers of transforms files: Blender (NeRF-synthetic, D-NeRF), nerfstudio and instant-ngp, people
+with body files."""
 
 from __future__ import annotations
 
@@ -7,17 +8,35 @@ from dataclasses import replace
 from pathlib import Path
 
 from dyngs.data.body_frames import read_body_file, rows_of
-from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Split, Splits, View, all_views, each_view
+from dyngs.data.capture import (
+    BodyFrames,
+    Capture,
+    CaptureFormat,
+    Split,
+    Splits,
+    View,
+    all_views,
+    each_view,
+)
 from dyngs.data.readers.colmap import find_masks, mask_of, unmasked_warning
-from dyngs.data.readers.transforms import SPLITS, FrameFile, find_points, read_frame_file, read_views, tracks_path_of
+from dyngs.data.readers.transforms import (
+    SPLITS,
+    FrameFile,
+    find_points,
+    read_frame_file,
+    read_views,
+    tracks_path_of,
+)
 from dyngs.errors import DyngsError
 
 
 def read_blender(root: Path) -> Capture:
-    """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test are optional.
+    """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test are
+    optional.
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
-    Points: see ``find_points``. Masks: ``mask_path`` of the frames, else those in ``masks/`` that are named as images.
+    Points: see ``find_points``. Masks: ``mask_path`` of the frames, else those in ``masks/`` that
+    are named as images.
     """
     splits: Splits = {}
     warnings: list[str] = []
@@ -36,7 +55,8 @@ def read_blender(root: Path) -> Capture:
 
 
 def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the views with masks of ``masks/`` where the files name none, and a line about views without one."""
+    """Return the views with masks of ``masks/`` where the files name none, and a line about views
+    without one."""
     views = all_views(splits)
     has_people = any(view.silhouette for view in views) or any(root.glob("body_*.npz"))
     if has_people or any(view.mask_path for view in views):
@@ -45,17 +65,24 @@ def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
     images = root / "images"
 
     def with_mask(view: View) -> View:
-        found = (mask_of(os.path.relpath(view.image_path, folder), masks) for folder in (images, root))
+        found = (
+            mask_of(os.path.relpath(view.image_path, folder), masks) for folder in (images, root)
+        )
         return replace(view, mask_path=next(filter(None, found), None))
 
     splits = each_view(splits, with_mask)
     return splits, unmasked_warning(all_views(splits), bool(masks))
 
 
-def _capture_of(root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]) -> Capture:
+def _capture_of(
+    root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]
+) -> Capture:
     points, path, notes = find_points(file)
-    tracks, lines = tracks_path_of(file), (*warnings, *notes)
-    return Capture(root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines)
+    tracks = tracks_path_of(file)
+    lines = (*warnings, *notes)
+    return Capture(
+        root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines
+    )
 
 
 def training_capture(root: Path, format: str, file: FrameFile, *more: str) -> Capture:
@@ -65,16 +92,20 @@ def training_capture(root: Path, format: str, file: FrameFile, *more: str) -> Ca
 
 
 FORMAT = CaptureFormat(
-    "blender", "transforms_train.json", lambda root: (root / "transforms_train.json").is_file(), read_blender
+    "blender",
+    "transforms_train.json",
+    lambda root: (root / "transforms_train.json").is_file(),
+    read_blender,
 )
 
 
 def read_nerfstudio(root: Path) -> Capture:
-    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if there, a ``.ply`` file of points.
+    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if there, a ``.ply`` file of
+    points.
 
-    The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val list without a test
-    list is used for testing. Points and poses are read as they stand: ``applied_transform``
-    has been applied to both.
+    The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val
+    list without a test list is used for testing. Points and poses are read as they stand:
+    ``applied_transform`` has been applied to both.
     """
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
@@ -110,28 +141,36 @@ def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits,
 
 
 NERFSTUDIO_FORMAT = CaptureFormat(
-    "nerfstudio", "transforms.json", lambda root: (root / "transforms.json").is_file(), read_nerfstudio
+    "nerfstudio",
+    "transforms.json",
+    lambda root: (root / "transforms.json").is_file(),
+    read_nerfstudio,
 )
 
 
 def read_body_json(root: Path) -> Capture:
-    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first file are optional.
+    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first file
+    are optional.
 
-    Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T, 3), betas and, if
-    there, scale; row n is for the frame whose ``frame`` is n. Without such a file, val and test show the frames of
-    train. ``surface_model_type`` "anny" says that betas are of the free template's shape space.
-    ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
-    one world; unlike with AMASS files nothing is rotated to make it y up.
+    Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T,
+    3), betas and, if there, scale; row n is for the frame whose ``frame`` is n. Without such a
+    file, val and test show the frames of train. ``surface_model_type`` "anny" says that betas are
+    of the free template's shape space. ``pose`` is another clip, with frame numbers, times and
+    parameters of its own. Parameters and cameras share one world; unlike with AMASS files nothing
+    is rotated to make it y up.
     """
     capture = read_blender(root)  # whose points are of no use: people begin on a template
-    splits, warnings = dict(capture.splits), capture.warnings
+    splits = dict(capture.splits)
+    warnings = capture.warnings
     path = root / "transforms_pose.json"
     if path.is_file():
         views, notes = read_views(read_frame_file(path))
         splits["pose"] = tuple(views.values())
         warnings = (*warnings, *(f"{path.name}: {note}" for note in notes))
     train = read_body_file(root / "body_train.npz")
-    body: dict[Split, BodyFrames] = {name: _body_of(root, name, views, train) for name, views in splits.items()}
+    body: dict[Split, BodyFrames] = {
+        name: _body_of(root, name, views, train) for name, views in splits.items()
+    }
     return capture.replace(
         format="body_json",
         splits=splits,

@@ -1,4 +1,5 @@
-"""Readers for sequences of fixed cameras, a folder or a video each: cameras.json, and LLFF's poses_bounds.npy (N3V)."""
+"""Readers for sequences of fixed cameras, a folder or a video each: cameras.json, and LLFF's
+poses_bounds.npy (N3V)."""
 
 from __future__ import annotations
 
@@ -11,7 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
-from dyngs.data.geometry import OPENGL_FROM_OPENCV, checked_pose, match_size, opengl_from_cam, rescale_warning
+from dyngs.data.geometry import (
+    OPENGL_FROM_OPENCV,
+    checked_pose,
+    match_size,
+    opengl_from_cam,
+    rescale_warning,
+)
 from dyngs.data.images.frame_cache import VideoFrames, planned_frames
 from dyngs.data.images.images import SUFFIXES, files_in
 from dyngs.data.images.video import VideoInfo, colour_notes, videos_in
@@ -26,7 +33,8 @@ MIN_CAMERAS_TO_HOLD_OUT = 3
 
 @dataclass(frozen=True)
 class CameraSource:
-    """Frame number to image file of the camera ``name``; those of a ``video`` may have to be decoded first."""
+    """Frame number to image file of the camera ``name``; those of a ``video`` may have to be
+    decoded first."""
 
     name: str
     images: dict[int, Path]
@@ -34,9 +42,11 @@ class CameraSource:
 
 
 def find_cameras(root: Path) -> dict[str, Path]:
-    """Map camera names, sorted, to folders of images, or to video files where there is no such folder.
+    """Map camera names, sorted, to folders of images, or to video files where there is no such
+    folder.
 
-    Images lie in the folder itself or in ``images`` below it. Raises DyngsError: two videos for one camera.
+    Images lie in the folder itself or in ``images`` below it. Raises DyngsError: two videos for one
+    camera.
     """
     found = {path.stem: path for path in videos_in(root)}
     for path in sorted(root.iterdir()):
@@ -50,7 +60,8 @@ def find_cameras(root: Path) -> dict[str, Path]:
 def open_camera(name: str, path: Path) -> CameraSource:
     """List the images of the camera that ``find_cameras`` found at ``path``.
 
-    Raises DyngsError: an image without a number, two with the same one, or a video that cannot be opened.
+    Raises DyngsError: an image without a number, two with the same one, or a video that cannot be
+    opened.
     """
     if path.is_file():
         planned = planned_frames(path)
@@ -59,22 +70,28 @@ def open_camera(name: str, path: Path) -> CameraSource:
     for image in files_in(path, SUFFIXES):
         digits = re.findall(r"\d+", image.stem)
         if not digits:
-            raise DyngsError(f"{image}: no frame number in its name; call it frame_0000{image.suffix} or the like")
+            raise DyngsError(
+                f"{image}: no frame number in its name; call it frame_0000{image.suffix} or the like"
+            )
         other = images.setdefault(int(digits[-1]), image)
         if other != image:
-            raise DyngsError(f"{path}: {other.name} and {image.name} have the same frame number; remove one of them")
+            raise DyngsError(
+                f"{path}: {other.name} and {image.name} have the same frame number; remove one of them"
+            )
     return CameraSource(name, images)
 
 
 def sequence_views(
     path: Path, cameras: Sequence[CameraSource], calibrations: Mapping[str, dict[str, object]]
 ) -> tuple[dict[str, tuple[View, ...]], list[str]]:
-    """Return the views of each camera, and warnings; times run from 0 at the lowest frame number to 1 at the highest.
+    """Return the views of each camera, and warnings; times run from 0 at the lowest frame number to
+    1 at the highest.
 
     Args:
         path: the calibration file in the capture's folder.
         cameras: in the order of their ``camera_id``.
-        calibrations: by camera name, the fields of a frame in a transforms file: ``fl_x``, ``transform_matrix``, ...
+        calibrations: by camera name, the fields of a frame in a transforms file: ``fl_x``,
+            ``transform_matrix``, ...
     """
     numbers = sorted({number for camera in cameras for number in camera.images})
     span = max(numbers[-1] - numbers[0], 1)
@@ -95,7 +112,9 @@ def sequence_views(
         read, notes = read_views(FrameFile(path, frames))
         views[camera.name] = tuple(read.values())
         if camera.video is not None:
-            views[camera.name], more = _at_video_size(camera.name, camera.video.info, views[camera.name], where)
+            views[camera.name], more = _at_video_size(
+                camera.name, camera.video.info, views[camera.name], where
+            )
             notes += more
         warnings += notes
     return views, warnings
@@ -103,25 +122,36 @@ def sequence_views(
 
 def video_fps(cameras: Sequence[CameraSource]) -> float | None:
     """Return the frame rate of the first video that has one, None if none has."""
-    return next((camera.video.info.fps for camera in cameras if camera.video and camera.video.info.fps > 0), None)
+    return next(
+        (camera.video.info.fps for camera in cameras if camera.video and camera.video.info.fps > 0),
+        None,
+    )
 
 
 def _at_video_size(
     name: str, video: VideoInfo, views: tuple[View, ...], where: str
 ) -> tuple[tuple[View, ...], list[str]]:
-    """Return the views named after the video and with its size: its frames may not be decoded yet."""
-    sized, rescaled = [], []
+    """Return the views named after the video and with its size: its frames may not be decoded
+    yet."""
+    sized = []
+    rescaled = []
     for view in views:
         described = (view.width, view.height)
-        intrinsics, size, changed = match_size(view.intrinsics, described, (video.width, video.height), where)
+        intrinsics, size, changed = match_size(
+            view.intrinsics, described, (video.width, video.height), where
+        )
         rescaled += [where] if changed else []
         frame = f"{name}/{view.image_path.stem}"
-        sized.append(replace(view, name=frame, intrinsics=intrinsics, width=size[0], height=size[1]))
+        sized.append(
+            replace(view, name=frame, intrinsics=intrinsics, width=size[0], height=size[1])
+        )
     return tuple(sized), rescale_warning(rescaled)
 
 
 def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
-    videos = [(x.name, x.video.info.fps) for x in cameras if x.video is not None and x.video.info.fps > 0]
+    videos = [
+        (x.name, x.video.info.fps) for x in cameras if x.video is not None and x.video.info.fps > 0
+    ]
     odd = [(name, fps) for name, fps in videos if not math.isclose(fps, videos[0][1], rel_tol=0.01)]
     if not odd:
         return []
@@ -138,16 +168,19 @@ CALIBRATION = "cameras.json"
 def read_camera_folders(root: Path) -> Capture:
     """Read ``cameras.json`` and the folders or videos named like its cameras.
 
-    The file holds ``{"cameras": {NAME: {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", .., "transform_matrix" (OpenGL
-    camera-to-world) or "cam_from_world" (OpenCV)}}, "fps": .., "test": [NAME, ..]}``. Without ``test`` the first camera
-    is held out where there are three or more. Times run from the first frame number to the last one.
+    The file holds ``{"cameras": {NAME: {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", ..,
+    "transform_matrix" (OpenGL camera-to-world) or "cam_from_world" (OpenCV)}}, "fps": .., "test":
+    [NAME, ..]}``. Without ``test`` the first camera is held out where there are three or more.
+    Times run from the first frame number to the last one.
     """
     path = root / CALIBRATION
     calibrated, fps, test = _read_calibration(path)
     found = find_cameras(root)
     names = [name for name in sorted(calibrated) if name in found]
     if not names:
-        raise DyngsError(f"{path}: no folder or video is named like its cameras ({first_few(sorted(calibrated))})")
+        raise DyngsError(
+            f"{path}: no folder or video is named like its cameras ({first_few(sorted(calibrated))})"
+        )
     warnings = []
     if len(names) < len(calibrated):
         absent = sorted(calibrated.keys() - found.keys())
@@ -159,7 +192,13 @@ def read_camera_folders(root: Path) -> Capture:
     own = {name: _calibration(calibrated[name], f"{path}, camera {name}") for name in names}
     views, notes = sequence_views(path, cameras, own)
     splits, more = _splits(path, test, views)
-    return Capture(root, "camera_folders", splits, fps=fps or video_fps(cameras), warnings=(*warnings, *notes, *more))
+    return Capture(
+        root,
+        "camera_folders",
+        splits,
+        fps=fps or video_fps(cameras),
+        warnings=(*warnings, *notes, *more),
+    )
 
 
 def _read_calibration(path: Path) -> tuple[dict[str, object], float | None, object]:
@@ -178,7 +217,9 @@ def _read_calibration(path: Path) -> tuple[dict[str, object], float | None, obje
 def _calibration(value: object, where: str) -> dict[str, object]:
     """Return the fields of a frame in a transforms file, with the pose as ``transform_matrix``."""
     if not isinstance(value, dict):
-        raise DyngsError(f"{where}: must be an object with fl_x and transform_matrix or cam_from_world")
+        raise DyngsError(
+            f"{where}: must be an object with fl_x and transform_matrix or cam_from_world"
+        )
     own = {str(key): field for key, field in value.items()}
     if ("transform_matrix" in own) == ("cam_from_world" in own):
         raise DyngsError(
@@ -192,8 +233,11 @@ def _calibration(value: object, where: str) -> dict[str, object]:
     return own
 
 
-def _splits(path: Path, test: object, views: dict[str, tuple[View, ...]]) -> tuple[Splits, list[str]]:
-    """Hold out the cameras that ``test`` lists, else the first one if there are enough; return splits and warnings."""
+def _splits(
+    path: Path, test: object, views: dict[str, tuple[View, ...]]
+) -> tuple[Splits, list[str]]:
+    """Hold out the cameras that ``test`` lists, else the first one if there are enough; return
+    splits and warnings."""
     notes = []
     if test is None:
         if len(views) < MIN_CAMERAS_TO_HOLD_OUT:
@@ -204,7 +248,9 @@ def _splits(path: Path, test: object, views: dict[str, tuple[View, ...]]) -> tup
         raise DyngsError(f"{path}: 'test' must be a list of camera names")
     unknown = sorted(set(test) - views.keys())
     if unknown:
-        raise DyngsError(f"{path}: 'test' names {first_few(unknown)}, but the cameras are {first_few(sorted(views))}")
+        raise DyngsError(
+            f"{path}: 'test' names {first_few(unknown)}, but the cameras are {first_few(sorted(views))}"
+        )
     return _held_out(views, test), notes
 
 
@@ -215,29 +261,37 @@ def _held_out(views: dict[str, tuple[View, ...]], test: Sequence[str]) -> Splits
     }
 
 
-FORMAT = CaptureFormat("camera_folders", CALIBRATION, lambda root: (root / CALIBRATION).is_file(), read_camera_folders)
+FORMAT = CaptureFormat(
+    "camera_folders", CALIBRATION, lambda root: (root / CALIBRATION).is_file(), read_camera_folders
+)
 
 
 POSES = "poses_bounds.npy"
 
 
 def read_llff(root: Path) -> Capture:
-    """Read ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, sorted by name.
+    """Read ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, sorted
+    by name.
 
-    Each row holds a 3x5 matrix, row by row, and the near and far bounds (not used). Its columns: the camera's down,
-    right and backward axes and its position in the world, then height, width and focal length of the full image in
-    pixels (Mildenhall et al. 2019). The first camera is the test view, as in N3V. Raises DyngsError: an unreadable
-    file, rows and cameras that differ in number, bad poses, images or videos.
+    Each row holds a 3x5 matrix, row by row, and the near and far bounds (not used). Its columns:
+    the camera's down, right and backward axes and its position in the world, then height, width and
+    focal length of the full image in pixels (Mildenhall et al. 2019). The first camera is the test
+    view, as in N3V. Raises DyngsError: an unreadable file, rows and cameras that differ in number,
+    bad poses, images or videos.
     """
     path = root / POSES
     rows = _read_rows(path)
     found = find_cameras(root)
     # There may be folders of other programs, too.
-    found = {name: at for name, at in found.items() if re.fullmatch(r"cam[-_]?\d+", name, re.IGNORECASE)} or found
+    found = {
+        name: at for name, at in found.items() if re.fullmatch(r"cam[-_]?\d+", name, re.IGNORECASE)
+    } or found
     names = list(found)
     if len(names) != len(rows):
         ends = f" ({names[0]} to {names[-1]})" if names else ""
-        few = "restore the missing ones" if len(names) < len(rows) else "remove those without a pose"
+        few = (
+            "restore the missing ones" if len(names) < len(rows) else "remove those without a pose"
+        )
         raise DyngsError(
             f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there"
             f"{ends}{_gaps(names)}; {few}, or remove the rows of cameras that are not there"
@@ -247,7 +301,9 @@ def read_llff(root: Path) -> Capture:
     views, notes = sequence_views(path, cameras, calibrations)
     numbers = [int(digits) for name in names for digits in re.findall(r"\d+$", name)]
     if numbers != sorted(numbers):
-        notes.append(f"{path.name}: its rows are matched with cameras in the order {', '.join(names[:4])}, .. by name")
+        notes.append(
+            f"{path.name}: its rows are matched with cameras in the order {', '.join(names[:4])}, .. by name"
+        )
     splits = _held_out(views, names[:1] if len(names) > 1 else [])
     return Capture(root, "llff", splits, fps=video_fps(cameras), warnings=tuple(notes))
 
@@ -255,11 +311,15 @@ def read_llff(root: Path) -> Capture:
 def _read_rows(path: Path) -> np.ndarray:
     rows = read_npy(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
-        raise DyngsError(f"{path}: must have 17 columns, one row per camera; got shape {rows.shape}")
+        raise DyngsError(
+            f"{path}: must have 17 columns, one row per camera; got shape {rows.shape}"
+        )
     bad = ~np.isfinite(rows[:, :15]).all(axis=1)
     if bad.any():
         row = int(np.argmax(bad))
-        raise DyngsError(f"{path}: row {row} holds NaN or infinite numbers; repair it or remove this camera")
+        raise DyngsError(
+            f"{path}: row {row} holds NaN or infinite numbers; repair it or remove this camera"
+        )
     return rows
 
 
@@ -275,7 +335,11 @@ def _llff_calibration(row: np.ndarray) -> dict[str, object]:
 def _gaps(names: list[str]) -> str:
     numbers = {int(digits) for name in names for digits in re.findall(r"\d+$", name)}
     missing = sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
-    return f", without number {', '.join(map(str, missing[:5]))}" if 0 < len(missing) < len(numbers) else ""
+    return (
+        f", without number {', '.join(map(str, missing[:5]))}"
+        if 0 < len(missing) < len(numbers)
+        else ""
+    )
 
 
 LLFF_FORMAT = CaptureFormat("llff", POSES, lambda root: (root / POSES).is_file(), read_llff)

@@ -22,7 +22,13 @@ from dyngs.data.geometry import (
     rescale_warning,
 )
 from dyngs.data.images.images import SUFFIXES, header_if_readable
-from dyngs.data.readers.colmap_model import EXTENSIONS, ModelCamera, ModelImage, num_images, read_model
+from dyngs.data.readers.colmap_model import (
+    EXTENSIONS,
+    ModelCamera,
+    ModelImage,
+    num_images,
+    read_model,
+)
 from dyngs.data.readers.transforms import view_name
 from dyngs.data.times import read_seconds
 from dyngs.errors import DyngsError, reading
@@ -35,7 +41,8 @@ TEST_LIST = "test.txt"
 MODEL_FOLDERS = ("sparse", ".", "colmap/sparse", "colmap", "distorted/sparse")
 """Folders of models; each may hold several, in folders 0, 1, ... of their own."""
 FILES = "cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0, distorted/sparse/0 or ."
-# Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as OpenCV does.
+# Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as
+# OpenCV does.
 _LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
     "SIMPLE_PINHOLE": (1, "none"), "PINHOLE": (2, "none"),
     "SIMPLE_RADIAL": (1, "opencv"), "RADIAL": (1, "opencv"), "OPENCV": (2, "opencv"), "FULL_OPENCV": (2, "opencv"),
@@ -48,7 +55,11 @@ def model_folders(root: Path) -> list[Path]:
     """Return the folders of the models of a capture: several are parts that are not connected."""
     for name in MODEL_FOLDERS:
         base = root / name
-        numbered = [path for path in base.iterdir() if re.fullmatch(r"\d{1,9}", path.name)] if base.is_dir() else []
+        numbered = (
+            [path for path in base.iterdir() if re.fullmatch(r"\d{1,9}", path.name)]
+            if base.is_dir()
+            else []
+        )
         parts = sorted(filter(_holds_model, numbered), key=lambda path: int(path.name))
         found = parts or list(filter(_holds_model, [base]))
         if found:
@@ -63,7 +74,9 @@ def find_model(root: Path) -> tuple[Path | None, list[str]]:
         return (folders or [None])[0], []
     counts = {folder: num_images(folder) for folder in folders}
     largest = max(folders, key=lambda folder: counts[folder])
-    others = ", ".join(f"{folder.name} ({counts[folder]})" for folder in folders if folder != largest)
+    others = ", ".join(
+        f"{folder.name} ({counts[folder]})" for folder in folders if folder != largest
+    )
     line = (
         f"{largest.parent}: of {len(folders)} models that are not connected, {largest.name} is read, "
         f"which has the most images ({counts[largest]}), not {others}; "
@@ -78,9 +91,12 @@ def is_colmap(root: Path) -> bool:
 
 
 def _is_chosen(root: Path) -> bool:
-    """Whether a folder is a COLMAP capture; nerfstudio's keep the model that their JSON is made from."""
+    """Whether a folder is a COLMAP capture; nerfstudio's keep the model that their JSON is made
+    from."""
     folders = model_folders(root)
-    return bool(folders) and not ((root / "transforms.json").is_file() and folders[0].is_relative_to(root / "colmap"))
+    return bool(folders) and not (
+        (root / "transforms.json").is_file() and folders[0].is_relative_to(root / "colmap")
+    )
 
 
 def _holds_model(folder: Path) -> bool:
@@ -88,10 +104,11 @@ def _holds_model(folder: Path) -> bool:
 
 
 def read_colmap(root: Path) -> Capture:
-    """Read a COLMAP model with images below ``images/``, and with ``masks/`` and ``times.json`` where they are.
+    """Read a COLMAP model with images below ``images/``, and with ``masks/`` and ``times.json``
+    where they are.
 
-    Registered images become training views, but for those that ``test.txt`` in the model's folder lists; distorted
-    camera models are kept as ``View.lens``.
+    Registered images become training views, but for those that ``test.txt`` in the model's folder
+    lists; distorted camera models are kept as ``View.lens``.
     """
     folder, warnings = find_model(root)
     if folder is None:
@@ -103,7 +120,8 @@ def read_colmap(root: Path) -> Capture:
     twice = [path for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise DyngsError(f"{folder}: {twice[0]} is listed more than once; export the model again")
-    masks, seconds = find_masks(root / "masks"), read_seconds(root)
+    masks = find_masks(root / "masks")
+    seconds = read_seconds(root)
     poses, repaired = _poses(folder, model.images)
     rescaled: list[str] = []
     views = []
@@ -119,11 +137,19 @@ def read_colmap(root: Path) -> Capture:
         view = View(view_name(path, images), path, pose, intrinsics, *size, lens, image.camera)
         exposure = None if header is None else header.tags.exposure
         name = Path(os.path.relpath(path, images)).as_posix()
-        views.append(replace(view, mask_path=mask_of(name, masks), time=seconds.get(name), exposure=exposure))
-    warnings += [*repair_warning(repaired), *rescale_warning(rescaled), *unmasked_warning(views, bool(masks))]
+        views.append(
+            replace(view, mask_path=mask_of(name, masks), time=seconds.get(name), exposure=exposure)
+        )
+    warnings += [
+        *repair_warning(repaired),
+        *rescale_warning(rescaled),
+        *unmasked_warning(views, bool(masks)),
+    ]
     splits, notes = _splits(folder, [image.name for image in model.images], views)
     cloud = model.points if len(model.points.xyz) else None
-    return Capture(root, "colmap", splits, cloud, in_seconds=bool(seconds), warnings=(*warnings, *notes))
+    return Capture(
+        root, "colmap", splits, cloud, in_seconds=bool(seconds), warnings=(*warnings, *notes)
+    )
 
 
 def _images_of(root: Path, model: Path) -> Path:
@@ -147,7 +173,9 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
         w, x, y, z, *translation = image.pose
         length = float(np.linalg.norm((w, x, y, z)))
         if not abs(length - 1) <= ROTATION_TOLERANCE:  # zeros would be taken for no rotation
-            raise DyngsError(f"{where}: the quaternion of its rotation has length {length:.6g}, not 1; export it again")
+            raise DyngsError(
+                f"{where}: the quaternion of its rotation has length {length:.6g}, not 1; export it again"
+            )
         rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
         pose, repaired[where] = checked_pose(np.column_stack([rotation, translation]), where)
         poses.append(pose)
@@ -155,24 +183,35 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
 
 
 def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]:
-    """Return the (3, 3) matrix and the lens of a COLMAP camera, whose model OpenCV's formulas must express."""
+    """Return the (3, 3) matrix and the lens of a COLMAP camera, whose model OpenCV's formulas must
+    express."""
     if camera.model not in _LENSES:
-        raise DyngsError(f"{where}: camera model {camera.model} is not supported; run `colmap image_undistorter` first")
+        raise DyngsError(
+            f"{where}: camera model {camera.model} is not supported; run `colmap image_undistorter` first"
+        )
     values = camera.params
     if not np.isfinite(values).all():
-        raise DyngsError(f"{where}: the parameters of camera {camera.number} are not finite; export it again")
+        raise DyngsError(
+            f"{where}: the parameters of camera {camera.number} are not finite; export it again"
+        )
     num_focal, kind = _LENSES[camera.model]
-    fx, fy = values[0], values[num_focal - 1]
+    fx = values[0]
+    fy = values[num_focal - 1]
     if fx <= 0 or fy <= 0 or min(camera.size) < 1:
-        raise DyngsError(f"{where}: camera {camera.number} has no positive size and focal length; export it again")
+        raise DyngsError(
+            f"{where}: camera {camera.number} has no positive size and focal length; export it again"
+        )
     cx, cy, *coefficients = values[num_focal:]
     if kind == "none" or (kind == "opencv" and not any(coefficients)):
         return pinhole_matrix(fx, fy, cx, cy), Lens()
-    return pinhole_matrix(fx, fy, cx, cy), Lens(kind, (*coefficients, *(0.0,) * (4 - len(coefficients))))
+    return pinhole_matrix(fx, fy, cx, cy), Lens(
+        kind, (*coefficients, *(0.0,) * (4 - len(coefficients)))
+    )
 
 
 def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, list[str]]:
-    """Return the views, those listed in ``test.txt`` for testing, and warnings; ``names`` are those of the images."""
+    """Return the views, those listed in ``test.txt`` for testing, and warnings; ``names`` are those
+    of the images."""
     path = folder / TEST_LIST
     if not path.is_file():
         return {"train": tuple(views)}, []
@@ -180,9 +219,17 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
         text = read_text(path)
     listed = {folded(line.strip()) for line in text.splitlines() if line.strip()}
     unknown = sorted(listed - set(map(folded, names)))
-    notes = [f"{path}: {len(unknown)} listed images have no pose, first {unknown[0]:.80}"] if unknown else []
+    notes = (
+        [f"{path}: {len(unknown)} listed images have no pose, first {unknown[0]:.80}"]
+        if unknown
+        else []
+    )
     train, test = (
-        tuple(view for name, view in zip(names, views, strict=True) if (folded(name) in listed) == is_test)
+        tuple(
+            view
+            for name, view in zip(names, views, strict=True)
+            if (folded(name) in listed) == is_test
+        )
         for is_test in (False, True)
     )
     return ({"train": train, "test": test} if test else {"train": train}), notes
@@ -200,16 +247,20 @@ def find_masks(folder: Path) -> dict[str, Path]:
 
 
 def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
-    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png`` or the like, else ``a/b.jpg``, ``a/b.png`` or ``a/b.mask.png``."""
+    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png`` or the like, else ``a/b.jpg``, ``a/b.png`` or
+    ``a/b.mask.png``."""
     stem = image_name.rpartition(".")[0]
     names = (f"{image_name}.png", image_name, stem, f"{stem}.mask")
     return next((masks[key] for name in names if (key := folded(name)) in masks), None)
 
 
 def unmasked_warning(views: list[View], has_masks: bool) -> list[str]:
-    """Return a line about the images that have no mask although others have, none if there are none."""
+    """Return a line about the images that have no mask although others have, none if there are
+    none."""
     without = [view.name for view in views if view.mask_path is None]
-    return [f"{len(without)} images have no mask, first {without[0]}"] if has_masks and without else []
+    return (
+        [f"{len(without)} images have no mask, first {without[0]}"] if has_masks and without else []
+    )
 
 
 FORMAT = CaptureFormat("colmap", FILES, _is_chosen, read_colmap)

@@ -1,7 +1,8 @@
 """The files of a COLMAP model, binary or text: cameras, poses of images, points; no observations.
 
-pycolmap is not used: it cuts names at spaces, refuses tracks of absent images, needs the second lines
-of images.txt, and trusts the counts in binary files: a truncated one can hang or abort the process.
+pycolmap is not used: it cuts names at spaces, refuses tracks of absent images, needs the second
+lines of images.txt, and trusts the counts in binary files: a truncated one can hang or abort the
+process.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image: name as written, camera, and its ``cam_from_world``: wxyz, translation."""
+    """A registered image: name as written, camera, and its ``cam_from_world``: wxyz,
+    translation."""
 
     name: str
     camera: int
@@ -64,17 +66,22 @@ class ColmapModel:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read the model in a folder. Raises DyngsError: a file is missing, truncated or damaged; names it."""
+    """Read the model in a folder. Raises DyngsError: a file is missing, truncated or damaged; names
+    it."""
     extension = _extension(folder)
     paths = [folder / f"{stem}{extension}" for stem in ("cameras", "images", "points3D")]
     for path in paths:
         if not inside(path).is_file():
-            raise DyngsError(f"{path}: the COLMAP model lacks this file; export the whole model again")
+            raise DyngsError(
+                f"{path}: the COLMAP model lacks this file; export the whole model again"
+            )
     cameras = {camera.number: camera for camera in _read_cameras(paths[0])}
     images = sorted(_read_images(paths[1]), key=lambda image: image.name)
     for image in images:
         if image.camera not in cameras:
-            raise DyngsError(f"{paths[1]}: {image.name} is of camera {image.camera}, which {paths[0].name} lacks")
+            raise DyngsError(
+                f"{paths[1]}: {image.name} is of camera {image.camera}, which {paths[0].name} lacks"
+            )
     return ColmapModel(cameras, images, _read_points(paths[2]))
 
 
@@ -101,7 +108,9 @@ def _read_cameras(path: Path) -> list[ModelCamera]:
             for _ in range(file.unpack("<Q")[0]):
                 number, model_id, width, height = file.unpack("<IiQQ")
                 if not 0 <= model_id < len(names):
-                    raise DyngsError(f"{path}: camera {number} has the unknown model id {model_id}; undistort it")
+                    raise DyngsError(
+                        f"{path}: camera {number} has the unknown model id {model_id}; undistort it"
+                    )
                 model = names[model_id]
                 params = file.unpack(f"<{NUM_PARAMS[model]}d")
                 cameras.append(ModelCamera(number, model, (width, height), params))
@@ -147,7 +156,9 @@ def _read_points(path: Path) -> PointCloud:
                 file.skip_list(8)
     table = np.array(rows, np.float64).reshape(-1, 7)
     table = table[np.argsort(table[:, 0], kind="stable")]
-    return PointCloud(table[:, 1:4].copy(), np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8))
+    return PointCloud(
+        table[:, 1:4].copy(), np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
+    )
 
 
 def _point_of(line: str) -> array[float]:
@@ -160,8 +171,8 @@ def _point_of(line: str) -> array[float]:
 def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
     """Parse a text file of a model, one entry per line.
 
-    In images.txt the second line of an image, its 2D points, may be empty or missing. Raises DyngsError: a damaged
-    line, or fewer entries than the header ``# Number of ..: N`` announces.
+    In images.txt the second line of an image, its 2D points, may be empty or missing. Raises
+    DyngsError: a damaged line, or fewer entries than the header ``# Number of ..: N`` announces.
     """
     entries: list[Entry] = []
     announced = 0
@@ -179,15 +190,20 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
                     entries.append(entry_of(line))
                 except ValueError:
                     where = f"{path}, line {number}"
-                    raise DyngsError(f"{where}: the line is truncated or damaged; export the model again") from None
+                    raise DyngsError(
+                        f"{where}: the line is truncated or damaged; export the model again"
+                    ) from None
                 may_skip = path.stem == "images"
     if len(entries) < announced:
-        raise DyngsError(f"{path}: truncated, holds {len(entries)} of {announced} entries; copy or export it again")
+        raise DyngsError(
+            f"{path}: truncated, holds {len(entries)} of {announced} entries; copy or export it again"
+        )
     return entries
 
 
 class _Binary:
-    """A binary model file, read from its start; the end of the block must be the end of the file."""
+    """A binary model file, read from its start; the end of the block must be the end of the
+    file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -204,7 +220,9 @@ class _Binary:
                 f"{self._path}: the COLMAP file is truncated ({len(self._data)} bytes); copy or export it again"
             ) from None
         if kind is None and extra:
-            raise DyngsError(f"{self._path}: {extra} bytes follow the end of the COLMAP file; copy or export it again")
+            raise DyngsError(
+                f"{self._path}: {extra} bytes follow the end of the COLMAP file; copy or export it again"
+            )
 
     def unpack(self, layout: str) -> tuple:
         """Return the numbers of the next bytes."""

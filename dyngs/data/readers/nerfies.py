@@ -1,4 +1,5 @@
-"""Reader for Nerfies and HyperNeRF captures: ``dataset.json``, ``metadata.json``, ``camera/`` and ``rgb/Nx/``."""
+"""Reader for Nerfies and HyperNeRF captures: ``dataset.json``, ``metadata.json``, ``camera/`` and
+``rgb/Nx/``."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ class _Scene:
 
 @dataclass(frozen=True)
 class _Images:
-    """Images of one resolution: their folder, and the factor by which they are smaller than their cameras say."""
+    """Images of one resolution: their folder, and the factor by which they are smaller than their
+    cameras say."""
 
     folder: Path
     factor: int
@@ -38,15 +40,19 @@ class _Images:
 
 
 def read_nerfies(root: Path) -> Capture:
-    """Read the capture, in the world scaled as ``scene.json`` says, with the largest images that exist.
+    """Read the capture, in the world scaled as ``scene.json`` says, with the largest images that
+    exist.
 
-    Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th image); the time is
-    ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if present, are the sparse points, grey.
-    Cameras (Park et al. 2021): ``orientation`` has the camera's OpenCV axes as rows, ``position`` is its centre.
+    Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th
+    image); the time is ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if
+    present, are the sparse points, grey. Cameras (Park et al. 2021): ``orientation`` has the
+    camera's OpenCV axes as rows, ``position`` is its centre.
     """
     dataset = read_json_object(root / "dataset.json")
     lists = {key: _ids(root, dataset, key) for key in ("ids", "train_ids", "val_ids")}
-    train = lists["train_ids"] or [name for name in lists["ids"] if name not in set(lists["val_ids"])]
+    train = lists["train_ids"] or [
+        name for name in lists["ids"] if name not in set(lists["val_ids"])
+    ]
     used = list(dict.fromkeys([*train, *lists["val_ids"]]))
     if not used:
         raise DyngsError(f"{root / 'dataset.json'}: 'train_ids' is empty; nothing to read")
@@ -70,7 +76,9 @@ def read_nerfies(root: Path) -> Capture:
     splits: Splits = {"train": tuple(views[name] for name in train)}
     if lists["val_ids"]:
         splits["test"] = tuple(views[name] for name in lists["val_ids"])
-    return Capture(root, "nerfies", splits, _points(root / "points.npy", scene), warnings=tuple(warnings))
+    return Capture(
+        root, "nerfies", splits, _points(root / "points.npy", scene), warnings=tuple(warnings)
+    )
 
 
 def _ids(root: Path, dataset: dict[str, object], key: str) -> list[str]:
@@ -91,7 +99,9 @@ def _metadata(root: Path, names: list[str]) -> dict[str, dict[str, object]]:
     for name in names:
         own = fields.get(name, {} if not fields else None)
         if not isinstance(own, dict):
-            raise DyngsError(f"{path}: has no entry for '{name}' of dataset.json; add its warp_id and camera_id")
+            raise DyngsError(
+                f"{path}: has no entry for '{name}' of dataset.json; add its warp_id and camera_id"
+            )
         found[name] = own
     return found
 
@@ -138,36 +148,65 @@ def _find_images(root: Path) -> _Images:
         if match and int(match[1]) > 0 and path.is_dir():
             folders[int(match[1])] = path
     for factor, folder in sorted(folders.items()):
-        files = {path.stem: path for path in sorted(folder.iterdir(), reverse=True) if path.suffix.lower() in SUFFIXES}
+        files = {
+            path.stem: path
+            for path in sorted(folder.iterdir(), reverse=True)
+            if path.suffix.lower() in SUFFIXES
+        }
         if files:
             return _Images(folder, factor, files)
-    raise DyngsError(f"{root / 'rgb'}: no images in 1x, 2x, 4x or the like; restore one of these folders")
+    raise DyngsError(
+        f"{root / 'rgb'}: no images in 1x, 2x, 4x or the like; restore one of these folders"
+    )
 
 
-def _camera(path: Path, scene: _Scene, images: _Images, name: str, skewed: list[str]) -> dict[str, object]:
-    """Return the camera as a frame of a transforms file, for images smaller by the factor of their folder."""
+def _camera(
+    path: Path, scene: _Scene, images: _Images, name: str, skewed: list[str]
+) -> dict[str, object]:
+    """Return the camera as a frame of a transforms file, for images smaller by the factor of their
+    folder."""
     if not path.is_file():
         raise DyngsError(f"{path}: no such camera file, although dataset.json lists it; restore it")
     fields = read_json_object(path)
     focal = float(_numbers(path, fields, "focal_length", ()))
-    aspect = float(_numbers(path, fields, "pixel_aspect_ratio", ())) if "pixel_aspect_ratio" in fields else 1.0
-    full, (cx, cy) = _numbers(path, fields, "image_size", (2,)), _numbers(path, fields, "principal_point", (2,))
+    aspect = (
+        float(_numbers(path, fields, "pixel_aspect_ratio", ()))
+        if "pixel_aspect_ratio" in fields
+        else 1.0
+    )
+    full, (cx, cy) = (
+        _numbers(path, fields, "image_size", (2,)),
+        _numbers(path, fields, "principal_point", (2,)),
+    )
     if (full < 1).any():
         raise DyngsError(f"{path}: 'image_size' must be positive")
     if "skew" in fields and abs(float(_numbers(path, fields, "skew", ()))) > 1e-6 * focal:
         skewed.append(str(path))
     image = images.files.get(name, images.folder / f"{name}.png")
     width, height = _scaled_size(full, images.factor, image)
-    scale_x, scale_y = width / full[0], height / full[1]
+    scale_x = width / full[0]
+    scale_y = height / full[1]
     # Older Nerfies files have "tangential".
     tangential = "tangential_distortion" if "tangential_distortion" in fields else "tangential"
-    k1, k2, k3 = _numbers(path, fields, "radial_distortion", (3,)) if "radial_distortion" in fields else np.zeros(3)
+    k1, k2, k3 = (
+        _numbers(path, fields, "radial_distortion", (3,))
+        if "radial_distortion" in fields
+        else np.zeros(3)
+    )
     p1, p2 = _numbers(path, fields, tangential, (2,)) if tangential in fields else np.zeros(2)
     world_from_cam = np.eye(4)
     world_from_cam[:3, :3] = _numbers(path, fields, "orientation", (3, 3)).T
     world_from_cam[:3, 3] = scene.apply(_numbers(path, fields, "position", (3,)))
     sizes = {"w": width, "h": height, "fl_x": focal * scale_x, "fl_y": focal * aspect * scale_y}
-    lens = {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2, "cx": cx * scale_x, "cy": cy * scale_y}
+    lens = {
+        "k1": k1,
+        "k2": k2,
+        "k3": k3,
+        "p1": p1,
+        "p2": p2,
+        "cx": cx * scale_x,
+        "cy": cy * scale_y,
+    }
     return {
         **{key: float(value) for key, value in (sizes | lens).items()},
         "file_path": f"rgb/{images.folder.name}/{image.name}",
@@ -176,7 +215,8 @@ def _camera(path: Path, scene: _Scene, images: _Images, name: str, skewed: list[
 
 
 def _scaled_size(full: np.ndarray, factor: int, image: Path) -> tuple[int, int]:
-    """(width, height) of the image: the stored size if that is ``full / factor`` rounded, else the rounded one."""
+    """(width, height) of the image: the stored size if that is ``full / factor`` rounded, else the
+    rounded one."""
     nominal = round(float(full[0]) / factor), round(float(full[1]) / factor)
     header = header_if_readable(image)
     if header is None:

@@ -1,4 +1,5 @@
-"""Reader for NeuMan folders: a COLMAP model, masks, and a body fitted to each image and aligned with the model."""
+"""Reader for NeuMan folders: a COLMAP model, masks, and a body fitted to each image and aligned
+with the model."""
 
 from __future__ import annotations
 
@@ -26,19 +27,22 @@ FITS = ("smpl_output_optimized.pkl", "smpl_output_romp.pkl")
 
 
 def read_neuman(root: Path) -> Capture:
-    """Read the capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's world and unit.
+    """Read the capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's
+    world and unit.
 
-    Body parameters, one row per posed image in order of their names: ``4d_humans/smpl_optimized_aligned_scale.npz``
-    (global_orient, body_pose, betas, transl, scale), else ``smpl_output_optimized.pkl`` or ``smpl_output_romp.pkl``
-    (pose, betas of one person) with ``alignments.npy`` (image name to a (4, 3) matrix M, ``world = [v 1] M``). Masks
-    in ``segmentations`` under the images' names are black where the person is. Splits are those of
+    Body parameters, one row per posed image in order of their names:
+    ``4d_humans/smpl_optimized_aligned_scale.npz`` (global_orient, body_pose, betas, transl, scale),
+    else ``smpl_output_optimized.pkl`` or ``smpl_output_romp.pkl`` (pose, betas of one person) with
+    ``alignments.npy`` (image name to a (4, 3) matrix M, ``world = [v 1] M``). Masks in
+    ``segmentations`` under the images' names are black where the person is. Splits are those of
     ``{train,val,test}_split.txt``, if there.
     """
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
     names = [view.image_path.name for view in posed]
     numbers = [_number(root, name) for name in names]
-    first, last = min(numbers, default=0), max(numbers, default=0)
+    first = min(numbers, default=0)
+    last = max(numbers, default=0)
     people: dict[str, View] = {}
     for view, number in zip(posed, numbers, strict=True):
         mask = root / "segmentations" / view.image_path.name
@@ -51,32 +55,52 @@ def read_neuman(root: Path) -> Capture:
         )
     body = _aligned(root, numbers) if (root / ALIGNED).is_file() else _fitted(root, names, numbers)
     without = [name for name, view in people.items() if view.silhouette is None]
-    notes = [f"{len(without)} images have no mask in segmentations, first {without[0]}"] if without else []
+    notes = (
+        [f"{len(without)} images have no mask in segmentations, first {without[0]}"]
+        if without
+        else []
+    )
     splits, more = _splits(root, people)
     warnings = (*capture.warnings, *notes, *more)
-    return capture.replace(format="neuman", splits=splits, body=of_one_clip(body), warnings=warnings)
+    return capture.replace(
+        format="neuman", splits=splits, body=of_one_clip(body), warnings=warnings
+    )
 
 
 def _aligned(root: Path, numbers: list[int]) -> BodyFrames:
     path = root / ALIGNED
     found = read_npz(path, ("global_orient", "body_pose", "betas", "transl", "scale"))
-    parts = [_per_image(path, key, found[key], len(numbers)) for key in ("global_orient", "body_pose")]
-    return body_frames(path, numbers, np.concatenate(parts, axis=1), found["transl"], found["betas"], found["scale"])
+    parts = [
+        _per_image(path, key, found[key], len(numbers)) for key in ("global_orient", "body_pose")
+    ]
+    return body_frames(
+        path,
+        numbers,
+        np.concatenate(parts, axis=1),
+        found["transl"],
+        found["betas"],
+        found["scale"],
+    )
 
 
 def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
-    """SMPL fitted in a frame of its own, mapped to the world by the similarity transform of each image."""
+    """SMPL fitted in a frame of its own, mapped to the world by the similarity transform of each
+    image."""
     from scipy.spatial.transform import Rotation  # late: other captures need none of scipy
 
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
     fits = read_pickle(inside(path))
     if not isinstance(fits, dict) or len(fits) != 1:
         count = len(fits) if isinstance(fits, dict) else 0
-        raise DyngsError(f"{path}: must hold the body parameters of one person, got {count}; keep one")
+        raise DyngsError(
+            f"{path}: must hold the body parameters of one person, got {count}; keep one"
+        )
     fit = next(iter(fits.values()))
     poses = _per_image(path, "pose", entry(path, fit, "pose"), len(numbers))
     alignments = read_pickled_array(inside(root / ALIGNMENTS))
-    scales, turns, trans = [], [], []
+    scales = []
+    turns = []
+    trans = []
     for name in names:
         where = f"{root / ALIGNMENTS}, {name}"
         matrix = numbers_of(where, entry(root / ALIGNMENTS, alignments, name), (4, 3)).T
@@ -85,12 +109,20 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
             raise DyngsError(
                 f"{where}: the alignment is no similarity (its determinant is not positive); export it again"
             )
-        pose, _ = checked_pose(np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1), where)
+        pose, _ = checked_pose(
+            np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1), where
+        )
         scales.append(scale)
         turns.append(Rotation.from_matrix(pose[:3, :3]).as_rotvec())
         trans.append(pose[:3, 3])
     return body_frames(
-        path, numbers, poses, np.array(trans), entry(path, fit, "betas"), np.array(scales), np.array(turns)
+        path,
+        numbers,
+        poses,
+        np.array(trans),
+        entry(path, fit, "betas"),
+        np.array(scales),
+        np.array(turns),
     )
 
 
@@ -106,7 +138,9 @@ def _per_image(path: Path, key: str, value: object, count: int) -> np.ndarray:
 def _number(root: Path, name: str) -> int:
     digits = re.findall(r"\d+", Path(name).stem)
     if not digits or len(digits[-1]) > 15:
-        raise DyngsError(f"{root / 'images' / name}: no frame number in its name; call it 00000.png or the like")
+        raise DyngsError(
+            f"{root / 'images' / name}: no frame number in its name; call it 00000.png or the like"
+        )
     return int(digits[-1])
 
 
@@ -127,13 +161,17 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
         splits["train"] = tuple(view for view in people.values() if view.name not in held_out)
     if not unposed:
         return splits, []
-    return splits, [f"{len(unposed)} images of the splits have no pose and are left out: {first_few(unposed)}"]
+    return splits, [
+        f"{len(unposed)} images of the splits have no pose and are left out: {first_few(unposed)}"
+    ]
 
 
 FORMAT = CaptureFormat(
     "neuman",
     "a COLMAP model and alignments.npy or 4d_humans",
-    lambda root: is_colmap(root) and any((root / name).is_file() for name in (ALIGNED, ALIGNMENTS, *FITS)),
+    lambda root: (
+        is_colmap(root) and any((root / name).is_file() for name in (ALIGNED, ALIGNMENTS, *FITS))
+    ),
     read_neuman,
     extends="colmap",
 )

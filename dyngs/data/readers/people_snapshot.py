@@ -1,4 +1,5 @@
-"""Reader for PeopleSnapshot folders: a video of a rotating person, ``camera.pkl``, masks and poses in HDF5 files."""
+"""Reader for PeopleSnapshot folders: a video of a rotating person, ``camera.pkl``, masks and poses
+in HDF5 files."""
 
 from __future__ import annotations
 
@@ -26,12 +27,14 @@ POSE_FILE = "reconstructed_poses.hdf5"
 
 
 def read_people_snapshot(root: Path) -> Capture:
-    """Read the capture of one static camera (Alldieck et al. 2018): frame n of the video is row n of masks and poses.
+    """Read the capture of one static camera (Alldieck et al. 2018): frame n of the video is row n
+    of masks and poses.
 
-    ``camera.pkl``: camera_f, camera_c (2,) px, camera_k (5,) OpenCV, camera_rt axis-angle and camera_t of
-    cam_from_world, width, height. ``masks.hdf5``: masks (F, H, W), 0 is background. ``reconstructed_poses.hdf5``: SMPL
-    pose (F, 72), trans (F, 3), betas (10,), in metres. Frames without a mask or parameters are left out. Raises
-    DyngsError: h5py is not installed; anything missing, broken or inconsistent; names the file.
+    ``camera.pkl``: camera_f, camera_c (2,) px, camera_k (5,) OpenCV, camera_rt axis-angle and
+    camera_t of cam_from_world, width, height. ``masks.hdf5``: masks (F, H, W), 0 is background.
+    ``reconstructed_poses.hdf5``: SMPL pose (F, 72), trans (F, 3), betas (10,), in metres. Frames
+    without a mask or parameters are left out. Raises DyngsError: h5py is not installed; anything
+    missing, broken or inconsistent; names the file.
     """
     camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)
@@ -50,8 +53,12 @@ def read_people_snapshot(root: Path) -> Capture:
     )
     lost = len(camera.images) - len(images)
     if lost:
-        warnings.append(f"{video.name}: {lost} of {len(camera.images)} frames lack a mask or a pose and are left out")
-    own, fps, lines = of_one_clip(body), video_fps([camera]), tuple(warnings)
+        warnings.append(
+            f"{video.name}: {lost} of {len(camera.images)} frames lack a mask or a pose and are left out"
+        )
+    own = of_one_clip(body)
+    fps = video_fps([camera])
+    lines = tuple(warnings)
     return Capture(root, "people_snapshot", {"train": people}, fps=fps, body=own, warnings=lines)
 
 
@@ -86,21 +93,31 @@ def _calibration(path: Path) -> dict[str, object]:
         ]
     )
     keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "w", "h")
-    return {**dict(zip(keys, values.tolist(), strict=True)), "transform_matrix": opengl_from_cam(pose).tolist()}
+    return {
+        **dict(zip(keys, values.tolist(), strict=True)),
+        "transform_matrix": opengl_from_cam(pose).tolist(),
+    }
 
 
 def _body(path: Path) -> BodyFrames:
     """Body parameters of the fitted frames; rows that are all zero were not fitted."""
     poses, trans, betas = (read_hdf5(path, key) for key in ("pose", "trans", "betas"))
     if len(poses) != len(trans):
-        raise DyngsError(f"{path}: 'pose' has {len(poses)} rows but 'trans' {len(trans)}; export it again")
-    fitted = np.flatnonzero([bool(np.any(p)) or bool(np.any(t)) for p, t in zip(poses, trans, strict=True)])
+        raise DyngsError(
+            f"{path}: 'pose' has {len(poses)} rows but 'trans' {len(trans)}; export it again"
+        )
+    fitted = np.flatnonzero(
+        [bool(np.any(p)) or bool(np.any(t)) for p, t in zip(poses, trans, strict=True)]
+    )
     return body_frames(path, fitted.tolist(), poses[fitted], trans[fitted], betas)
 
 
 FORMAT = CaptureFormat(
     "people_snapshot",
     f"{CAMERA}, {MASK_FILE}, {POSE_FILE}",
-    lambda root: (root / CAMERA).is_file() and any((root / name).is_file() for name in (MASK_FILE, POSE_FILE)),
+    lambda root: (
+        (root / CAMERA).is_file()
+        and any((root / name).is_file() for name in (MASK_FILE, POSE_FILE))
+    ),
     read_people_snapshot,
 )

@@ -28,18 +28,24 @@ _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width",
 
 
 def read_polycam(root: Path) -> Capture:
-    """Read ``keyframes`` of Polycam's raw data: an image, a camera and, if there, a depth map of the same name each.
+    """Read ``keyframes`` of Polycam's raw data: an image, a camera and, if there, a depth map of
+    the same name each.
 
-    Poses are OpenGL camera-to-world, y up. Corrected images have no distortion, corrected cameras closed loops.
+    Poses are OpenGL camera-to-world, y up. Corrected images have no distortion, corrected cameras
+    closed loops.
     """
     images, cameras = _existing(root, _POLYCAM)[0]
     frames: list[FrameEntry] = []
     for image in files_in(images, SUFFIXES):
         path = cameras / f"{image.stem}.json"
         fields = read_json_object(path)
-        own: dict[str, object] = {key: entry(path, fields, name) for key, name in _INTRINSICS.items()}
+        own: dict[str, object] = {
+            key: entry(path, fields, name) for key, name in _INTRINSICS.items()
+        }
         own |= _depth_of(root / "keyframes" / "depth" / f"{image.stem}.png")
-        own["transform_matrix"] = [[entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+        own["transform_matrix"] = [
+            [entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)
+        ]
         frames.append(FrameEntry(str(path), own | {"file_path": str(image)}, image=image))
     return training_capture(root, "polycam", FrameFile(root / "keyframes", frames))
 
@@ -49,20 +55,30 @@ def _depth_of(path: Path) -> dict[str, object]:
 
 
 def _existing(root: Path, places: Sequence[tuple[str, str]]) -> list[tuple[Path, Path]]:
-    """Return the folders that hold images, each with its file or folder of cameras, in the order of ``places``."""
+    """Return the folders that hold images, each with its file or folder of cameras, in the order of
+    ``places``."""
     pairs = [(root / images, root / cameras) for images, cameras in places]
-    return [(images, cameras) for images, cameras in pairs if cameras.exists() and files_in(images, SUFFIXES)]
+    return [
+        (images, cameras)
+        for images, cameras in pairs
+        if cameras.exists() and files_in(images, SUFFIXES)
+    ]
 
 
 POLYCAM_FORMAT = CaptureFormat(
-    "polycam", "keyframes/images and keyframes/cameras", lambda root: bool(_existing(root, _POLYCAM)), read_polycam
+    "polycam",
+    "keyframes/images and keyframes/cameras",
+    lambda root: bool(_existing(root, _POLYCAM)),
+    read_polycam,
 )
 
 
 def read_record3d(root: Path) -> Capture:
-    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or those of an unpacked ``.r3d``.
+    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or those of an unpacked
+    ``.r3d``.
 
-    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is written column by column.
+    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is written column by
+    column.
     """
     from scipy.spatial.transform import Rotation  # late: other captures do not need it
 
@@ -80,7 +96,9 @@ def read_record3d(root: Path) -> Capture:
             continue
         number = int(image.stem)
         if number >= len(poses):
-            raise DyngsError(f"{image}: has no pose, {path} has {len(poses)}, from number 0 on; export it again")
+            raise DyngsError(
+                f"{image}: has no pose, {path} has {len(poses)}, from number 0 on; export it again"
+            )
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(poses[number, :4]).as_matrix()
         pose[:3, 3] = poses[number, 4:]

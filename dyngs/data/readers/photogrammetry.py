@@ -1,4 +1,5 @@
-"""Readers for cameras that photogrammetry programs export: Metashape, RealityCapture (RealityScan) and ODM."""
+"""Readers for cameras that photogrammetry programs export: Metashape, RealityCapture (RealityScan)
+and ODM."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from dyngs.files.fields import first_few, numbers_of
 
 _HEAD_BYTES = 4096
 _LENS_ERROR = 1e-4
-"""Largest error of a fitted distortion, in focal lengths: a tenth of a pixel in a photo of 1000 pixels."""
+"""Largest error of a fitted distortion, in focal lengths: a tenth of a pixel in a photo of 1000
+pixels."""
 _ADVICE = "export it again"
 _Fields = dict[str, Any]
 """Fields of a frame in a transforms file."""
@@ -46,8 +48,11 @@ class _Photos:
         return self._by_name.get(path.name, self._by_name.get(path.stem))
 
 
-def _capture(root: Path, format: str, path: Path, photos: _Photos, cameras: Sequence[tuple[str, _Fields]]) -> Capture:
-    """Return a capture of the cameras, each the name of a photo and its fields, which lack a pose if it has none."""
+def _capture(
+    root: Path, format: str, path: Path, photos: _Photos, cameras: Sequence[tuple[str, _Fields]]
+) -> Capture:
+    """Return a capture of the cameras, each the name of a photo and its fields, which lack a pose
+    if it has none."""
     frames: list[FrameEntry] = []
     left_out: list[str] = []
     for name, fields in cameras:
@@ -55,14 +60,18 @@ def _capture(root: Path, format: str, path: Path, photos: _Photos, cameras: Sequ
         if image is None or "transform_matrix" not in fields:
             left_out.append(name)
         else:
-            frames.append(FrameEntry(f"{path}, {name}", {**fields, "file_path": str(image)}, image=image))
+            frames.append(
+                FrameEntry(f"{path}, {name}", {**fields, "file_path": str(image)}, image=image)
+            )
     if not frames:
         raise DyngsError(
             f"{path}: no photo in {photos.folder} has the name of a camera with a pose; put the photos there"
         )
     count = f"{len(left_out)} of {counted(len(cameras), 'camera')}"
     line = f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}"
-    return training_capture(root, format, FrameFile(root / path.name, frames), *([line] if left_out else []))
+    return training_capture(
+        root, format, FrameFile(root / path.name, frames), *([line] if left_out else [])
+    )
 
 
 def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
@@ -86,33 +95,41 @@ def _radial(coefficients: Sequence[float]) -> _Fields:
 
 
 def _brown(where: str, k: Sequence[float], diagonal: float) -> _Fields:
-    """Return the radial distortion 1 + k1 r^2 + .. + k4 r^8 in OpenCV's terms, which have no such k4.
+    """Return the radial distortion 1 + k1 r^2 + .. + k4 r^8 in OpenCV's terms, which have no such
+    k4.
 
-    OpenCV's rational function is fitted to it, up to the corners of a photo whose ``diagonal`` is in focal lengths.
+    OpenCV's rational function is fitted to it, up to the corners of a photo whose ``diagonal`` is
+    in focal lengths.
     """
     if k[3] == 0:
         return _radial(k[:3])
-    radius = np.linspace(0, 0.6 * diagonal, 1000)[:, None]  # barrel distortion brings more in than half of it
+    # barrel distortion brings more in than half of it
+    radius = np.linspace(0, 0.6 * diagonal, 1000)[:, None]
     factor = 1 + radius ** [2, 4, 6, 8] @ np.array(k)[:, None]
     powers = radius ** [2, 4, 6]
     fitted = np.linalg.lstsq(np.hstack([powers, -factor * powers]), factor - 1, rcond=None)[0]
     error = radius * ((1 + powers @ fitted[:3]) / (1 + powers @ fitted[3:]) - factor)
     if not np.abs(error).max() < _LENS_ERROR:
-        raise DyngsError(f"{where}: its distortion with k4={k[3]:g} cannot be expressed; export undistorted photos")
+        raise DyngsError(
+            f"{where}: its distortion with k4={k[3]:g} cannot be expressed; export undistorted photos"
+        )
     return {**_radial(fitted[:, 0].tolist()), "camera_model": "FULL_OPENCV"}
 
 
 def read_metashape(root: Path) -> Capture:
     """Read the cameras that Metashape exports as .xml, and the photos in its folder.
 
-    ``transform`` of a camera maps OpenCV axes to the chunk; that of its component, or of the chunk, maps to the world.
+    ``transform`` of a camera maps OpenCV axes to the chunk; that of its component, or of the chunk,
+    maps to the world.
     """
     path = _only(_exports(root, ".xml", b"<chunk"))
     cameras: list[tuple[str, _Fields]] = []
     with reading(path, _ADVICE):
         content = path.read_bytes()
         if b"<!ENTITY" in content:
-            raise DyngsError(f"{path}: defines entities, which no export of cameras needs; {_ADVICE}")
+            raise DyngsError(
+                f"{path}: defines entities, which no export of cameras needs; {_ADVICE}"
+            )
         chunk = next(ElementTree.fromstring(content).iter("chunk"))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
         placements: dict[str | None, ElementTree.Element | None] = {}
@@ -138,7 +155,9 @@ def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarr
     """Return a pose in the world: rotated, scaled and shifted as ``transform`` of a chunk says."""
     if transform is None:
         return pose
-    rotation = np.array(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1").split(), np.float64).reshape(3, 3)
+    rotation = np.array(
+        transform.findtext("rotation", "1 0 0 0 1 0 0 0 1").split(), np.float64
+    ).reshape(3, 3)
     shift = np.array(transform.findtext("translation", "0 0 0").split(), np.float64)
     placed = np.eye(4)
     placed[:3, :3] = rotation @ pose[:3, :3]
@@ -147,14 +166,16 @@ def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarr
 
 
 def _ignored_terms(sensor: ElementTree.Element) -> list[str]:
-    """Return a line where a sensor has terms that no lens of ours has: skew, and tangential ones of fisheye lenses."""
+    """Return a line where a sensor has terms that no lens of ours has: skew, and tangential ones of
+    fisheye lenses."""
     keys = ("b2", "p1", "p2") if sensor.get("type") == "fisheye" else ("b2",)
     found = [key for key in keys if any(float(term.text or 0) for term in sensor.iter(key))]
     return [f"sensor {sensor.get('label')}: {', '.join(found)} are ignored"] if found else []
 
 
 def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
-    """Return the intrinsics of a sensor in px, ``cx`` and ``cy`` from the middle; its p1 and p2 are OpenCV's p2, p1."""
+    """Return the intrinsics of a sensor in px, ``cx`` and ``cy`` from the middle; its p1 and p2 are
+    OpenCV's p2, p1."""
     where = f"{path}, sensor {sensor.get('label')}"
     calibrations = sensor.findall("calibration")
     kind = sensor.get("type")
@@ -163,14 +184,25 @@ def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
             f"{where}: is of type {kind} with {counted(len(calibrations), 'calibration')}; only calibrated frame and "
             "fisheye sensors are read: convert its photos to those of a frame camera in Metashape"
         )
-    adjusted = [calibration for calibration in calibrations if calibration.get("class") == "adjusted"]
+    adjusted = [
+        calibration for calibration in calibrations if calibration.get("class") == "adjusted"
+    ]
     values = {child.tag: child.text for child in (adjusted or calibrations)[0]}
     f, cx, cy, p1, p2, b1, *k = (
-        float(values.get(key) or 0) for key in ("f", "cx", "cy", "p1", "p2", "b1", "k1", "k2", "k3", "k4")
+        float(values.get(key) or 0)
+        for key in ("f", "cx", "cy", "p1", "p2", "b1", "k1", "k2", "k3", "k4")
     )
     size = next(sensor.iter("resolution"))
-    width, height = int(size.attrib["width"]), int(size.attrib["height"])
-    own = {"w": width, "h": height, "fl_x": f + b1, "fl_y": f, "cx": width / 2 + cx, "cy": height / 2 + cy}
+    width = int(size.attrib["width"])
+    height = int(size.attrib["height"])
+    own = {
+        "w": width,
+        "h": height,
+        "fl_x": f + b1,
+        "fl_y": f,
+        "cx": width / 2 + cx,
+        "cy": height / 2 + cy,
+    }
     if kind == "fisheye":
         return {**own, **_radial(k), "camera_model": "OPENCV_FISHEYE"}
     return {**own, **_brown(where, k, math.hypot(width, height) / f), "p1": p2, "p2": p1}
@@ -190,10 +222,12 @@ _RENAMED = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 
 
 def read_realitycapture(root: Path) -> Capture:
-    """Read RealityCapture's .csv of "internal/external camera parameters", and the photos in its folder.
+    """Read RealityCapture's .csv of "internal/external camera parameters", and the photos in its
+    folder.
 
-    x points east, y north. Heading is clockwise from north, pitch up from straight down, in degrees. ``f`` is for 36 mm
-    wide film, ``px`` and ``py`` are from the middle, in longer sides. ``t1`` and ``t2`` are OpenCV's p2 and p1.
+    x points east, y north. Heading is clockwise from north, pitch up from straight down, in
+    degrees. ``f`` is for 36 mm wide film, ``px`` and ``py`` are from the middle, in longer sides.
+    ``t1`` and ``t2`` are OpenCV's p2 and p1.
     """
     path = _only(_exports(root, ".csv", _REALITYCAPTURE_MARK))
     photos = _Photos(root)
@@ -212,17 +246,27 @@ def read_realitycapture(root: Path) -> Capture:
     return _capture(root, "realitycapture", path, photos, cameras)
 
 
-def _realitycapture_camera(where: str, values: dict[str, float], width: int, height: int) -> _Fields:
+def _realitycapture_camera(
+    where: str, values: dict[str, float], width: int, height: int
+) -> _Fields:
     from scipy.spatial.transform import Rotation  # late: other captures do not need it
 
-    px, py, t1, t2, *k = (values.get(key, 0.0) for key in ("px", "py", "t1", "t2", "k1", "k2", "k3", "k4"))
+    px, py, t1, t2, *k = (
+        values.get(key, 0.0) for key in ("px", "py", "t1", "t2", "k1", "k2", "k3", "k4")
+    )
     side = max(width, height)
     focal = values["f"] / 36 * side
     pose = np.eye(4)
     angles = (-values["heading"], values["pitch"], values["roll"])
     pose[:3, :3] = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
     pose[:3, 3] = (values["x"], values["y"], values["alt"])
-    own = {"w": width, "h": height, "fl_x": focal, "cx": width / 2 + px * side, "cy": height / 2 + py * side}
+    own = {
+        "w": width,
+        "h": height,
+        "fl_x": focal,
+        "cx": width / 2 + px * side,
+        "cy": height / 2 + py * side,
+    }
     lens = _brown(where, k, math.hypot(width, height) / focal)
     return {**own, **lens, "p1": t2, "p2": t1, "transform_matrix": pose.tolist()}
 
@@ -246,9 +290,11 @@ _ODM_LENSES = {
 
 
 def read_odm(root: Path) -> Capture:
-    """Read ``reconstruction.json`` of ODM or OpenSfM, else ``odm_report/shots.geojson`` and ``cameras.json``.
+    """Read ``reconstruction.json`` of ODM or OpenSfM, else ``odm_report/shots.geojson`` and
+    ``cameras.json``.
 
-    Rotations are axis-angle, from the world to OpenCV axes. In ``shots.geojson`` the translation is the camera's place.
+    Rotations are axis-angle, from the world to OpenCV axes. In ``shots.geojson`` the translation is
+    the camera's place.
     """
     path = next(root / name for name in _ODM_FILES if (root / name).is_file())
     points = None
@@ -258,16 +304,24 @@ def read_odm(root: Path) -> Capture:
         if path.suffix == ".json":
             model = max(content, key=lambda model: len(model["shots"]))
             if len(content) > 1:
-                warnings = [f"{path.name}: the largest of {len(content)} models is read, {len(model['shots'])} photos"]
+                warnings = [
+                    f"{path.name}: the largest of {len(content)} models is read, {len(model['shots'])} photos"
+                ]
             lenses = model["cameras"]
             shots = model["shots"]
-            listed = [[*point["coordinates"], *point["color"]] for point in model.get("points", {}).values()]
+            listed = [
+                [*point["coordinates"], *point["color"]]
+                for point in model.get("points", {}).values()
+            ]
             if listed:
                 table = numbers_of(f"{path}: points", listed, (len(listed), 6))
                 points = PointCloud(table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8))
         else:
             lenses = json.loads(inside(root / "cameras.json").read_text(encoding="utf-8-sig"))
-            shots = {feature["properties"]["filename"]: feature["properties"] for feature in content["features"]}
+            shots = {
+                feature["properties"]["filename"]: feature["properties"]
+                for feature in content["features"]
+            }
         cameras = [(name, _odm_camera(path, name, shot, lenses)) for name, shot in shots.items()]
     capture = _capture(root, "odm", path, _Photos(root), cameras)
     return capture.replace(points=points or capture.points, warnings=(*warnings, *capture.warnings))
@@ -278,16 +332,30 @@ def _odm_camera(path: Path, name: str, shot: _Fields, lenses: dict[str, _Fields]
 
     where = f"{path}, {name}"
     if "camera" not in shot and len(lenses) > 1:
-        raise DyngsError(f"{where}: which of {len(lenses)} cameras took it is not stated; add {_ODM_FILES[0]}")
+        raise DyngsError(
+            f"{where}: which of {len(lenses)} cameras took it is not stated; add {_ODM_FILES[0]}"
+        )
     lens = lenses[shot.get("camera", next(iter(lenses)))]
     kind = lens["projection_type"]
     if kind not in _ODM_LENSES:
-        raise DyngsError(f"{where}: photos of projection {kind!r:.40} are not read, only {', '.join(_ODM_LENSES)}")
-    width, height = lens["width"], lens["height"]
+        raise DyngsError(
+            f"{where}: photos of projection {kind!r:.40} are not read, only {', '.join(_ODM_LENSES)}"
+        )
+    width = lens["width"]
+    height = lens["height"]
     side = max(width, height)
     fx, fy = (side * lens.get(key, lens.get("focal")) for key in ("focal_x", "focal_y"))
-    cx, cy = width / 2 + side * lens.get("c_x", 0), height / 2 + side * lens.get("c_y", 0)
-    own = {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": _ODM_LENSES[kind]}
+    cx = width / 2 + side * lens.get("c_x", 0)
+    cy = height / 2 + side * lens.get("c_y", 0)
+    own = {
+        "w": width,
+        "h": height,
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        "camera_model": _ODM_LENSES[kind],
+    }
     distortion = {key: lens[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key in lens}
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(shot["rotation"]).as_matrix()

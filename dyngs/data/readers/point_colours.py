@@ -17,8 +17,13 @@ _PACKED = ("rgb", "rgba")
 
 
 def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
-    """Return (P, 3) uint8 colours of ``count`` points, grey where ``columns`` (by property name) hold none."""
-    known = {name.lower(): np.ravel(column) for name, column in columns.items() if np.size(column) == count}
+    """Return (P, 3) uint8 colours of ``count`` points, grey where ``columns`` (by property name)
+    hold none."""
+    known = {
+        name.lower(): np.ravel(column)
+        for name, column in columns.items()
+        if np.size(column) == count
+    }
     for names in _NAMES:
         if known.keys() >= set(names):
             return _as_bytes(np.stack([known[name] for name in names], axis=1))

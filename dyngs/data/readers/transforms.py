@@ -1,4 +1,5 @@
-"""Transforms JSON files, as Blender, nerfstudio and instant-ngp captures have them: frames, views, points."""
+"""Transforms JSON files, as Blender, nerfstudio and instant-ngp captures have them: frames, views,
+points."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One entry of ``frames``: its ``own`` fields; keys that it lacks are looked up in those of the file, ``shared``.
+    """One entry of ``frames``: its ``own`` fields; keys that it lacks are looked up in those of the
+    file, ``shared``.
 
     Attributes:
         where: file and index, for messages.
@@ -59,7 +61,8 @@ class FrameEntry:
         return _number(self.own.get(key, self.shared.get(key)), key, self.where)
 
     def integer(self, key: str) -> int | None:
-        """Return the whole number at ``key`` of this frame alone, None if absent or no whole number."""
+        """Return the whole number at ``key`` of this frame alone, None if absent or no whole
+        number."""
         value = self.own.get(key)
         if not is_number(value):
             return None
@@ -109,14 +112,17 @@ def read_frame_file(path: Path) -> FrameFile:
 def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     """Return views by ``file_path`` as written in the file, in its order, and warnings.
 
-    Raises DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same image twice.
+    Raises DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same
+    image twice.
     """
     root = file.path.parent
     files = FileFinder(root)
     paths = [_image_path(files, frame) for frame in file.frames]
     twice = [path for path, count in Counter(paths).items() if count > 1]
     if twice:
-        raise DyngsError(f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames")
+        raise DyngsError(
+            f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames"
+        )
     headers = [
         header_if_readable(path) if frame.video is None else None
         for frame, path in zip(file.frames, paths, strict=True)
@@ -141,21 +147,29 @@ def tracks_path_of(file: FrameFile) -> Path | None:
 
 
 def view_name(path: Path, root: Path) -> str:
-    """Name of a view: the image's path below ``root`` without extension, safe as a relative file name."""
+    """Name of a view: the image's path below ``root`` without extension, safe as a relative file
+    name."""
     relative = PurePosixPath(os.path.relpath(path, root).replace(os.sep, "/")).with_suffix("")
     return "/".join(part for part in relative.parts if part not in ("..", "/"))
 
 
 def _view(
-    frame: FrameEntry, files: FileFinder, path: Path, header: ImageHeader | None, common: tuple[int, int] | None
+    frame: FrameEntry,
+    files: FileFinder,
+    path: Path,
+    header: ImageHeader | None,
+    common: tuple[int, int] | None,
 ) -> tuple[View, float, bool]:
-    """Return a view, by how much its rotation was repaired, and whether its intrinsics were rescaled."""
+    """Return a view, by how much its rotation was repaired, and whether its intrinsics were
+    rescaled."""
     described = _described_size(frame)
     stored = header.size_for(described) if header else None
     described = described or stored or common
     if described is None:
         described = read_header(path).upright_size  # raises the error
-    intrinsics, size, rescaled = match_size(_intrinsics(frame, *described), described, stored, frame.where)
+    intrinsics, size, rescaled = match_size(
+        _intrinsics(frame, *described), described, stored, frame.where
+    )
     if frame.own.get("transform_matrix") is None:
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
     matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
@@ -187,12 +201,16 @@ def _view(
 
 
 def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
-    """Return the views of a file with the next view of the same camera in ``flow_to`` where they have flow."""
+    """Return the views of a file with the next view of the same camera in ``flow_to`` where they
+    have flow."""
     if all(view.flow_path is None for view in views.values()):
         return views
-    ordered = sorted(views.items(), key=lambda item: (item[1].camera_id, item[1].time or 0.0, item[1].name))
+    ordered = sorted(
+        views.items(), key=lambda item: (item[1].camera_id, item[1].time or 0.0, item[1].name)
+    )
     following = {
-        key: after.name if after.camera_id == view.camera_id else None for (key, view), (_, after) in pairwise(ordered)
+        key: after.name if after.camera_id == view.camera_id else None
+        for (key, view), (_, after) in pairwise(ordered)
     }
     return {key: replace(view, flow_to=following.get(key)) for key, view in views.items()}
 
@@ -213,7 +231,9 @@ def _number(value: object, key: str, where: str) -> float | None:
 def _below(files: FileFinder, written: str, where: str) -> Path:
     path = files.find(written)
     if not path.name or path == Path(os.path.normpath(files.root)) or "\0" in written:
-        raise DyngsError(f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder")
+        raise DyngsError(
+            f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder"
+        )
     return path
 
 
@@ -232,16 +252,22 @@ def _image_path(files: FileFinder, frame: FrameEntry) -> Path:
 
 
 def _described_size(frame: FrameEntry) -> tuple[int, int] | None:
-    width, height = frame.number("w"), frame.number("h")
+    width = frame.number("w")
+    height = frame.number("h")
     if width is None or height is None:
         return None
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise DyngsError(f"{frame.where}: w and h must be from 1 to {MAX_SIDE:,}, got {width:g} and {height:g}")
+        raise DyngsError(
+            f"{frame.where}: w and h must be from 1 to {MAX_SIDE:,}, got {width:g} and {height:g}"
+        )
     return round(width), round(height)
 
 
-def _common_size(file: FrameFile, paths: list[Path], headers: list[ImageHeader | None]) -> tuple[int, int] | None:
-    """(width, height) of the images without a size of their own, which share the file's focal length."""
+def _common_size(
+    file: FrameFile, paths: list[Path], headers: list[ImageHeader | None]
+) -> tuple[int, int] | None:
+    """(width, height) of the images without a size of their own, which share the file's focal
+    length."""
     sizes: dict[tuple[int, int], Path] = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
         has_own = any(key in frame.own for key in _FOCAL_KEYS)
@@ -261,8 +287,11 @@ def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
     focal_x = _focal(source, "x", width, frame.where)
     focal_y = _focal(source, "y", height, frame.where)
     if focal_x is None and focal_y is None:
-        raise DyngsError(f"{frame.where}: no focal length; give fl_x (px) or camera_angle_x (radians)")
-    cx, cy = frame.number("cx"), frame.number("cy")
+        raise DyngsError(
+            f"{frame.where}: no focal length; give fl_x (px) or camera_angle_x (radians)"
+        )
+    cx = frame.number("cx")
+    cy = frame.number("cy")
     return pinhole_matrix(
         focal_x or focal_y or 0.0,
         focal_y or focal_x or 0.0,
@@ -273,13 +302,16 @@ def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
 
 def _focal(source: Mapping[str, object], axis: str, size: int, where: str) -> float | None:
     focal = _number(source.get(f"fl_{axis}"), f"fl_{axis}", where)
-    # An angle next to an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
+    # An angle next to an fl_x for the other axis only repeats it rounded: square pixels are the
+    # better guess.
     if focal is None and not any(source.get(key) is not None for key in ("fl_x", "fl_y")):
         angle = _number(source.get(f"camera_angle_{axis}"), f"camera_angle_{axis}", where)
         if angle is None:
             return None
         if not 0 < angle < math.pi:
-            raise DyngsError(f"{where}: camera_angle_{axis} must lie between 0 and pi radians, got {angle:g}")
+            raise DyngsError(
+                f"{where}: camera_angle_{axis} must lie between 0 and pi radians, got {angle:g}"
+            )
         focal = 0.5 * size / max(math.tan(0.5 * angle), 1e-300)
     if focal is not None and focal <= 0:
         raise DyngsError(f"{where}: fl_{axis} must be positive, got {focal:g}")
@@ -291,14 +323,21 @@ def _lens(frame: FrameEntry) -> Lens:
     k1, k2, k3, k4, k5, k6, p1, p2 = (
         frame.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     )
-    if model == "OPENCV_FISHEYE" or frame.own.get("is_fisheye", frame.shared.get("is_fisheye")) is True:
+    if (
+        model == "OPENCV_FISHEYE"
+        or frame.own.get("is_fisheye", frame.shared.get("is_fisheye")) is True
+    ):
         return Lens("fisheye", (k1, k2, k3, k4))
     if model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return Lens()
     if model not in ("OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"):
-        raise DyngsError(f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE")
+        raise DyngsError(
+            f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE"
+        )
     if k4 and not (k5 or k6 or model == "FULL_OPENCV"):
-        raise DyngsError(f"{frame.where}: k4 has no agreed meaning for {model}; use FULL_OPENCV or set it to 0")
+        raise DyngsError(
+            f"{frame.where}: k4 has no agreed meaning for {model}; use FULL_OPENCV or set it to 0"
+        )
     params = (k1, k2, p1, p2, k3, k4, k5, k6)
     while len(params) > 4 and not params[-1]:
         params = params[:-1]
@@ -306,18 +345,22 @@ def _lens(frame: FrameEntry) -> Lens:
 
 
 USUAL_NAMES = ("points3d.ply", "points3D.ply", "fused.ply", "points.ply")
-"""Names that 4DGaussians, COLMAP and nerfstudio give to first points, in the order in which they are looked for."""
+"""Names that 4DGaussians, COLMAP and nerfstudio give to first points, in the order in which they
+are looked for."""
 KEY = "ply_file_path"
 
 
 def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[str]]:
-    """Return the points that belong to a transforms file, the file that they are from, and warnings.
+    """Return the points that belong to a transforms file, the file that they are from, and
+    warnings.
 
-    Those of its key ``ply_file_path``; else of the first of ``USUAL_NAMES`` that is in its folder; else of the only
-    ``.ply`` there. A file that is named nowhere and cannot be read is left out, with a warning. Raises DyngsError: the
-    file that the key names is missing, unreadable, or outside the capture.
+    Those of its key ``ply_file_path``; else of the first of ``USUAL_NAMES`` that is in its folder;
+    else of the only ``.ply`` there. A file that is named nowhere and cannot be read is left out,
+    with a warning. Raises DyngsError: the file that the key names is missing, unreadable, or
+    outside the capture.
     """
-    root, written = file.path.parent, file.fields.get(KEY)
+    root = file.path.parent
+    written = file.fields.get(KEY)
     if isinstance(written, str) and written:
         path = inside(FileFinder(root).find(written))
         return read_points(path), path, []
@@ -334,13 +377,17 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read the points of a ``.ply`` file (through trimesh), with colours as ``point_colours`` finds them."""
+    """Read the points of a ``.ply`` file (through trimesh), with colours as ``point_colours`` finds
+    them."""
     import trimesh
 
     if not path.is_file():
         raise DyngsError(f"{path}: no such point file; restore it or remove {KEY}")
     # From an open file: given a path, trimesh would look for textures next to it.
-    with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
+    with (
+        reading(path, "it must be a .ply file of points; export it again"),
+        path.open("rb") as file,
+    ):
         loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
         xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         columns = loaded.metadata["_ply_raw"]["vertex"]["data"]

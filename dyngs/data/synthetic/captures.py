@@ -1,4 +1,5 @@
-"""Captures of the embedded scenes, ray traced into the layout of NeRF-synthetic and D-NeRF, with true tracks."""
+"""Captures of the embedded scenes, ray traced into the layout of NeRF-synthetic and D-NeRF, with
+true tracks."""
 
 from __future__ import annotations
 
@@ -11,7 +12,13 @@ from typing import Literal
 import numpy as np
 
 from dyngs.data.synthetic.polyhedra import polyhedra, true_edges
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, is_seen, render_scene, render_things
+from dyngs.data.synthetic.raytrace import (
+    CAMERA_ANGLE_X,
+    Scene,
+    is_seen,
+    render_scene,
+    render_things,
+)
 from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
@@ -19,9 +26,11 @@ from dyngs.files.outputs import new_folder
 from dyngs.files.write import write_image, write_text
 
 CaptureStyle = Literal["teleport", "moving", "fixed"]
-"""One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all times."""
+"""One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all
+times."""
 
-_FRONT_DEG, _SECTOR_DEG = -45.0, 64.0
+_FRONT_DEG = -45.0
+_SECTOR_DEG = 64.0
 """Middle and range of the azimuths of fixed and moving cameras."""
 
 
@@ -54,13 +63,16 @@ class StillOptions(ImageOptions):
 class DynamicOptions(ImageOptions):
     """Options of a capture of a moving scene. The seed also assigns times to cameras.
 
-    Test images lie at times between the training times, those of ``num_val`` are of one fixed camera; with fixed
-    cameras both numbers only say whether there is a camera of that kind, which is never trained on.
+    Test images lie at times between the training times, those of ``num_val`` are of one fixed
+    camera; with fixed cameras both numbers only say whether there is a camera of that kind, which
+    is never trained on.
 
     Attributes:
-        num_times: training times, evenly spaced in [0, 1]; each fixed camera takes an image at each.
+        num_times: training times, evenly spaced in [0, 1]; each fixed camera takes an image at
+            each.
         num_cameras: fixed training cameras.
-        style: how the scene is captured; None: ``room`` by fixed cameras, the others by one that teleports.
+        style: how the scene is captured; None: ``room`` by fixed cameras, the others by one that
+            teleports.
     """
 
     num_test: int = 12
@@ -72,7 +84,8 @@ class DynamicOptions(ImageOptions):
 
 @dataclass(frozen=True)
 class _Shot:
-    """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, the time, a fixed camera."""
+    """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, the
+    time, a fixed camera."""
 
     name: str
     world_from_cam: np.ndarray
@@ -83,15 +96,17 @@ class _Shot:
 def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
     """Write images of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
 
-    Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA, straight alpha, sRGB) for
-    every split with images. The folder appears when it is complete. Raises DyngsError: ``out`` holds something already,
-    or cannot be written.
+    Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA,
+    straight alpha, sRGB) for every split with images. The folder appears when it is complete.
+    Raises DyngsError: ``out`` holds something already, or cannot be written.
     """
     scene = still_life()
     splits = {
         "train": hemisphere_cameras(options.num_train, options.distance, options.seed),
         "val": orbit_cameras(options.num_val, options.distance, elevation_deg=45.0, start_deg=10.0),
-        "test": orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0),
+        "test": orbit_cameras(
+            options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0
+        ),
     }
     with new_folder(out) as started:
         for split, poses in splits.items():
@@ -106,14 +121,17 @@ CLOSE = 0.4  # Distance of close-ups, in that of the other cameras
 def write_polyhedra_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
     """Write images of ``polyhedra`` as ``write_still_capture`` does; returns ``out``.
 
-    The split val has as many close-ups as test has images, from 40 % of the distance. ``edges/SPLIT/r_000.png`` is
-    white where the true edges of the images of test and val are.
+    The split val has as many close-ups as test has images, from 40 % of the distance.
+    ``edges/SPLIT/r_000.png`` is white where the true edges of the images of test and val are.
     """
-    scene, close = polyhedra(), CLOSE * options.distance
+    scene = polyhedra()
+    close = CLOSE * options.distance
     splits = {
         "train": hemisphere_cameras(options.num_train, options.distance, options.seed),
         "val": orbit_cameras(options.num_test, close, elevation_deg=33.0, start_deg=10.0),
-        "test": orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0),
+        "test": orbit_cameras(
+            options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0
+        ),
     }
     with new_folder(out) as started:
         for split, poses in splits.items():
@@ -125,31 +143,52 @@ def write_polyhedra_capture(out: Path, options: StillOptions = StillOptions()) -
     return out
 
 
-def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = DynamicOptions()) -> Path:
+def write_dynamic_capture(
+    name: SceneName, out: Path, options: DynamicOptions = DynamicOptions()
+) -> Path:
     """Write images of the moving scene ``name`` in the layout of D-NeRF; returns ``out``.
 
-    Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the images, RGBA with straight alpha, of
-    ``room`` without alpha. Each time is seen by one camera somewhere else on the hemisphere, or by one on an arc,
-    which a fixed camera in its middle tests. Fixed cameras each take all times: ``camAA/frame_BBBB.png``, frames with
-    ``camera``; test and val have one camera each, never trained on.
+    Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the images, RGBA with
+    straight alpha, of ``room`` without alpha. Each time is seen by one camera somewhere else on the
+    hemisphere, or by one on an arc, which a fixed camera in its middle tests. Fixed cameras each
+    take all times: ``camAA/frame_BBBB.png``, frames with ``camera``; test and val have one camera
+    each, never trained on.
 
-    ``things/`` holds labels of what moves for each image (``render_things``), and ``true_tracks.npz`` the tracks of
-    points on it (``TrueTracks``). Frames of val and test name their labels (``instance_mask_path``), those of train do
-    not: training would take them as a prior. Raises DyngsError: no such scene, no images requested, ``out`` holds
-    something already, or cannot be written.
+    ``things/`` holds labels of what moves for each image (``render_things``), and
+    ``true_tracks.npz`` the tracks of points on it (``TrueTracks``). Frames of val and test name
+    their labels (``instance_mask_path``), those of train do not: training would take them as a
+    prior. Raises DyngsError: no such scene, no images requested, ``out`` holds something already,
+    or cannot be written.
     """
     scene_at(name, 0.0)
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
-        raise DyngsError("a synthetic capture needs size, num_times, num_cameras and samples of at least 1")
+        raise DyngsError(
+            "a synthetic capture needs size, num_times, num_cameras and samples of at least 1"
+        )
     style = options.style or ("fixed" if name == "room" else "teleport")
     if name == "room" and style == "teleport":
-        raise DyngsError("the walls of the room would hide it from cameras all around; choose --style fixed or moving")
+        raise DyngsError(
+            "the walls of the room would hide it from cameras all around; choose --style fixed or moving"
+        )
     splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style)
-    taken = [(shot.name, shot.time or 0.0, shot.world_from_cam) for shots in splits.values() for shot in shots]
+    taken = [
+        (shot.name, shot.time or 0.0, shot.world_from_cam)
+        for shots in splits.values()
+        for shot in shots
+    ]
     with new_folder(out) as started:
         for split, shots in splits.items():
-            _write_split(started, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options, name == "room")
-        write_true_tracks(started, true_tracks(lambda time: scene_at(name, time), taken, options.seed))
+            _write_split(
+                started,
+                split,
+                shots,
+                lambda shot: scene_at(name, shot.time or 0.0),
+                options,
+                name == "room",
+            )
+        write_true_tracks(
+            started, true_tracks(lambda time: scene_at(name, time), taken, options.seed)
+        )
     return out
 
 
@@ -183,15 +222,23 @@ def _write_split(
 
 
 def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[_Shot]]:
-    """One image per training time, by cameras in random order or on a smooth arc; the validation camera is fixed.
+    """One image per training time, by cameras in random order or on a smooth arc; the validation
+    camera is fixed.
 
     Test cameras lie on an orbit; a moving camera is tested by a fixed one in its middle.
     """
-    random, count, gaps = np.random.default_rng(options.seed), options.num_test, max(options.num_times - 1, 1)
+    random = np.random.default_rng(options.seed)
+    count = options.num_test
+    gaps = max(options.num_times - 1, 1)
     if style == "moving":
-        count, middle_deg = min(count, gaps), _FRONT_DEG + random.uniform(-2.0, 2.0)
+        count = min(count, gaps)
+        middle_deg = _FRONT_DEG + random.uniform(-2.0, 2.0)
         along = np.array(_even_times(options.num_times)) - 0.5
-        train = _poses(options.distance, middle_deg + _SECTOR_DEG * along, 20.0 + 5.0 * np.sin(2 * np.pi * along))
+        train = _poses(
+            options.distance,
+            middle_deg + _SECTOR_DEG * along,
+            20.0 + 5.0 * np.sin(2 * np.pi * along),
+        )
         fixed = _poses(options.distance, np.array([middle_deg]), np.array([28.0]))
         test = np.repeat(fixed, count, axis=0)
     else:
@@ -216,7 +263,8 @@ def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, lis
 
 
 def _fixed_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
-    """Fixed cameras on an arc in front, low and high in turn; the test camera in the middle of the arc."""
+    """Fixed cameras on an arc in front, low and high in turn; the test camera in the middle of the
+    arc."""
     count = options.num_cameras
     shift = np.random.default_rng(options.seed).uniform(-2.0, 2.0)
     azimuths_deg = _FRONT_DEG + shift + _SECTOR_DEG * ((np.arange(count) + 0.5) / count - 0.5)
@@ -245,7 +293,8 @@ def _even_times(count: int) -> list[float]:
 
 
 def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
-    """(count, 4, 4) OpenGL camera-to-world poses spread evenly over the upper hemisphere, looking at the origin.
+    """(count, 4, 4) OpenGL camera-to-world poses spread evenly over the upper hemisphere, looking
+    at the origin.
 
     A Fibonacci spiral from 6 to 80 degrees of elevation, rotated by a random azimuth.
     """
@@ -256,7 +305,9 @@ def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
     return _look_at_origin(distance, azimuths, np.arcsin(heights))
 
 
-def orbit_cameras(count: int, distance: float, elevation_deg: float, start_deg: float) -> np.ndarray:
+def orbit_cameras(
+    count: int, distance: float, elevation_deg: float, start_deg: float
+) -> np.ndarray:
     """(count, 4, 4) OpenGL camera-to-world poses on a level circle around the origin."""
     azimuths = np.radians(start_deg) + 2 * np.pi * np.arange(count) / max(count, 1)
     return _look_at_origin(distance, azimuths, np.full(count, np.radians(elevation_deg)))
@@ -268,7 +319,10 @@ def _poses(distance: float, azimuths_deg: np.ndarray, elevations_deg: np.ndarray
 
 def _look_at_origin(distance: float, azimuths: np.ndarray, elevations: np.ndarray) -> np.ndarray:
     """(V, 4, 4) OpenGL camera-to-world poses, z up; angles (V,) in radians."""
-    cos_e, sin_e, cos_a, sin_a = np.cos(elevations), np.sin(elevations), np.cos(azimuths), np.sin(azimuths)
+    cos_e = np.cos(elevations)
+    sin_e = np.sin(elevations)
+    cos_a = np.cos(azimuths)
+    sin_a = np.sin(azimuths)
     backward = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
     right = np.stack([-sin_a, cos_a, np.zeros_like(sin_a)], axis=-1)
     poses = np.tile(np.eye(4), (len(azimuths), 1, 1))
@@ -281,11 +335,14 @@ POINTS_PER_THING = 200
 
 
 def true_tracks(
-    scene_of: Callable[[float], Scene], shots: Sequence[tuple[str, float, np.ndarray]], seed: int = 0
+    scene_of: Callable[[float], Scene],
+    shots: Sequence[tuple[str, float, np.ndarray]],
+    seed: int = 0,
 ) -> TrueTracks:
     """Return the tracks of points spread over all that moves in the scene at a time in [0, 1].
 
-    ``shots``: name, time, and (4, 4) OpenGL camera-to-world pose of each view; ``seed``: of the points.
+    ``shots``: name, time, and (4, 4) OpenGL camera-to-world pose of each view; ``seed``: of the
+    points.
     """
     times = sorted({time for _, time, _ in shots})
     scenes = {time: scene_of(time) for time in times}
@@ -293,7 +350,10 @@ def true_tracks(
     random = np.random.default_rng(seed)
     local = {i: first.primitives[i].sampled(POINTS_PER_THING, random) for i in first.movers}
     points = {time: _placed(scenes[time], local) for time in times}
-    visible = [is_in_image(points[time], pose) & is_seen(scenes[time], points[time], pose) for _, time, pose in shots]
+    visible = [
+        is_in_image(points[time], pose) & is_seen(scenes[time], points[time], pose)
+        for _, time, pose in shots
+    ]
     return TrueTracks(
         np.stack([points[time] for time in times]),
         np.array(times, np.float64),
@@ -312,4 +372,6 @@ def is_in_image(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
 
 def _placed(scene: Scene, local: dict[int, np.ndarray]) -> np.ndarray:
     """(P, 3) float32 of points on the primitives of ``scene``."""
-    return np.concatenate([scene.primitives[i].placed(x) for i, x in local.items()]).astype(np.float32)
+    return np.concatenate([scene.primitives[i].placed(x) for i, x in local.items()]).astype(
+        np.float32
+    )

@@ -1,4 +1,5 @@
-"""A scene of polyhedra and letters whose faces have one colour each, and where the edges of its images truly are."""
+"""A scene of polyhedra and letters whose faces have one colour each, and where the edges of its
+images truly are."""
 
 from __future__ import annotations
 
@@ -7,7 +8,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dyngs.data.synthetic.raytrace import Box, Paint, Primitive, Scene, Sphere, f32, nearest_things, sampled_rays
+from dyngs.data.synthetic.raytrace import (
+    Box,
+    Paint,
+    Primitive,
+    Scene,
+    Sphere,
+    f32,
+    nearest_things,
+    sampled_rays,
+)
 
 Rgb = tuple[float, float, float]
 _FACES = 64  # More than any primitive has, for numbers of faces
@@ -15,23 +25,32 @@ _FACES = 64  # More than any primitive has, for numbers of faces
 
 @dataclass(frozen=True)
 class Solid(Sphere):
-    """A convex polyhedron around a ball: the points p with <n, p - center> <= radius * reach for each of its faces.
+    """A convex polyhedron around a ball: the points p with <n, p - center> <= radius * reach for
+    each of its faces.
 
     Attributes:
         outward: (F, 3) unit normals n.
         reach: (F,) distances of the faces, in radii, at least 1.
     """
 
-    outward: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.float32), repr=False, compare=False)
-    reach: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32), repr=False, compare=False)
+    outward: np.ndarray = field(
+        default_factory=lambda: np.zeros((0, 3), np.float32), repr=False, compare=False
+    )
+    reach: np.ndarray = field(
+        default_factory=lambda: np.zeros(0, np.float32), repr=False, compare=False
+    )
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         along = directions @ self.outward.T
         along = np.where(np.abs(along) < 1e-9, np.float32(1e-9), along)
-        distance = (self.radius * self.reach - (origins - f32(self.center)) @ self.outward.T) / along
+        distance = (
+            self.radius * self.reach - (origins - f32(self.center)) @ self.outward.T
+        ) / along
         enter = np.where(along < 0, distance, -np.inf).max(axis=1)
         leave = np.where(along > 0, distance, np.inf).min(axis=1)
-        return np.where((enter < leave) & (enter > 1e-4), enter, np.float32(np.inf)).astype(np.float32)
+        return np.where((enter < leave) & (enter > 1e-4), enter, np.float32(np.inf)).astype(
+            np.float32
+        )
 
     def local(self, points: np.ndarray) -> np.ndarray:
         return (points - f32(self.center)) / np.float32(self.radius)
@@ -44,8 +63,11 @@ class Solid(Sphere):
         return (self.local(points) @ self.outward.T - self.reach).argmax(axis=1)
 
 
-def solid(center: Rgb, radius: float, outward: np.ndarray, colours: Sequence[Rgb], reach: float = 1.0) -> Solid:
-    """Return a polyhedron with faces of ``colours`` in turn; the last two of a prism are at ``reach`` radii."""
+def solid(
+    center: Rgb, radius: float, outward: np.ndarray, colours: Sequence[Rgb], reach: float = 1.0
+) -> Solid:
+    """Return a polyhedron with faces of ``colours`` in turn; the last two of a prism are at
+    ``reach`` radii."""
     outward = (outward / np.linalg.norm(outward, axis=1, keepdims=True)).astype(np.float32)
     distances = np.ones(len(outward), np.float32)
     distances[-2:] = reach
@@ -69,8 +91,14 @@ def _around(count: int, turn: float) -> np.ndarray:
     return np.concatenate([sides, [[0, 0, 1], [0, 0, -1]]])
 
 
-_RED, _YELLOW, _GREEN, _BLUE = (0.80, 0.10, 0.10), (0.92, 0.72, 0.08), (0.08, 0.46, 0.26), (0.08, 0.24, 0.66)
-_CREAM, _PURPLE, _ORANGE, _BLACK = (0.92, 0.88, 0.78), (0.42, 0.14, 0.52), (0.90, 0.42, 0.08), (0.06, 0.06, 0.08)
+_RED = (0.80, 0.10, 0.10)
+_YELLOW = (0.92, 0.72, 0.08)
+_GREEN = (0.08, 0.46, 0.26)
+_BLUE = (0.08, 0.24, 0.66)
+_CREAM = (0.92, 0.88, 0.78)
+_PURPLE = (0.42, 0.14, 0.52)
+_ORANGE = (0.90, 0.42, 0.08)
+_BLACK = (0.06, 0.06, 0.08)
 _FLOOR = -0.34
 _STROKES = {
     "E": ((0, 0, 1, 5), (1, 0, 3, 1), (1, 2, 2.5, 3), (1, 4, 3, 5)),
@@ -98,15 +126,42 @@ def polyhedra() -> Scene:
     signs = np.array([(a, b) for a in (-1, 1) for b in (-1, 1)], float)
     dodeca = np.concatenate([np.insert(signs * [1, golden], axis, 0, axis=1) for axis in (0, 1, 2)])
     octa = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)], float)
-    tetra = np.array([(1, 0, 0.3536), (-0.5, 0.866, 0.3536), (-0.5, -0.866, 0.3536), (0, 0, -1.0606)])
+    tetra = np.array(
+        [(1, 0, 0.3536), (-0.5, 0.866, 0.3536), (-0.5, -0.866, 0.3536), (0, 0, -1.0606)]
+    )
     things: list[Primitive] = [
-        Box((0, 0, _FLOOR - 0.06), (0.98, 0.98, 0.06), _per_side(_BLUE, _PURPLE, _CREAM), gloss=0.0),
-        solid((-0.45, 0.45, _FLOOR + 0.34), 0.33, dodeca, (_RED, _YELLOW, _BLUE, _GREEN, _CREAM, _ORANGE)),
+        Box(
+            (0, 0, _FLOOR - 0.06), (0.98, 0.98, 0.06), _per_side(_BLUE, _PURPLE, _CREAM), gloss=0.0
+        ),
+        solid(
+            (-0.45, 0.45, _FLOOR + 0.34),
+            0.33,
+            dodeca,
+            (_RED, _YELLOW, _BLUE, _GREEN, _CREAM, _ORANGE),
+        ),
         solid((0.45, 0.50, _FLOOR + 0.26), 0.25, octa, (_PURPLE, _CREAM, _ORANGE, _GREEN, _RED)),
         solid((0.60, -0.05, _FLOOR + 0.13), 0.13, tetra, (_GREEN, _YELLOW, _RED, _BLACK)),
-        solid((-0.72, -0.22, _FLOOR + 0.30), 0.15, _around(6, 0.2), (_YELLOW, _BLUE, _CREAM, _RED), reach=2.0),
-        solid((-0.10, 0.02, _FLOOR + 0.20), 0.12, _around(3, 0.9), (_ORANGE, _GREEN, _PURPLE, _CREAM), reach=1.6),
-        Box((0.20, -0.05, _FLOOR + 0.10), (0.12, 0.10, 0.10), _per_side(_YELLOW, _RED, _BLUE), yaw=0.6, gloss=0.0),
+        solid(
+            (-0.72, -0.22, _FLOOR + 0.30),
+            0.15,
+            _around(6, 0.2),
+            (_YELLOW, _BLUE, _CREAM, _RED),
+            reach=2.0,
+        ),
+        solid(
+            (-0.10, 0.02, _FLOOR + 0.20),
+            0.12,
+            _around(3, 0.9),
+            (_ORANGE, _GREEN, _PURPLE, _CREAM),
+            reach=1.6,
+        ),
+        Box(
+            (0.20, -0.05, _FLOOR + 0.10),
+            (0.12, 0.10, 0.10),
+            _per_side(_YELLOW, _RED, _BLUE),
+            yaw=0.6,
+            gloss=0.0,
+        ),
     ]
     for i, (name, colour) in enumerate(zip("HELT", (_RED, _BLUE, _GREEN, _ORANGE), strict=True)):
         things += _letter(name, -0.62 + 0.32 * i, -0.68, colour)
@@ -114,7 +169,8 @@ def polyhedra() -> Scene:
 
 
 def face_ids(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int) -> np.ndarray:
-    """(samples^2, size, size) int64: which face of which primitive each sample of a pixel sees; -1 none."""
+    """(samples^2, size, size) int64: which face of which primitive each sample of a pixel sees; -1
+    none."""
     origin = world_from_cam[:3, 3].astype(np.float32)
     found = []
     for _, directions in sampled_rays(world_from_cam, size, samples):
@@ -137,7 +193,8 @@ def _face(primitive: Primitive, points: np.ndarray) -> np.ndarray:
 
 
 def true_edges(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
-    """(size, size) uint8: 255 where a pixel sees several faces, or another one than a neighbour does; else 0."""
+    """(size, size) uint8: 255 where a pixel sees several faces, or another one than a neighbour
+    does; else 0."""
     ids = face_ids(scene, world_from_cam, size, samples)
     edge = (ids != ids[0]).any(axis=0)
     middle = ids[len(ids) // 2]

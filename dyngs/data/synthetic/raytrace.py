@@ -1,7 +1,8 @@
-"""A small ray tracer in NumPy: painted balls, capsules, boxes and waving sheets under a soft lamp and the sky.
+"""A small ray tracer in NumPy: painted balls, capsules, boxes and waving sheets under a soft lamp
+and the sky.
 
-It shares no formula with the rasterizer, so that its images are an independent ground truth. A scene is a tuple of
-primitives; a scene that moves is a function from time to such a tuple.
+It shares no formula with the rasterizer, so that its images are an independent ground truth. A
+scene is a tuple of primitives; a scene that moves is a function from time to such a tuple.
 
 Local letters: R rays (or points on surfaces), S samples per pixel side.
 """
@@ -19,11 +20,14 @@ CAMERA_ANGLE_X = 0.6911112070083618
 """Horizontal field of view of the NeRF-synthetic scenes, radians."""
 
 Paint = Callable[[np.ndarray], np.ndarray]
-"""Local surface points (R, 3), scaled so that the primitive spans [-1, 1], to linear albedo (R, 3)."""
+"""Local surface points (R, 3), scaled so that the primitive spans [-1, 1], to linear albedo (R,
+3)."""
 
 _RAYS = 1 << 14  # that are traced at once
 _LAMP_SIZE = 0.9
-_SKY, _GROUND, _LAMPLIGHT = (0.46, 0.50, 0.56), (0.20, 0.17, 0.15), (0.80, 0.74, 0.66)
+_SKY = (0.46, 0.50, 0.56)
+_GROUND = (0.20, 0.17, 0.15)
+_LAMPLIGHT = (0.80, 0.74, 0.66)
 _MARCH_STEPS = 40
 _BISECTIONS = 18
 _SURFACE = 3e-3  # world units by which a surface may seem to lie before one of its own points
@@ -31,16 +35,20 @@ _SURFACE = 3e-3  # world units by which a surface may seem to lie before one of 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball; ``gloss`` is the strength of its highlight, ``turn`` (3, 3) rotates the paint's axes to the world's."""
+    """A ball; ``gloss`` is the strength of its highlight, ``turn`` (3, 3) rotates the paint's axes
+    to the world's."""
 
     center: tuple[float, float, float]
     radius: float
     paint: Paint
     gloss: float = 0.25
-    turn: np.ndarray = field(default_factory=lambda: np.eye(3, dtype=np.float32), repr=False, compare=False)
+    turn: np.ndarray = field(
+        default_factory=lambda: np.eye(3, dtype=np.float32), repr=False, compare=False
+    )
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray misses."""
+        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray
+        misses."""
         offset = origins - f32(self.center)
         half_b = _dot(offset, directions)
         discriminant = half_b**2 - _dot(offset, offset) + self.radius**2
@@ -64,7 +72,8 @@ class Sphere:
         return (points - f32(self.center)) / np.float32(self.radius)
 
     def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(R,) fraction of the cosine-weighted sky that the ball hides: the form factor of a sphere."""
+        """(R,) fraction of the cosine-weighted sky that the ball hides: the form factor of a
+        sphere."""
         offset = f32(self.center) - points
         distance = np.sqrt(np.maximum(_dot(offset, offset), 1e-12))
         cosine = np.maximum(_dot(normals, offset) / distance, 0.0)
@@ -73,7 +82,8 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Box:
-    """A box rotated by ``yaw`` radians about the vertical; its methods are as those of ``Sphere``."""
+    """A box rotated by ``yaw`` radians about the vertical; its methods are as those of
+    ``Sphere``."""
 
     center: tuple[float, float, float]
     half_extents: tuple[float, float, float]
@@ -82,7 +92,8 @@ class Box:
     gloss: float = 0.1
 
     def _axes(self) -> np.ndarray:
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        c = np.cos(self.yaw)
+        s = np.sin(self.yaw)
         return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -103,7 +114,8 @@ class Box:
         half = np.asarray(self.half_extents)
         areas = half.prod() / half
         local = random.uniform(-1.0, 1.0, (count, 3))
-        rows, face = np.arange(count), random.choice(3, count, p=areas / areas.sum())
+        rows = np.arange(count)
+        face = random.choice(3, count, p=areas / areas.sum())
         local[rows, face] = np.where(local[rows, face] < 0, -1.0, 1.0)
         return local.astype(np.float32)
 
@@ -120,7 +132,8 @@ class Box:
 
 @dataclass(frozen=True)
 class Wave:
-    """A plane wave ``amplitude * sin(wave_vector . (u, v) + phase)``; ``wave_vector`` in radians per world unit."""
+    """A plane wave ``amplitude * sin(wave_vector . (u, v) + phase)``; ``wave_vector`` in radians
+    per world unit."""
 
     amplitude: float
     wave_vector: tuple[float, float]
@@ -129,10 +142,11 @@ class Wave:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A thin cloth, seen from both sides: its material point (u, v) lies at ``center + (u, v, height(u, v))``.
+    """A thin cloth, seen from both sides: its material point (u, v) lies at ``center + (u, v,
+    height(u, v))``.
 
-    The height is the sum of ``waves``: moving their phases moves the cloth, while its paint keeps to (u, v). The paint
-    gets (u, v, 0) divided by the half extents.
+    The height is the sum of ``waves``: moving their phases moves the cloth, while its paint keeps
+    to (u, v). The paint gets (u, v, 0) divided by the half extents.
     """
 
     center: tuple[float, float, float]
@@ -158,11 +172,16 @@ class Sheet:
         distances = np.full(len(directions), np.inf, np.float32)
         inside = np.flatnonzero(enter < leave)
         if len(inside):
-            distances[inside] = self._crossing(start[inside], directions[inside], enter[inside], leave[inside])
+            distances[inside] = self._crossing(
+                start[inside], directions[inside], enter[inside], leave[inside]
+            )
         return distances
 
-    def _crossing(self, start: np.ndarray, directions: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> np.ndarray:
-        """(R,) first distance between ``enter`` and ``leave`` at which the ray pierces the cloth, or inf."""
+    def _crossing(
+        self, start: np.ndarray, directions: np.ndarray, enter: np.ndarray, leave: np.ndarray
+    ) -> np.ndarray:
+        """(R,) first distance between ``enter`` and ``leave`` at which the ray pierces the cloth,
+        or inf."""
 
         def is_above(rays: np.ndarray, distance: np.ndarray) -> np.ndarray:
             x, y, z = (start[rays, axis] + distance * directions[rays, axis] for axis in range(3))
@@ -178,11 +197,13 @@ class Sheet:
             far[pending[crossed]] = distance[crossed]
             pending = pending[~crossed]
         hit = np.flatnonzero(np.isfinite(far))
-        high, low = far[hit], far[hit] - step[hit]
+        high = far[hit]
+        low = far[hit] - step[hit]
         for _ in range(_BISECTIONS):
             middle = np.float32(0.5) * (low + high)
             before = is_above(hit, middle) == first_side[hit]
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
+            low = np.where(before, middle, low)
+            high = np.where(before, high, middle)
         far[hit] = high
         return far
 
@@ -212,7 +233,8 @@ class Sheet:
         return _unit(normals)
 
     def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(R,) fraction of the sky hidden: the form factor, for a point on its axis, of a level disk of equal area."""
+        """(R,) fraction of the sky hidden: the form factor, for a point on its axis, of a level
+        disk of equal area."""
         offset = f32(self.center) - points
         squared = np.maximum(_dot(offset, offset), 1e-12)
         cosines = np.maximum(_dot(normals, offset), 0.0) * np.abs(offset[:, 2]) / squared
@@ -228,8 +250,8 @@ class Scene:
     """Primitives, z up, lit by a sky and one square lamp, whose size softens the shadows.
 
     Attributes:
-        faint: a neighbour that hides no more than this fraction of a point's sky hides nothing, which leaves what is
-            far from a moving thing exactly as it is.
+        faint: a neighbour that hides no more than this fraction of a point's sky hides nothing,
+            which leaves what is far from a moving thing exactly as it is.
         num_static: the first so many primitives stand still; None: all do.
     """
 
@@ -241,20 +263,28 @@ class Scene:
     @property
     def movers(self) -> range:
         """Indices of the primitives that move."""
-        return range(len(self.primitives) if self.num_static is None else self.num_static, len(self.primitives))
+        return range(
+            len(self.primitives) if self.num_static is None else self.num_static,
+            len(self.primitives),
+        )
 
 
-def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
+def render_scene(
+    scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
+) -> np.ndarray:
     """(size, size, 4) uint8 image: sRGB with straight alpha, transparent background.
 
-    Sample (a, b) of every pixel sees the lamp at place (a, b) of its grid, so shadows are soft and agree between views.
-    The field of view is ``CAMERA_ANGLE_X``; ``world_from_cam`` is a (4, 4) OpenGL pose.
+    Sample (a, b) of every pixel sees the lamp at place (a, b) of its grid, so shadows are soft and
+    agree between views. The field of view is ``CAMERA_ANGLE_X``; ``world_from_cam`` is a (4, 4)
+    OpenGL pose.
     """
     color = np.zeros((size * size, 3), np.float32)
     hits = np.zeros(size * size, np.float32)
     origin = world_from_cam[:3, 3].astype(np.float32)
     for places, directions in sampled_rays(world_from_cam, size, samples):
-        moved = np.array([[_LAMP_SIZE * (x - 0.5), _LAMP_SIZE * (y - 0.5), 0.0] for x, y in places], np.float32)
+        moved = np.array(
+            [[_LAMP_SIZE * (x - 0.5), _LAMP_SIZE * (y - 0.5), 0.0] for x, y in places], np.float32
+        )
         lamps = f32(scene.lamp) + moved
         hit, rgb = _trace(scene, origin, directions, np.repeat(lamps, size * size, axis=0))
         for own in range(len(places)):
@@ -268,7 +298,8 @@ def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: i
 
 
 def colours_along(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return (R, 3) float32 sRGB colours of rays from ``origin`` (3,), black where they hit nothing; a point lamp."""
+    """Return (R, 3) float32 sRGB colours of rays from ``origin`` (3,), black where they hit
+    nothing; a point lamp."""
     rgb = np.zeros((len(directions), 3), np.float32)
     lamps = np.broadcast_to(f32(scene.lamp), directions.shape)
     hit, colours = _trace(scene, f32(origin), directions.astype(np.float32), lamps)
@@ -276,8 +307,11 @@ def colours_along(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> n
     return rgb
 
 
-def render_things(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
-    """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0 none.
+def render_things(
+    scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
+) -> np.ndarray:
+    """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0
+    none.
 
     Of several in one pixel the one that most samples see; light does not count.
     """
@@ -291,7 +325,8 @@ def render_things(scene: Scene, world_from_cam: np.ndarray, size: int, samples: 
 
 
 def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not; NaN is never seen."""
+    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not; NaN
+    is never seen."""
     origin = world_from_cam[:3, 3]
     offset = np.nan_to_num(points - origin)
     distance = np.maximum(np.sqrt(_dot(offset, offset)), 1e-6)
@@ -299,8 +334,11 @@ def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.
     return np.isfinite(points).all(axis=1) & (nearest > distance - _SURFACE)
 
 
-def nearest_things(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, per ray, the primitive that it hits first and the distance to it, inf where it hits none."""
+def nearest_things(
+    scene: Scene, origin: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return, per ray, the primitive that it hits first and the distance to it, inf where it hits
+    none."""
     distances = np.stack([p.intersect(origin[None], directions) for p in scene.primitives])
     return distances.argmin(axis=0), distances.min(axis=0)
 
@@ -308,13 +346,15 @@ def nearest_things(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> 
 def _trace(
     scene: Scene, origin: np.ndarray, directions: np.ndarray, lamps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return indices of the rays that hit something (R_hit,), and the colours there: sRGB (R_hit, 3).
+    """Return indices of the rays that hit something (R_hit,), and the colours there: sRGB (R_hit,
+    3).
 
     The lamp is at a place (R, 3) of its own for each ray.
     """
     nearest, distance = nearest_things(scene, origin, directions)
     hit = np.flatnonzero(np.isfinite(distance))
-    nearest, directions = nearest[hit], directions[hit]
+    nearest = nearest[hit]
+    directions = directions[hit]
     points = origin + distance[hit, None] * directions
     rgb = np.zeros((len(hit), 3), np.float32)
     for index, primitive in enumerate(scene.primitives):
@@ -325,9 +365,14 @@ def _trace(
 
 
 def _shade(
-    scene: Scene, primitive: Primitive, points: np.ndarray, directions: np.ndarray, lamps: np.ndarray
+    scene: Scene,
+    primitive: Primitive,
+    points: np.ndarray,
+    directions: np.ndarray,
+    lamps: np.ndarray,
 ) -> np.ndarray:
-    """(R, 3) linear radiance: sky light less what neighbours occlude, Lambert and Blinn-Phong light of the lamp."""
+    """(R, 3) linear radiance: sky light less what neighbours occlude, Lambert and Blinn-Phong light
+    of the lamp."""
     normals = primitive.normals(points)
     if isinstance(primitive, Sheet):  # its upper side, whichever is seen
         normals = np.where(_dot(normals, directions)[:, None] > 0, -normals, normals)
@@ -339,14 +384,18 @@ def _shade(
     for other in scene.primitives:
         if other is primitive:
             continue
-        hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0) / (1.0 - scene.faint)
+        hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0) / (
+            1.0 - scene.faint
+        )
         open_sky *= 1.0 - hidden
         seen = np.flatnonzero(lit)
         lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
     upward = (0.5 + 0.5 * normals[:, 2:]).astype(np.float32)
     ambient = upward * f32(_SKY) + (1 - upward) * f32(_GROUND)
     direct = np.where(lit, 1.0, 0.0)[:, None] * f32(_LAMPLIGHT)
-    rgb = primitive.paint(primitive.local(points)) * (ambient * open_sky[:, None] + direct * facing[:, None])
+    rgb = primitive.paint(primitive.local(points)) * (
+        ambient * open_sky[:, None] + direct * facing[:, None]
+    )
     if primitive.gloss == 0:
         return rgb
     shine = np.maximum(_dot(normals, _unit(to_lamp - directions)), 0.0) ** 60 * primitive.gloss
@@ -356,9 +405,11 @@ def _shade(
 def sampled_rays(
     world_from_cam: np.ndarray, size: int, samples: int
 ) -> Iterator[tuple[list[tuple[float, float]], np.ndarray]]:
-    """Yield P positions in a pixel, and (P * size * size, 3) float32 unit directions in the world through them.
+    """Yield P positions in a pixel, and (P * size * size, 3) float32 unit directions in the world
+    through them.
 
-    By rows. Of small images many positions at once: numpy takes as long for one ray as for a thousand.
+    By rows. Of small images many positions at once: numpy takes as long for one ray as for a
+    thousand.
     """
     focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
     places = [((a + 0.5) / samples, (b + 0.5) / samples) for a, b in np.ndindex(samples, samples)]
@@ -373,8 +424,11 @@ def sampled_rays(
         yield some, np.concatenate(found)
 
 
-def _through_box(start: np.ndarray, directions: np.ndarray, bound: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (R,) at which rays enter and leave the box of half extents ``bound`` (3,); enter > leave: a miss."""
+def _through_box(
+    start: np.ndarray, directions: np.ndarray, bound: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (R,) at which rays enter and leave the box of half extents ``bound`` (3,); enter >
+    leave: a miss."""
     inverse = 1.0 / np.where(np.abs(directions) < 1e-9, np.float32(1e-9), directions)
     reach = np.abs(inverse) * bound
     middle = -start * inverse

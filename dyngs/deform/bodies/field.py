@@ -1,4 +1,5 @@
-"""Rigid bodies that move along splines, within another field: the smallest motion that explains what turns.
+"""Rigid bodies that move along splines, within another field: the smallest motion that explains
+what turns.
 
 Local letters: M moving Gaussians, B bodies, P control points.
 """
@@ -38,19 +39,23 @@ class BodyRest:
 
 
 class BodyField(OuterField):
-    """The offsets of ``others``, but for the Gaussians of bodies: these move rigidly, and take colours alone from it.
+    """The offsets of ``others``, but for the Gaussians of bodies: these move rigidly, and take
+    colours alone from it.
 
-    A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of the place p and of
-    the quaternion of R; the Gaussians turn with it, into the light and out of it: their colours change by their albedo
-    times the light on what faces the way that they lie from the centre (``light_harmonics``). All else is in their
-    shadow (``light_left``).
+    A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of
+    the place p and of the quaternion of R; the Gaussians turn with it, into the light and out of
+    it: their colours change by their albedo times the light on what faces the way that they lie
+    from the centre (``light_harmonics``). All else is in their shadow (``light_left``).
     """
 
-    def __init__(self, others: DeformationField, rest: BodyRest, learned: Mapping[str, Tensor]) -> None:
-        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies' splines, and others.
+    def __init__(
+        self, others: DeformationField, rest: BodyRest, learned: Mapping[str, Tensor]
+    ) -> None:
+        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies'
+        splines, and others.
 
-        These may be missing: ``albedo`` (M, 3), in units of the harmonic of degree 0; ``light`` (8, 3); ``sun`` (3,)
-        and ``shade`` (4,), see ``light_left``.
+        These may be missing: ``albedo`` (M, 3), in units of the harmonic of degree 0; ``light`` (8,
+        3); ``sun`` (3,) and ``shade`` (4,), see ``light_left``.
         """
         super().__init__(others)
         self.rest = rest
@@ -67,11 +72,14 @@ class BodyField(OuterField):
 
     def poses(self, time: float) -> tuple[Tensor, Tensor]:
         """Return (B, 3) places of the bodies' centres and (B, 4) quaternions, of any length."""
-        motion, quats = spline_motion([self.parameters["places"], self.parameters["quats"], None, None, None], time)
+        motion, quats = spline_motion(
+            [self.parameters["places"], self.parameters["quats"], None, None, None], time
+        )
         return motion[:, :3], quats
 
     def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
-        labels, means = chosen(self.rest.labels, rows), chosen(means, rows)
+        labels = chosen(self.rest.labels, rows)
+        means = chosen(means, rows)
         own = torch.nonzero(labels >= 0)[:, 0]
         body = labels[own]
         places, quats = (x.index_select(0, body) for x in self.poses(time))
@@ -79,7 +87,9 @@ class BodyField(OuterField):
         arms = rotate(quats, means[own] - self.rest.centers[body])
         moved = arms + places - means[own]
         facing = torch.nn.functional.normalize(arms.detach(), dim=1)
-        lit = (light_harmonics(facing) @ self.parameters["light"]) * chosen(self.parameters["albedo"], rows)[own]
+        lit = (light_harmonics(facing) @ self.parameters["light"]) * chosen(
+            self.parameters["albedo"], rows
+        )[own]
         turned = found.quats if found.quats is not None else means.new_zeros(len(means), 4)
         scales = found.log_scales
         return Offsets(
@@ -87,25 +97,33 @@ class BodyField(OuterField):
             turned.index_copy(0, own, quats - identity_quat(quats)),
             None if scales is None else scales.index_fill(0, own, 0.0),
             found.logit_opacities,
-            (means.new_zeros(len(means), 3) if found.colors is None else found.colors).index_add(0, own, lit),
+            (means.new_zeros(len(means), 3) if found.colors is None else found.colors).index_add(
+                0, own, lit
+            ),
         )
 
-    def shaded(self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float) -> Gaussians:
+    def shaded(
+        self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float
+    ) -> Gaussians:
         labels = chosen(self.rest.labels, which)
         if rows is not None:
             labels = labels.new_full((len(gaussians),), -1).index_copy(0, rows, labels)
-        means, places = gaussians.means.detach(), self.poses(time)[0].detach()
+        means = gaussians.means.detach()
+        places = self.poses(time)[0].detach()
         balls = places, self.rest.radii, self.parameters["sun"], self.parameters["shade"]
         with torch.no_grad():
             left = light_left(means, labels, *balls)
         few = light_left(means[::TEACHES], labels[::TEACHES], *balls)
-        return super().shaded(gaussians.replace(sh=dimmed(gaussians.sh, left, few, TEACHES)), rows, which, time)
+        return super().shaded(
+            gaussians.replace(sh=dimmed(gaussians.sh, left, few, TEACHES)), rows, which, time
+        )
 
     def rest_outside_(self, window: tuple[float, float]) -> None:
         super().rest_outside_(window)
         for points in (self.parameters["places"], self.parameters["quats"]):
             pieces = points.shape[1] - SPAN + 1
-            first, last = math.ceil(window[0] * pieces) + 1, math.floor(window[1] * pieces) + 1  # by where they peak
+            first = math.ceil(window[0] * pieces) + 1
+            last = math.floor(window[1] * pieces) + 1  # by where they peak
             if points.grad is not None and window != (0.0, 1.0):
                 points.grad[:, :first], points.grad[:, last + 1 :] = 0, 0
 
@@ -123,14 +141,19 @@ class BodyField(OuterField):
     def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
         """Return the field of a state within the restored ``others``; raises as ``restored``."""
         centers = require_tensor("centers", tensors["centers"], (None, 3))
-        radii = require_positive("radii", require_tensor("radii", tensors["radii"], (len(centers),)))
+        radii = require_positive(
+            "radii", require_tensor("radii", tensors["radii"], (len(centers),))
+        )
         labels = require_tensor("labels", tensors["labels"], (others.setup.num_moving,), torch.long)
         require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
         learned = part_of(tensors, "learned")
         points = learned["places"].shape[1] if learned["places"].ndim == 3 else 0
         if points < SPAN:
             raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
-        like = {name: centers.new_zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
+        like = {
+            name: centers.new_zeros(len(centers), points, size)
+            for name, size in (("places", 3), ("quats", 4))
+        }
         field = BodyField(others, BodyRest(centers, radii, labels), like)
         field.parameters = field.parameters.restored(learned)
         return field

@@ -1,7 +1,8 @@
 """Paths of things that move before one moving camera, from where the static model fails.
 
-A thing is a ball here: a disc in every image. Three discs in nearby images fix a straight piece of a path; the pieces
-are linked over time, and each image then adds the ray on which the thing must lie, to a smooth path through all.
+A thing is a ball here: a disc in every image. Three discs in nearby images fix a straight piece of
+a path; the pieces are linked over time, and each image then adds the ray on which the thing must
+lie, to a smooth path through all.
 
 Local letters: T images, n candidates, K peaks, S sizes of discs.
 """
@@ -16,15 +17,18 @@ import numpy as np
 
 from dyngs.deform.bodies.shots import Shots
 
-SIZES, SMALLEST, LARGEST = 9, 3.0, 0.2  # Radii of discs: number, least in pixels, greatest in image widths
+# Radii of discs: number, least in pixels, greatest in image widths
+SIZES, SMALLEST, LARGEST = 9, 3.0, 0.2
 PEAKS, LEAST_PEAK = 6, 0.08
 HALF = 3  # Images on either side that a straight path is tried on
 TRIPLES = 1500  # Candidates per middle image
 KEPT, SKIPPED = 10, 14  # Straight paths around an image, and images after which the next may follow
 FOLLOWED = 4  # Chains of straight paths
-ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7  # Of looking for the ball around its path, that many radii away
+# Of looking for the ball around its path, that many radii away
+ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7
 LOOKS = 8  # Places on either side that are looked at there
-KINK, REWEIGHTED = 0.03, 4  # Second difference of a path in radii that counts in full, and rounds of weighting
+# Second difference of a path in radii that counts in full, and rounds of weighting
+KINK, REWEIGHTED = 0.03, 4
 LEAST_SUPPORT = 0.28  # Contrast of a disc with its ring, mean over images, from which it is a thing
 STIFFNESS = 3.0
 
@@ -40,11 +44,15 @@ class Path:
     def is_like(self, other: Path) -> bool:
         """Whether both are of one thing at about one size."""
         apart = np.median(np.linalg.norm(self.centers - other.centers, axis=1))
-        return bool(apart < 0.5 * min(self.radius, other.radius) and abs(np.log(self.radius / other.radius)) < 0.3)
+        return bool(
+            apart < 0.5 * min(self.radius, other.radius)
+            and abs(np.log(self.radius / other.radius)) < 0.3
+        )
 
 
 class Discs:
-    """Mean of a map in a disc less that in the ring around it, for discs of all sizes at all pixels of T images."""
+    """Mean of a map in a disc less that in the ring around it, for discs of all sizes at all pixels
+    of T images."""
 
     def __init__(self, maps: np.ndarray) -> None:
         from scipy.fft import irfft2, next_fast_len, rfft2
@@ -57,22 +65,37 @@ class Discs:
         kernels = np.empty((SIZES, shape[0], shape[1] // 2 + 1), np.complex64)
         for k, radius in enumerate(self.radii):
             disc = np.clip(radius - away + 0.5, 0, 1)
-            ring = np.clip(1.6 * radius - away + 0.5, 0, 1) - np.clip(1.15 * radius - away + 0.5, 0, 1)
+            ring = np.clip(1.6 * radius - away + 0.5, 0, 1) - np.clip(
+                1.15 * radius - away + 0.5, 0, 1
+            )
             kernels[k] = np.asarray(rfft2(disc / disc.sum() - ring / ring.sum()))
-        self.values: np.ndarray = np.empty((len(maps), SIZES, height, width), np.float32)  # (T, S, H, W)
+        # (T, S, H, W)
+        self.values: np.ndarray = np.empty((len(maps), SIZES, height, width), np.float32)
         for values, one in zip(self.values, maps, strict=True):
-            found = np.asarray(irfft2(np.asarray(rfft2(one.astype(np.float32), shape)) * kernels, shape))
+            found = np.asarray(
+                irfft2(np.asarray(rfft2(one.astype(np.float32), shape)) * kernels, shape)
+            )
             values[:] = found[:, :height, :width]
 
     def at(self, which: np.ndarray, pixels: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """Return the (n,) values at ``pixels`` (n, 2) for discs of ``radii`` (n,) pixels, -0.2 out of the images."""
+        """Return the (n,) values at ``pixels`` (n, 2) for discs of ``radii`` (n,) pixels, -0.2 out
+        of the images."""
         from scipy.ndimage import map_coordinates
 
         _, sizes, height, width = self.values.shape
-        level = np.log(np.maximum(radii, 1e-3) / self.radii[0]) / np.log(self.radii[1] / self.radii[0])
-        out = (pixels < 0).any(1) | (pixels > [width, height]).any(1) | (level < -1.2) | (level > sizes + 0.2)
+        level = np.log(np.maximum(radii, 1e-3) / self.radii[0]) / np.log(
+            self.radii[1] / self.radii[0]
+        )
+        out = (
+            (pixels < 0).any(1)
+            | (pixels > [width, height]).any(1)
+            | (level < -1.2)
+            | (level > sizes + 0.2)
+        )
         x, y = pixels.T - 0.5
-        found = map_coordinates(self.values, [which, level, y, x], order=1, mode="nearest", output=np.float64)
+        found = map_coordinates(
+            self.values, [which, level, y, x], order=1, mode="nearest", output=np.float64
+        )
         return np.where(out, -0.2, found)
 
     def peaks(self, index: int) -> np.ndarray:
@@ -80,7 +103,8 @@ class Discs:
         values = self.values[index]
         greatest = values.copy()
         for axis, reach in (0, 1), (1, 2), (2, 2):
-            line, before = np.moveaxis(greatest, axis, 0), np.moveaxis(greatest.copy(), axis, 0)
+            line = np.moveaxis(greatest, axis, 0)
+            before = np.moveaxis(greatest.copy(), axis, 0)
             for i in range(1, reach + 1):
                 np.maximum(line[i:], before[:-i], out=line[i:])
                 np.maximum(line[:-i], before[i:], out=line[:-i])
@@ -90,7 +114,8 @@ class Discs:
 
 
 def found_paths(shots: Shots, maps: np.ndarray) -> list[Path]:
-    """Return paths that things may move along where ``maps`` (T, H, W) are marked, the most likely first.
+    """Return paths that things may move along where ``maps`` (T, H, W) are marked, the most likely
+    first.
 
     No two are of the same thing at the same size; which are things is for their turning to tell.
     """
@@ -98,7 +123,11 @@ def found_paths(shots: Shots, maps: np.ndarray) -> list[Path]:
         return []
     discs = Discs(maps)
     chains = _chains(_straight_pieces(shots, discs, np.random.default_rng(0)), len(shots))
-    followed = [path for path in (_followed(shots, discs, chain) for chain in chains) if path.support > LEAST_SUPPORT]
+    followed = [
+        path
+        for path in (_followed(shots, discs, chain) for chain in chains)
+        if path.support > LEAST_SUPPORT
+    ]
     found: list[Path] = []
     for path in sorted(followed, key=lambda path: _unsteadiness(shots, discs, path) - path.support):
         if not any(path.is_like(other) for other in found):
@@ -114,7 +143,8 @@ def clear_(maps: np.ndarray, shots: Shots, path: Path) -> None:
 
 
 def _colors(shots: Shots, which: np.ndarray, centers: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return the (n, 3) mean colours in the middle of balls with ``centers`` (n, 3) in the images ``which`` (n,)."""
+    """Return the (n, 3) mean colours in the middle of balls with ``centers`` (n, 3) in the images
+    ``which`` (n,)."""
     height, width = shots.size
     pixels, depths = shots.projected(which, centers)
     grid = np.array([-0.5, 0.0, 0.5])
@@ -125,7 +155,8 @@ def _colors(shots: Shots, which: np.ndarray, centers: np.ndarray, radius: np.nda
 
 
 def _unsteadiness(shots: Shots, discs: Discs, path: Path) -> float:
-    """Return the standard deviation of a path's colours over time: that of what goes on as another thing is large."""
+    """Return the standard deviation of a path's colours over time: that of what goes on as another
+    thing is large."""
     which = np.nonzero(_contrast(shots, discs, path.centers, path.radius) > LEAST_PEAK)[0]
     if len(which) < 2:
         return 0.0
@@ -163,7 +194,8 @@ class Start:
 
 def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) -> list[Pieces]:
     """Return straight paths through the most marked discs, around every other image."""
-    peaks, found = [discs.peaks(i) for i in range(len(shots))], []
+    peaks = [discs.peaks(i) for i in range(len(shots))]
+    found = []
     counts = np.array([len(one) for one in peaks])
     table = np.stack([np.resize(one, (PEAKS, 3)) for one in peaks])
     for middle in range(HALF, len(shots) - HALF, 2):
@@ -175,25 +207,42 @@ def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) ->
         centers, steps, radii = _through(shots, which, middle, picked)
         values = []
         for t in range(middle - HALF, middle + HALF + 1):
-            pixels, depths = shots.projected(np.full(len(centers), t), centers + (t - middle) * steps)
-            values.append(discs.at(np.full(len(centers), t), pixels, radii * shots.focal[t] / depths))
-        scores, kept = np.sort(np.array(values), axis=0)[1:].mean(0), []
+            pixels, depths = shots.projected(
+                np.full(len(centers), t), centers + (t - middle) * steps
+            )
+            values.append(
+                discs.at(np.full(len(centers), t), pixels, radii * shots.focal[t] / depths)
+            )
+        scores = np.sort(np.array(values), axis=0)[1:].mean(0)
+        kept = []
         for i in np.argsort(-scores, kind="stable"):
-            if len(kept) < KEPT and all(np.linalg.norm(centers[i] - centers[k]) > radii[k] / 2 for k in kept):
+            if len(kept) < KEPT and all(
+                np.linalg.norm(centers[i] - centers[k]) > radii[k] / 2 for k in kept
+            ):
                 kept.append(i)
         if kept:
             scores, centers, steps, radii = (x[kept] for x in (scores, centers, steps, radii))
             times = np.arange(middle - HALF, middle + HALF + 1)
-            shown = [_colors(shots, np.full(len(kept), t), centers + (t - middle) * steps, radii) for t in times]
+            shown = [
+                _colors(shots, np.full(len(kept), t), centers + (t - middle) * steps, radii)
+                for t in times
+            ]
             found.append(Pieces(middle, scores, centers, steps, radii, np.mean(shown, axis=0)))
     return found
 
 
 def _chains(pieces: list[Pieces], count: int) -> list[Start]:
-    """Return where chains of pieces lead, and where their best piece alone does; no two chains share a piece."""
-    left, found = [piece.scores.copy() for piece in pieces], []
-    near = [[i for i in range(j) if pieces[j].middle - pieces[i].middle <= SKIPPED] for j in range(len(pieces))]
-    partings = [{i: _parting(pieces[i], pieces[j]) for i in before} for j, before in enumerate(near)]
+    """Return where chains of pieces lead, and where their best piece alone does; no two chains
+    share a piece."""
+    left = [piece.scores.copy() for piece in pieces]
+    found = []
+    near = [
+        [i for i in range(j) if pieces[j].middle - pieces[i].middle <= SKIPPED]
+        for j in range(len(pieces))
+    ]
+    partings = [
+        {i: _parting(pieces[i], pieces[j]) for i in before} for j, before in enumerate(near)
+    ]
     while len(found) < 2 * FOLLOWED and any(np.isfinite(scores).any() for scores in left):
         chain = _best_chain(partings, left)
         best = max(chain, key=lambda at: left[at[0]][at[1]])
@@ -203,11 +252,14 @@ def _chains(pieces: list[Pieces], count: int) -> list[Start]:
     return found
 
 
-def _best_chain(partings: list[dict[int, np.ndarray]], scores: list[np.ndarray]) -> list[tuple[int, int]]:
-    """Return which pieces, in order of time, have the most of ``scores`` in all less what parts them (Viterbi 1967).
+def _best_chain(
+    partings: list[dict[int, np.ndarray]], scores: list[np.ndarray]
+) -> list[tuple[int, int]]:
+    """Return which pieces, in order of time, have the most of ``scores`` in all less what parts
+    them (Viterbi 1967).
 
-    Pieces must meet, but may change direction where they do, as what hops. ``partings`` holds, for the pieces around
-    each middle image, the costs of coming from those around earlier ones.
+    Pieces must meet, but may change direction where they do, as what hops. ``partings`` holds, for
+    the pieces around each middle image, the costs of coming from those around earlier ones.
     """
     totals = [x.copy() for x in scores]
     before: list[list[tuple[int, int] | None]] = [[None] * len(x) for x in scores]
@@ -231,9 +283,12 @@ def _along(chain: list[tuple[Pieces, int]], count: int) -> Start:
     middles = np.array([piece.middle for piece, _ in chain])
     places = np.array([piece.centers[k] for piece, k in chain])
     centers = np.stack([np.interp(np.arange(count), middles, x) for x in places.T], axis=1)
-    first, last = int(middles[0]) - HALF, int(middles[-1]) + HALF
+    first = int(middles[0]) - HALF
+    last = int(middles[-1]) + HALF
     for (piece, k), times in zip(
-        (chain[0], chain[-1]), (np.arange(first, middles[0]), np.arange(middles[-1] + 1, last + 1)), strict=True
+        (chain[0], chain[-1]),
+        (np.arange(first, middles[0]), np.arange(middles[-1] + 1, last + 1)),
+        strict=True,
     ):
         centers[times] += (times - piece.middle)[:, None] * piece.steps[k]
     return Start(centers, float(np.median([piece.radii[k] for piece, k in chain])), first, last)
@@ -256,26 +311,33 @@ def _parting(first: Pieces, later: Pieces) -> np.ndarray:
 def _through(
     shots: Shots, which: np.ndarray, middle: int, picked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centres (n, 3), steps (n, 3) and radii (n,) of paths through three discs each, where these agree."""
-    count, flat = len(which), which.ravel()
+    """Return centres (n, 3), steps (n, 3) and radii (n,) of paths through three discs each, where
+    these agree."""
+    count = len(which)
+    flat = which.ravel()
     ways = shots.rays(flat, picked[..., :2].reshape(-1, 2))
     across = np.eye(3) - ways[:, :, None] * ways[:, None]
     later = (which - middle).astype(float)
     across = across.reshape(count, 3, 3, 3)
     seen = np.einsum("ntij,ntj->nti", across, shots.centers[flat].reshape(count, 3, 3))
-    blocks = [[np.einsum("nt,ntij->nij", later ** (a + b), across) for b in range(2)] for a in range(2)]
+    blocks = [
+        [np.einsum("nt,ntij->nij", later ** (a + b), across) for b in range(2)] for a in range(2)
+    ]
     left = np.concatenate([np.concatenate(row, axis=2) for row in blocks], axis=1)
     left[:, range(6), range(6)] += 1e-6
     right = np.concatenate([np.einsum("nt,nti->ni", later**a, seen) for a in range(2)], axis=1)
     solved = np.linalg.solve(left, right[..., None])[..., 0]
-    centers, steps = solved[:, :3], solved[:, 3:]
+    centers = solved[:, :3]
+    steps = solved[:, 3:]
     places = (centers[:, None] + later[..., None] * steps[:, None]).reshape(-1, 3)
     pixels, depths = shots.projected(flat, places)
     misses = np.linalg.norm(pixels.reshape(count, 3, 2) - picked[..., :2], axis=-1).max(1)
     sizes = np.log(picked[..., 2] * (depths / shots.focal[flat]).reshape(count, 3))
     radii = np.exp(sizes.mean(1))
     agree = (misses < 0.35 * picked[..., 2].min(1)) & (np.ptp(sizes, axis=1) < 1)
-    agree &= (depths.reshape(count, 3) > 1e-3).all(1) & (np.linalg.norm(steps, axis=1) < 1.5 * radii)
+    agree &= (depths.reshape(count, 3) > 1e-3).all(1) & (
+        np.linalg.norm(steps, axis=1) < 1.5 * radii
+    )
     return centers[agree], steps[agree], radii[agree]
 
 
@@ -284,31 +346,39 @@ def _followed(shots: Shots, discs: Discs, start: Start) -> Path:
 
     Followed outwards from there image by image, then looked for in all images at once.
     """
-    count, radius, centers = len(shots), start.radius, start.centers
-    ways, weights = np.zeros((count, 3)), np.zeros(count)
+    count = len(shots)
+    radius = start.radius
+    centers = start.centers
+    ways = np.zeros((count, 3))
+    weights = np.zeros(count)
 
     def looked(which: np.ndarray, reach: float) -> np.ndarray:
         ways[which], weights[which] = _sighted(shots, discs, which, centers[which], radius, reach)
         return _smooth(shots, ways, weights, radius)
 
-    low, high = start.first, start.last
+    low = start.first
+    high = start.last
     centers = looked(np.arange(low, high + 1), REACH)
     while low > 0 or high < count - 1:
         fresh = [t for t in (low - 1, high + 1) if 0 <= t < count]
-        low, high = min(low, *fresh), max(high, *fresh)
+        low = min(low, *fresh)
+        high = max(high, *fresh)
         centers = looked(np.array(fresh), REACH_NEW)
     for turn in range(ROUNDS):
         centers = looked(np.arange(count), REACH)
         if turn % 2:
             sizes = radius * np.geomspace(0.8, 1.25, 9)
-            radius = float(sizes[np.argmax([_contrast(shots, discs, centers, size).mean() for size in sizes])])
+            radius = float(
+                sizes[np.argmax([_contrast(shots, discs, centers, size).mean() for size in sizes])]
+            )
     return Path(centers, radius, float(_contrast(shots, discs, centers, radius).mean()))
 
 
 def _sighted(
     shots: Shots, discs: Discs, which: np.ndarray, centers: np.ndarray, radius: float, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return in ``which`` (n,) images (n, 3) directions and (n,) weights of discs up to ``reach`` radii from balls."""
+    """Return in ``which`` (n,) images (n, 3) directions and (n,) weights of discs up to ``reach``
+    radii from balls."""
     pixels, depths = shots.projected(which, centers)
     sizes = radius * shots.focal[which] / depths
     side = np.linspace(-1, 1, 2 * LOOKS + 1)
@@ -322,10 +392,11 @@ def _sighted(
 
 
 def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray, radius: float) -> np.ndarray:
-    """Return the (T, 3) places nearest to the rays along ``ways``, with small second differences but at kinks.
+    """Return the (T, 3) places nearest to the rays along ``ways``, with small second differences
+    but at kinks.
 
-    Reweighted least squares: second differences above ``KINK`` radii count by their length. Images of weight 0 have
-    no ray, and the path goes straight on there.
+    Reweighted least squares: second differences above ``KINK`` radii count by their length. Images
+    of weight 0 have no ray, and the path goes straight on there.
     """
     from scipy.linalg import solveh_banded
 
@@ -341,8 +412,11 @@ def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray, radius: float) 
     stiff = np.ones(count - 2)
     for _ in range(REWEIGHTED):
         full = rays.copy()
-        for gap, taps in enumerate(([1, 4, 1], [-2, -2], [1])):  # of the squares of second differences
+        for gap, taps in enumerate(([1, 4, 1], [-2, -2], [1])):
+            # of the squares of second differences
             full[6 - 3 * gap, 3 * gap :] += np.repeat(stiffness * np.convolve(stiff, taps), 3)
         found = solveh_banded(full, right).reshape(count, 3)
-        stiff = np.minimum(1, KINK * radius / np.maximum(np.linalg.norm(np.diff(found, 2, axis=0), axis=1), 1e-12))
+        stiff = np.minimum(
+            1, KINK * radius / np.maximum(np.linalg.norm(np.diff(found, 2, axis=0), axis=1), 1e-12)
+        )
     return found

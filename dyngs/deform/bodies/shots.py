@@ -1,4 +1,5 @@
-"""What one moving camera shows, against a static model of it: images in which what moves stands out.
+"""What one moving camera shows, against a static model of it: images in which what moves stands
+out.
 
 Local letters: T images in order of time, n points or pixels, each in one image.
 """
@@ -31,7 +32,8 @@ SOLID = 0.6  # Opacity from which it hides what lies behind
 
 @dataclass(frozen=True)
 class Shots:
-    """T images of distinct times, in order, the static model's in the same places, and pinhole cameras."""
+    """T images of distinct times, in order, the static model's in the same places, and pinhole
+    cameras."""
 
     times: np.ndarray  # (T,) ascending, in [0, 1]
     images: np.ndarray  # (T, H, W, 3) float32
@@ -44,7 +46,8 @@ class Shots:
     centers: np.ndarray = field(init=False)  # (T, 3) of the cameras
 
     def __post_init__(self) -> None:
-        rotations, shifts = self.poses[:, :3, :3], self.poses[:, :3, 3]
+        rotations = self.poses[:, :3, :3]
+        shifts = self.poses[:, :3, 3]
         object.__setattr__(self, "centers", -np.einsum("tji,tj->ti", rotations, shifts))
 
     def __len__(self) -> int:
@@ -61,21 +64,26 @@ class Shots:
         return self.intrinsics[:, 0, 0]
 
     def projected(self, which: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (n, 2) pixels and (n,) depths of ``points`` (n, 3) in the images ``which`` (n,)."""
+        """Return (n, 2) pixels and (n,) depths of ``points`` (n, 3) in the images ``which``
+        (n,)."""
         seen = np.einsum("nij,nj->ni", self.poses[which, :3, :3], points) + self.poses[which, :3, 3]
         depths = np.maximum(seen[:, 2], 1e-6)
         scale = self.intrinsics[which][:, [0, 1], [0, 1]]
         return scale * seen[:, :2] / depths[:, None] + self.intrinsics[which, :2, 2], depths
 
     def rays(self, which: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Return (n, 3) unit directions in the world through ``pixels`` (n, 2) of the images ``which`` (n,)."""
+        """Return (n, 3) unit directions in the world through ``pixels`` (n, 2) of the images
+        ``which`` (n,)."""
         scale = self.intrinsics[which][:, [0, 1], [0, 1]]
-        seen = np.concatenate([(pixels - self.intrinsics[which, :2, 2]) / scale, np.ones((len(pixels), 1))], axis=1)
+        seen = np.concatenate(
+            [(pixels - self.intrinsics[which, :2, 2]) / scale, np.ones((len(pixels), 1))], axis=1
+        )
         ways = np.einsum("nji,nj->ni", self.poses[which, :3, :3], seen)
         return ways / np.linalg.norm(ways, axis=1, keepdims=True)
 
     def differences(self) -> np.ndarray:
-        """Return (T, H, W) in [0, 1]: where an image differs from the static model, moved by up to one pixel.
+        """Return (T, H, W) in [0, 1]: where an image differs from the static model, moved by up to
+        one pixel.
 
         In colour or in alpha. What is darker alike in all channels may be a shadow and counts less.
         """
@@ -87,7 +95,8 @@ class Shots:
     def on_ball(
         self, index: int, center: np.ndarray, radius: float, reach: float = 0.92
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return rows, columns and (n, 3) outward normals of the pixels of one image that see a ball.
+        """Return rows, columns and (n, 3) outward normals of the pixels of one image that see a
+        ball.
 
         Not those that the static model hides. Args: ``reach``: of the disc looked at, in radii.
         """
@@ -101,7 +110,8 @@ class Shots:
         half = ways @ offset
         square = half**2 - offset @ offset + radius**2
         hit = square > radius**2 * (1 - reach**2)
-        rows, columns = rows[hit], columns[hit]
+        rows = rows[hit]
+        columns = columns[hit]
         along = (-half[hit] - np.sqrt(square[hit]))[:, None] * ways[hit]
         in_front = (along @ self.poses[index, 2, :3]) - 0.15 * radius
         seen = self.depths[index, rows, columns] > in_front
@@ -109,18 +119,22 @@ class Shots:
 
 
 def _apart(images: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the (T, H, W) differences, mean over channels, from ``others`` moved by up to one pixel."""
+    """Return the (T, H, W) differences, mean over channels, from ``others`` moved by up to one
+    pixel."""
     height, width = images.shape[1:3]
     around = np.pad(others, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
     found = np.full(images.shape[:3], np.inf, np.float32)
     for y in range(3):
         for x in range(3):
-            np.minimum(found, np.abs(images - around[:, y : y + height, x : x + width]).mean(-1), out=found)
+            np.minimum(
+                found, np.abs(images - around[:, y : y + height, x : x + width]).mean(-1), out=found
+            )
     return found
 
 
 def one_camera(views: Sequence[View]) -> list[int] | None:
-    """Return the order in time of views that one moving camera may have taken, each at a time of its own; else None."""
+    """Return the order in time of views that one moving camera may have taken, each at a time of
+    its own; else None."""
     times = [view.time for view in views]
     if None in times or len(set(times)) < len(times) or static_cameras(views):
         return None
@@ -135,7 +149,8 @@ def shots_of(
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
 ) -> Shots:
-    """Return ``images``, in order of time, with what ``still`` shows, at most ``LONGEST_SIDE`` pixels wide or high.
+    """Return ``images``, in order of time, with what ``still`` shows, at most ``LONGEST_SIDE``
+    pixels wide or high.
 
     All have one size. Masked pixels are as the static model has them.
     """
@@ -149,12 +164,22 @@ def shots_of(
         assert drawn.depth is not None
         alpha = drawn.alpha.reshape(small.cameras.height, small.cameras.width)
         depth = torch.where(alpha > SOLID, drawn.depth.reshape(alpha.shape), NEVER)
-        rgb, own_alpha = small.composite(background), alpha if small.alpha is None else small.alpha
+        rgb = small.composite(background)
+        own_alpha = alpha if small.alpha is None else small.alpha
         if small.mask is not None:
             rgb = torch.where(small.mask[..., None] > 0, rgb, drawn.rgb[0])
             own_alpha = torch.where(small.mask > 0, own_alpha, alpha)
-        shown = {"images": rgb, "still": drawn.rgb[0], "depths": depth, "alphas": own_alpha, "still_alphas": alpha}
-        camera = {"poses": small.cameras.cam_from_world[0].double(), "intrinsics": small.cameras.intrinsics[0].double()}
+        shown = {
+            "images": rgb,
+            "still": drawn.rgb[0],
+            "depths": depth,
+            "alphas": own_alpha,
+            "still_alphas": alpha,
+        }
+        camera = {
+            "poses": small.cameras.cam_from_world[0].double(),
+            "intrinsics": small.cameras.intrinsics[0].double(),
+        }
         for name, x in (shown | camera).items():
             parts.setdefault(name, []).append(x.cpu().numpy())
         parts.setdefault("times", []).append(np.array(small.time or 0.0))

@@ -1,7 +1,7 @@
 """Visual hulls of what changes, one set per time (Laurentini 1994), from cameras that stand still.
 
-Cubes that project onto changes are divided again and again until they are about a pixel large. Things may be hidden
-behind still ones in some cameras: where many see a place, not all need agree.
+Cubes that project onto changes are divided again and again until they are about a pixel large.
+Things may be hidden behind still ones in some cameras: where many see a place, not all need agree.
 
 Local letters: C cubes, T images of one camera.
 """
@@ -20,11 +20,13 @@ MAX_CUBES = 300_000  # Carving stops to divide cubes at this number
 LARGEST_PX = 2.0  # Pixels that a side covers, in most cameras, when cubes are no longer divided
 MAX_LEVELS = 8
 MISSING_FRACTION = 0.25
-"""Fraction of the cameras that see a place which may not see the thing there, because something still hides it."""
+"""Fraction of the cameras that see a place which may not see the thing there, because something
+still hides it."""
 ENOUGH_VIEWS = 3  # Cameras that must see a change at a place, or all there are
 FEWEST_CUBES = 12
 SOLID_FRACTION = 0.3
-"""Of a blob, the cubes that most cameras agree on are kept, as long as they are this fraction of all."""
+"""Of a blob, the cubes that most cameras agree on are kept, as long as they are this fraction of
+all."""
 NEAR = 1e-3
 
 
@@ -58,14 +60,17 @@ class ChangedRegion:
 
     @property
     def focal(self) -> float:
-        return float(np.linalg.norm(self.projection[0, :3] - self.projection[2, :3] * self._principal))
+        return float(
+            np.linalg.norm(self.projection[0, :3] - self.projection[2, :3] * self._principal)
+        )
 
     @property
     def _principal(self) -> float:
         return float(self.projection[0, :3] @ self.projection[2, :3])
 
     def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (C, 2) pixel coordinates and (C,) depths of ``points`` (C, 3); those behind the camera have none."""
+        """Return (C, 2) pixel coordinates and (C,) depths of ``points`` (C, 3); those behind the
+        camera have none."""
         u, v, depth = self.projection[:, :3] @ points.T + self.projection[:, 3:]
         safe = np.where(depth > NEAR, depth, np.inf)
         return np.stack([u / safe, v / safe], -1), depth
@@ -74,26 +79,36 @@ class ChangedRegion:
         """Return (C,) bool, whether ``points`` lie in the image, and whether it changes there."""
         place, depth = self.pixels(points)
         height, width = self.changed.shape
-        x, y = (np.clip(np.floor(place[:, i]), -1, limit).astype(int) for i, limit in enumerate((width, height)))
+        x, y = (
+            np.clip(np.floor(place[:, i]), -1, limit).astype(int)
+            for i, limit in enumerate((width, height))
+        )
         inside = (depth > NEAR) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+        x = np.where(inside, x, 0)
+        y = np.where(inside, y, 0)
         inside &= self.counted[y, x]
         return inside, inside & self.changed[y, x]
 
-    def touched(self, centers: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (C,) bool of cubes: part of it may be in the image, all of it is, and part of it may change."""
+    def touched(
+        self, centers: np.ndarray, side: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return (C,) bool of cubes: part of it may be in the image, all of it is, and part of it
+        may change."""
         place, depth = self.pixels(centers)
         reach = 0.5 * np.sqrt(3.0) * side
         spread = self.focal * reach / np.maximum(depth - reach, NEAR) + 1.0
         height, width = self.changed.shape
-        low, high = np.floor(place - spread[:, None]), np.ceil(place + spread[:, None])
+        low = np.floor(place - spread[:, None])
+        high = np.ceil(place + spread[:, None])
         ahead = depth > -reach
         limits = np.array([width, height])
         partly = ahead & (high > 0).all(1) & (low < limits).all(1)
         wholly = partly & (low >= 0).all(1) & (high <= limits).all(1) & (depth > reach)
         x0, y0 = np.clip(low, 0, limits).astype(int).T
         x1, y1 = np.clip(high, 0, limits).astype(int).T
-        changing, masked = (s[y1, x1] - s[y0, x1] - s[y1, x0] + s[y0, x0] for s in (self.sums, self.masked))
+        changing, masked = (
+            s[y1, x1] - s[y0, x1] - s[y1, x0] + s[y0, x0] for s in (self.sums, self.masked)
+        )
         around = ahead & (depth <= reach)
         return partly | around, wholly & (masked == 0), (partly & (changing > 0)) | around
 
@@ -107,13 +122,19 @@ def silhouettes_at(footage: Sequence[Footage], time: float) -> list[ChangedRegio
         i = one.times.index(time)
         pose = one.camera.cam_from_world[0].double().cpu().numpy()[:3]
         projection = one.camera.intrinsics[0].double().cpu().numpy() @ pose
-        sums, masked = (np.pad(x.cumsum(0).cumsum(1), ((1, 0), (1, 0))) for x in (one.changed[i], ~one.counted[i]))
-        found.append(ChangedRegion(projection, one.images[i], one.changed[i], one.counted[i], sums, masked))
+        sums, masked = (
+            np.pad(x.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+            for x in (one.changed[i], ~one.counted[i])
+        )
+        found.append(
+            ChangedRegion(projection, one.images[i], one.changed[i], one.counted[i], sums, masked)
+        )
     return found
 
 
 def blobs_in(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndarray) -> list[Blob]:
-    """Return the connected parts of the visual hull of what ``views`` see to change, in the box ``low`` to ``high``."""
+    """Return the connected parts of the visual hull of what ``views`` see to change, in the box
+    ``low`` to ``high``."""
     if len(views) < 2:
         return []
     side = float((high - low).max()) / FIRST_CUBES
@@ -124,13 +145,20 @@ def blobs_in(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndarray) 
         cubes = cubes[_may_hold(views, centers, side)]
         if not len(cubes):
             return []
-        if level == MAX_LEVELS - 1 or 8 * len(cubes) > MAX_CUBES or _largest_px(views, centers, side) <= LARGEST_PX:
+        if (
+            level == MAX_LEVELS - 1
+            or 8 * len(cubes) > MAX_CUBES
+            or _largest_px(views, centers, side) <= LARGEST_PX
+        ):
             break
         halves = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-        cubes, side = (2 * cubes[:, None] + halves).reshape(-1, 3), side / 2
+        cubes = (2 * cubes[:, None] + halves).reshape(-1, 3)
+        side = side / 2
     centers = low + (cubes + 0.5) * side
     agreeing, kept = _agreed(views, centers)
-    cubes, centers, agreeing = cubes[kept], centers[kept], agreeing[kept]
+    cubes = cubes[kept]
+    centers = centers[kept]
+    agreeing = agreeing[kept]
     labels = _components(cubes)
     order = np.argsort(labels, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(order) else []
@@ -146,25 +174,33 @@ def _may_hold(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) 
         seeing += partly
         whole += wholly & ~changes
         agreeing += changes
-    return (agreeing >= min(ENOUGH_VIEWS, len(views))) & (whole <= np.floor(MISSING_FRACTION * seeing))
+    return (agreeing >= min(ENOUGH_VIEWS, len(views))) & (
+        whole <= np.floor(MISSING_FRACTION * seeing)
+    )
 
 
 def _agreed(views: Sequence[ChangedRegion], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (C,) numbers of cameras that see a change at ``points``, and whether they are enough."""
+    """Return (C,) numbers of cameras that see a change at ``points``, and whether they are
+    enough."""
     seeing, agreeing = np.zeros((2, len(points)), int)
     for view in views:
         inside, changes = view.seen(points)
         seeing += inside
         agreeing += changes
-    enough = (agreeing >= min(ENOUGH_VIEWS, len(views))) & (seeing - agreeing <= np.floor(MISSING_FRACTION * seeing))
+    enough = (agreeing >= min(ENOUGH_VIEWS, len(views))) & (
+        seeing - agreeing <= np.floor(MISSING_FRACTION * seeing)
+    )
     return agreeing, enough
 
 
 def _largest_px(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) -> float:
-    """Return the pixels that ``side`` covers in the middle of ``centers``: the median over the cameras."""
+    """Return the pixels that ``side`` covers in the middle of ``centers``: the median over the
+    cameras."""
     middle = np.median(centers, axis=0)
     depths = [max(float(view.pixels(middle[None])[1][0]), NEAR) for view in views]
-    return float(np.median([view.focal * side / depth for view, depth in zip(views, depths, strict=True)]))
+    return float(
+        np.median([view.focal * side / depth for view, depth in zip(views, depths, strict=True)])
+    )
 
 
 def _components(cubes: np.ndarray) -> np.ndarray:
@@ -193,7 +229,8 @@ def _components(cubes: np.ndarray) -> np.ndarray:
 
 
 def _solid(group: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
-    """Return the part of ``group`` that most cameras agree on: tolerance for hidden views makes hulls too large."""
+    """Return the part of ``group`` that most cameras agree on: tolerance for hidden views makes
+    hulls too large."""
     own = agreeing[group]
     for least in range(int(own.max()), 0, -1):
         part: np.ndarray = group[own >= least]

@@ -11,14 +11,17 @@ from dyngs.deform.fixed_cameras.hulls import Blob
 
 MAX_GAP = 3  # Times in a row at which a thing may be lost
 FEWEST_TIMES = 4  # Times at which a thing must be found
-FIRST_REACH = 6.0  # Radii within which a thing whose velocity is not known is looked for at the next time
+# Radii within which a thing whose velocity is not known is looked for at the next time
+FIRST_REACH = 6.0
 REACH, SPEED_REACH = 3.0, 1.5
-"""Radii, and fractions of the last displacement, by which a thing may be away from where its velocity takes it."""
+"""Radii, and fractions of the last displacement, by which a thing may be away from where its
+velocity takes it."""
 COLOR_REACH, SIZE_REACH = 0.35, 1.2
 """Differences of colour, and of the logarithm of the radius, at which a blob is another thing."""
-FEWEST_STEPS, SAME_WAY = 2, -0.2
-"""Steps of at least a radius that a thing which travels makes, and the least correlation of each with the next:
-what hops turns back, too, but less often than noise does."""
+FEWEST_STEPS = 2
+SAME_WAY = -0.2
+"""Steps of at least a radius that a thing which travels makes, and the least correlation of each
+with the next: what hops turns back, too, but less often than noise does."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Track:
     def travels(self) -> bool:
         """Whether it goes on and on: what turns or bends in place is no track to start from.
 
-        Of places a radius apart or more, in the order of time, successive steps must not mostly turn back.
+        Of places a radius apart or more, in the order of time, successive steps must not mostly
+        turn back.
         """
         centers = self.centers
         places = [centers[0]]
@@ -66,8 +70,9 @@ class Track:
 def linked(times: Sequence[float], blobs: Sequence[Sequence[Blob]]) -> list[Track]:
     """Return the tracks among the ``blobs`` of each of ``times`` (ascending), longest first.
 
-    Blobs are assigned to the tracks so far by the least total cost (Kuhn 1955), each within a gate around where
-    constant velocity takes a track. A track may miss some times in a row; those found too rarely are left out.
+    Blobs are assigned to the tracks so far by the least total cost (Kuhn 1955), each within a gate
+    around where constant velocity takes a track. A track may miss some times in a row; those found
+    too rarely are left out.
     """
     from scipy.optimize import linear_sum_assignment
 

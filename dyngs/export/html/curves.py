@@ -1,6 +1,7 @@
 """Motion as splines of a few drivers, which a program without dyngs can play.
 
-A driver is a control node that several Gaussians follow, or the own one of each Gaussian where a field has no nodes.
+A driver is a control node that several Gaussians follow, or the own one of each Gaussian where a
+field has no nodes.
 
 Local letters: M moving Gaussians, S drivers, P control points, B drivers that one Gaussian follows.
 """
@@ -23,8 +24,10 @@ from dyngs.ops.nodes import SPAN
 
 SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
 FEWEST_PIECES, MOST_PIECES = 8, 256
-ALWAYS_ALLOWED = 32  # Pieces, however few training times there are: between those a network moves as it likes
-CHECKED = 0.95  # Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance
+# Pieces, however few training times there are: between those a network moves as it likes
+ALWAYS_ALLOWED = 32
+# Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance
+CHECKED = 0.95
 
 
 @dataclass(frozen=True)
@@ -33,11 +36,13 @@ class Curves:
 
     Attributes:
         heads: control points (S, P, size) by attribute of ``Offsets``; always "means".
-        pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own, about itself.
+        pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own,
+            about itself.
         followed: (M, B) drivers of each Gaussian, B = 4; None as above.
         fractions: (M, B) of theirs, rows sum to 1; None as above.
         is_steep: control points lie far outside what is drawn, and are to be kept as they are.
-        windows: (M, 2) begin and end of each Gaussian's window in time (``WindowedField``); None: all are always there.
+        windows: (M, 2) begin and end of each Gaussian's window in time (``WindowedField``); None:
+            all are always there.
         error: of a driver's place: the quantile ``CHECKED``, in world units.
     """
 
@@ -61,16 +66,20 @@ def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance:
         case FreePrimitives():  # straight lines and parabolas
             return Curves(_fit(lambda time: field.offsets(means, time), 1), is_steep=True)
         case _:
-            heads, error = fitted_curves(lambda time: field.offsets(means, time), num_times, tolerance)
+            heads, error = fitted_curves(
+                lambda time: field.offsets(means, time), num_times, tolerance
+            )
             return Curves(heads, error=error)
 
 
 def fitted_curves(
     offsets_at: Callable[[float], Offsets], num_times: int, tolerance: float
 ) -> tuple[dict[str, Tensor], float]:
-    """Return control points (S, P, size), by attribute, of the splines nearest to offsets, and the error of places.
+    """Return control points (S, P, size), by attribute, of the splines nearest to offsets, and the
+    error of places.
 
-    The number of pieces is doubled until the error is within ``tolerance``, or there are two for each training time.
+    The number of pieces is doubled until the error is within ``tolerance``, or there are two for
+    each training time.
     """
     pieces = FEWEST_PIECES
     most = min(max(2 * (num_times - 1), ALWAYS_ALLOWED), MOST_PIECES)
@@ -97,7 +106,8 @@ def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tenso
 
 
 def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) -> float:
-    """Return the quantile ``CHECKED`` of the splines' distances from the places, root mean squares over the pieces."""
+    """Return the quantile ``CHECKED`` of the splines' distances from the places, root mean squares
+    over the pieces."""
     times = (torch.arange(pieces, dtype=torch.float64, device="cpu") + 0.5) / pieces
     apart = [
         (torch.einsum("p,spd->sd", fractions.float(), points) - offsets_at(time).means).norm(dim=1)
@@ -110,5 +120,7 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
 def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
     nodes = field.nodes_for(means)
     more = 0, FOLLOWED - nodes.followed.shape[1]  # of which a Gaussian follows nothing
-    followed, fractions = (torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means)))
+    followed, fractions = (
+        torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
+    )
     return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)

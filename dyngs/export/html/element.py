@@ -1,4 +1,5 @@
-"""The script that defines ``<dyngs-scene src="PAGE">``, which draws our pages and stands in those of others."""
+"""The script that defines ``<dyngs-scene src="PAGE">``, which draws our pages and stands in those
+of others."""
 
 from __future__ import annotations
 
@@ -6,14 +7,24 @@ from pathlib import Path
 
 from dyngs.export.html.template import script_safe
 
-SCRIPTS = ("fetched.js", "data.js", "chunks.js", "motion.js", "sort.js", "drawing.js", "renderer.js", "levels.js")
+SCRIPTS = (
+    "fetched.js",
+    "data.js",
+    "chunks.js",
+    "motion.js",
+    "sort.js",
+    "drawing.js",
+    "renderer.js",
+    "levels.js",
+)
 SCRIPTS += ("triangles.js", "camera.js", "player.js", "controls.js", "element.js")
 SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
 SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 
 
 def element_script() -> str:
-    """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages may be of any."""
+    """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages
+    may be of any."""
     texts = {"STYLE": text_of("scene.css"), "SHADERS": {name: text_of(name) for name in SHADERS}}
     constants = [f"const {name} = {script_safe(value)};" for name, value in texts.items()]
     parts = "\n".join([*constants, *map(text_of, SCRIPTS)])

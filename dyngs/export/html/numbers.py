@@ -1,6 +1,8 @@
-"""The numbers that a page draws: Gaussians, what moves them, what colours them, or triangles; ``data.js`` reads them.
+"""The numbers that a page draws: Gaussians, what moves them, what colours them, or triangles;
+``data.js`` reads them.
 
-Local letters: N Gaussians, M of them moving, J joints, F frames of a clip; R rows and D columns of a list.
+Local letters: N Gaussians, M of them moving, J joints, F frames of a clip; R rows and D columns of
+a list.
 """
 
 from __future__ import annotations
@@ -40,8 +42,8 @@ CHUNK = 256  # rows of a list that share a range for each column: neighbours in 
 class Lists:
     """A block of bytes to which lists are added, and where they lie in it.
 
-    ``layout``: by name what ``data.js`` needs to know. ``chunks``: splines that are fetched when they are played, all
-    of one layout; None: everything is in the block.
+    ``layout``: by name what ``data.js`` needs to know. ``chunks``: splines that are fetched when
+    they are played, all of one layout; None: everything is in the block.
     """
 
     def __init__(self, *, chunked: bool = False) -> None:
@@ -61,14 +63,23 @@ class Lists:
         quantised = np.zeros((rows, columns), dtype=np.uint16)
         for i in range(count):
             part = slice(i * CHUNK, (i + 1) * CHUNK)
-            low, high = values[part].min(0), values[part].max(0)
+            low = values[part].min(0)
+            high = values[part].max(0)
             step = ((high.astype(np.float64) - low) / (2**bits - 1)).astype(np.float32)
             ranges[i] = np.stack([low, step], axis=1)
             relative = (values[part].astype(np.float64) - low) / np.where(step > 0, step, 1)
             quantised[part] = relative.round().clip(0, 2**bits - 1)
         planes = [quantised >> 8, quantised & 255] if bits == 16 else [quantised]
-        bytes_of = np.stack([plane.T.astype(np.uint8) for plane in planes], axis=1)  # (D, planes, R)
-        self._add(name, ranges.tobytes() + bytes_of.tobytes(), "quantised", values.shape, bits=bits, chunk=CHUNK)
+        # (D, planes, R)
+        bytes_of = np.stack([plane.T.astype(np.uint8) for plane in planes], axis=1)
+        self._add(
+            name,
+            ranges.tobytes() + bytes_of.tobytes(),
+            "quantised",
+            values.shape,
+            bits=bits,
+            chunk=CHUNK,
+        )
 
     def exact(self, name: str, values: NDArray[Any]) -> None:
         """Add ``values`` (R, D) as they are: uint8, uint16 or float32."""
@@ -92,7 +103,13 @@ class Lists:
 
     def _add(self, name: str, data: bytes, kind: str, shape: tuple[int, ...], **more: int) -> None:
         rows, columns = shape
-        self.layout[name] = {"kind": kind, "rows": rows, "columns": columns, "at": self._size, **more}
+        self.layout[name] = {
+            "kind": kind,
+            "rows": rows,
+            "columns": columns,
+            "at": self._size,
+            **more,
+        }
         self._parts.append(data)
         self._size += len(data)
 
@@ -102,17 +119,23 @@ def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str,
 
     ``tolerance``: world units that a place may be off where motion is fitted.
     """
-    person, moved = avatar_of(scene), field_scene_of(scene)
+    person = avatar_of(scene)
+    moved = field_scene_of(scene)
     if person is not None:
-        order = torch.from_numpy(storage_order(_numpy(scene.gaussians.means), np.arange(len(scene))))
-        gaussians, told = scene.gaussians.select(order), _add_person(person, order, lists, tolerance)
+        order = torch.from_numpy(
+            storage_order(_numpy(scene.gaussians.means), np.arange(len(scene)))
+        )
+        gaussians = scene.gaussians.select(order)
+        told = _add_person(person, order, lists, tolerance)
     elif moved is not None:
         order = torch.from_numpy(storage_order(_numpy(scene.gaussians.means), moved.moving.numpy()))
-        gaussians, told = scene.gaussians.select(order), _add_motion(moved, order, lists, tolerance)
+        gaussians = scene.gaussians.select(order)
+        told = _add_motion(moved, order, lists, tolerance)
     else:
         still = scene.at(None)
         order = torch.from_numpy(storage_order(_numpy(still.means), np.zeros(0, dtype=np.int64)))
-        gaussians, told = still.select(order), {}
+        gaussians = still.select(order)
+        told = {}
     told |= _add_gaussians(gaussians.detach(), lists, with_rest=scene.colour is None)
     if scene.colour is not None:
         told["network"] = _add_network(scene.colour, lists)
@@ -120,7 +143,8 @@ def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str,
 
 
 def add_levels(levels: Levels, colour: ColourNetwork | None, lists: Lists) -> dict[str, Any]:
-    """Add where the blocks of ``levels`` are, and a colour network, and return what the page needs to know about all.
+    """Add where the blocks of ``levels`` are, and a colour network, and return what the page needs
+    to know about all.
 
     The page fetches the blocks, see ``block_numbers``.
     """
@@ -128,13 +152,26 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: Lists) -> di
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
     coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), with_rest=colour is None)
     sizes = [len(level) for level in levels.levels]
-    known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": PIXELS, "layout": coarsest.layout}
+    known = {
+        "sizes": sizes,
+        "block": BLOCK,
+        "merged": MERGED,
+        "pixels": PIXELS,
+        "layout": coarsest.layout,
+    }
     degree = levels.levels[0].sh_degree if colour is None else 0
-    return told | {"levels": known, "degree": degree, "count": sizes[0], "frames": 0, "moves": False}
+    return told | {
+        "levels": known,
+        "degree": degree,
+        "count": sizes[0],
+        "frames": 0,
+        "moves": False,
+    }
 
 
 def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> Lists:
-    """Return the lists of a block, ``BLOCK`` rows each; the last ones of a block that has fewer are never seen."""
+    """Return the lists of a block, ``BLOCK`` rows each; the last ones of a block that has fewer are
+    never seen."""
     gaussians = levels.of_block(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
@@ -148,11 +185,15 @@ def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes
     """Yield names and bytes of the files of all blocks, as ``levels.js`` asks for them."""
     for level, balls in enumerate(levels.blocks):
         for place in range(len(balls)):
-            yield f"{level}-{place}.bin", block_numbers(levels, (level, place), with_rest=with_rest).deflated()
+            yield (
+                f"{level}-{place}.bin",
+                block_numbers(levels, (level, place), with_rest=with_rest).deflated(),
+            )
 
 
 def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
-    """Add the numbers of curved triangles to ``lists`` and return what the page needs to know about them."""
+    """Add the numbers of curved triangles to ``lists`` and return what the page needs to know about
+    them."""
     patches = scene.patches
     middles = _numpy(patches.points[:, CORNERS].mean(1))
     order = torch.from_numpy(storage_order(middles, np.zeros(0, dtype=np.int64)))
@@ -160,8 +201,17 @@ def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
     lists.quantised("colours", _numpy(patches.colours[order].flatten(1)), 8)
     if patches.sh_degree:
         lists.quantised("rest", _numpy(patches.harmonics[order].flatten(1)), 8)
-    told = {"degree": patches.sh_degree, "texture": patches.texture, "segments": scene.options.segments}
-    return told | {"bounds": scene.bounds.tolist(), "count": len(scene), "frames": 0, "moves": False}
+    told = {
+        "degree": patches.sh_degree,
+        "texture": patches.texture,
+        "segments": scene.options.segments,
+    }
+    return told | {
+        "bounds": scene.bounds.tolist(),
+        "count": len(scene),
+        "frames": 0,
+        "moves": False,
+    }
 
 
 def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:
@@ -170,7 +220,11 @@ def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> di
     lists.quantised("means", _numpy(gaussians.means), 16)
     lists.quantised("quats", _numpy(unit), 8)
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
-    lists.quantised("logit_opacities", _numpy(gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)[:, None]), 8)
+    lists.quantised(
+        "logit_opacities",
+        _numpy(gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)[:, None]),
+        8,
+    )
     lists.quantised("base", _numpy(gaussians.sh[:, 0]), 8)
     degree = gaussians.sh_degree if with_rest else 0
     if degree:
@@ -178,14 +232,18 @@ def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> di
     return {"degree": degree}
 
 
-def _add_motion(scene: DynamicScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
+def _add_motion(
+    scene: DynamicScene, order: Tensor, lists: Lists, tolerance: float
+) -> dict[str, Any]:
     """Add the motion of a scene whose Gaussians are stored in ``order``, moving ones first."""
     if scene.field is None:
         return {}
     place = torch.full((len(scene),), -1, device="cpu")
     place[scene.moving] = torch.arange(len(scene.moving), device="cpu")
     mine = place[order[: len(scene.moving)]]
-    curves = curves_of(scene.field, scene.gaussians.means[scene.moving], len(scene.times), tolerance)
+    curves = curves_of(
+        scene.field, scene.gaussians.means[scene.moving], len(scene.times), tolerance
+    )
     told: dict[str, Any] = {"curves": _add_curves(curves, mine, lists)}
     if scene.filter_std is not None:
         lists.quantised("filter_std", _numpy(scene.filter_std[order][:, None]), 8)
@@ -198,10 +256,18 @@ def _add_motion(scene: DynamicScene, order: Tensor, lists: Lists, tolerance: flo
 
 
 def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
-    """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order`` (M,)."""
+    """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order``
+    (M,)."""
     count, points, _ = curves.heads["means"].shape
-    told: dict[str, Any] = {"count": count, "points": points, "moving": len(order), "error": curves.error}
-    pieces, chunk, chunks = points - SPAN + 1, _pieces_of_chunk(curves), lists.chunks
+    told: dict[str, Any] = {
+        "count": count,
+        "points": points,
+        "moving": len(order),
+        "error": curves.error,
+    }
+    pieces = points - SPAN + 1
+    chunk = _pieces_of_chunk(curves)
+    chunks = lists.chunks
     if chunks is None or chunk >= pieces:
         _add_splines(curves, slice(None), order, lists)
     else:
@@ -238,14 +304,17 @@ def _bits(curves: Curves, name: str) -> Literal[8, 16]:
 def _pieces_of_chunk(curves: Curves) -> int:
     """Return the pieces of a chunk of time of some ``CHUNK_BYTES``."""
     wide = 32 if curves.is_steep else 0
-    sizes = (x.shape[0] * x.shape[2] * (wide or _bits(curves, name)) for name, x in curves.heads.items())
+    sizes = (
+        x.shape[0] * x.shape[2] * (wide or _bits(curves, name)) for name, x in curves.heads.items()
+    )
     return max(CHUNK_BYTES * 8 // max(sum(sizes), 1), 1)
 
 
 def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
     from scipy.spatial.transform import Rotation
 
-    clip, skeleton = scene.moves_as, scene.learned_skeleton
+    clip = scene.moves_as
+    skeleton = scene.learned_skeleton
     top = scene.weights[order].topk(min(BONES, scene.weights.shape[1]), dim=1)
     more = BONES - top.values.shape[1]
     boned, fractions = (torch.nn.functional.pad(x, (0, more)) for x in (top.indices, top.values))
@@ -283,7 +352,12 @@ def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
         bias[: len(layer.bias)] = _numpy(layer.bias.detach())
         parts += [weight.ravel(), bias]
     lists.exact("network", np.concatenate(parts).reshape(-1, 4))
-    told = {"layers": len(network.layers), "width": width, "first": first, "box": network.box.flatten().tolist()}
+    told = {
+        "layers": len(network.layers),
+        "width": width,
+        "first": first,
+        "box": network.box.flatten().tolist(),
+    }
     return told | {"time": network.sees_time, "normals": network.sees_normals}
 
 

@@ -33,7 +33,8 @@ from dyngs.static.scene import StaticScene
 from dyngs.triangles.scene import TriangleScene
 
 PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # in a folder for a web server
-TOLERANCE = 0.25  # pixels of the first view that a place at its target may be off where motion is fitted
+# pixels of the first view that a place at its target may be off where motion is fitted
+TOLERANCE = 0.25
 
 
 MOST_VIEWS = 24  # cameras of the capture that a page offers, evenly chosen
@@ -52,12 +53,18 @@ class WrittenPage:
 
 
 def write_page(
-    opened: Opened, path: Path, *, title: str | None = None, time: float = 0.0, views: Sequence[Cameras] = ()
+    opened: Opened,
+    path: Path,
+    *,
+    title: str | None = None,
+    time: float = 0.0,
+    views: Sequence[Cameras] = (),
 ) -> WrittenPage:
     """Write the page of a scene, atomically: where its viewer begins, and what moves.
 
-    ``title``: shown in a corner and in the title bar; None: the name of the run, or of the file. ``views``: cameras to
-    begin with and to go through, each a batch of one; without any, those of the capture, or around the scene.
+    ``title``: shown in a corner and in the title bar; None: the name of the run, or of the file.
+    ``views``: cameras to begin with and to go through, each a batch of one; without any, those of
+    the capture, or around the scene.
     """
     inputs_of(opened).require_output(path)
     lists = Lists()
@@ -76,17 +83,19 @@ def write_folder(
     time: float = 0.0,
     views: Sequence[Cameras] = (),
 ) -> WrittenPage:
-    """Write a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and what is fetched when it is seen.
+    """Write a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and what is
+    fetched when it is seen.
 
-    That is a still scene in blocks of its levels of detail, and a long motion in chunks of time. ``most``: Gaussians of
-    a still scene that are drawn at most. Others as of ``write_page``. Raises DyngsError: ``most`` of another scene, or
-    a folder that exists already.
+    That is a still scene in blocks of its levels of detail, and a long motion in chunks of time.
+    ``most``: Gaussians of a still scene that are drawn at most. Others as of ``write_page``. Raises
+    DyngsError: ``most`` of another scene, or a folder that exists already.
     """
     require_new_folder(folder)
     lists = Lists(chunked=True)
     if most is not None or isinstance(opened.renderable, StaticScene):
         levelled = LevelScene.of(opened.renderable, most)
-        levels, colour = levelled.levels, levelled.scene.colour
+        levels = levelled.levels
+        colour = levelled.scene.colour
         header = add_levels(levels, colour, lists) | _drawn(levelled.options)
         header["levels"]["most"] = most
         header |= _shown(opened, time, *_beginning(opened, views))
@@ -114,7 +123,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     notes: list[str] = []
     if opened.captured is not None and opened.missing is not None:
         up = "" if opened.person is not None else f", {opened.stated_up or 'z'} up"
-        notes.append(f"without the capture ({opened.missing}) the page begins with a view from outside{up}")
+        notes.append(
+            f"without the capture ({opened.missing}) the page begins with a view from outside{up}"
+        )
     if any(opened.world_offset):
         offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
         notes.append(f"the scene is far from the origin: {offset} is subtracted from its positions")
@@ -147,7 +158,9 @@ def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Camer
     return (views, _middle(opened)) if views else _views(opened)
 
 
-def _shown(opened: Opened, time: float, views: Sequence[Cameras], target: list[float]) -> dict[str, Any]:
+def _shown(
+    opened: Opened, time: float, views: Sequence[Cameras], target: list[float]
+) -> dict[str, Any]:
     upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
     return {
         "near": opened.renderable.options.near,
@@ -169,7 +182,8 @@ def _drawn(options: RenderOptions) -> dict[str, Any]:
 
 
 def _views(opened: Opened) -> tuple[list[Cameras], list[float]]:
-    """Return the cameras to begin with and to go through, each a batch of one, and the point to look at."""
+    """Return the cameras to begin with and to go through, each a batch of one, and the point to
+    look at."""
     cameras = opened.cameras
     if cameras is not None:
         capture = opened.capture
@@ -188,7 +202,8 @@ def _middle(opened: Opened) -> list[float]:
 
 
 def _some(capture: Capture) -> list[View]:
-    views, seen = [], set()
+    views = []
+    seen = set()
     for view in capture.splits["train"]:
         pose = view.cam_from_world.tobytes()
         if pose not in seen:
@@ -209,12 +224,18 @@ def _view(camera: Cameras) -> dict[str, Any]:
 
 
 def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
-    """Return the text of the page. All that stems from a run is escaped; scripts are allowed by their hash alone."""
+    """Return the text of the page. All that stems from a run is escaped; scripts are allowed by
+    their hash alone."""
     red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in header["background"])
-    style, script = text_of("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})"), element_script()
+    style = text_of("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
+    script = element_script()
     page = text_of("page.html")
     fixed = {"style": style, "script": script}
-    fixed |= {"style_hash": source_hash(style), "script_hash": source_hash(script), "title": html.escape(title)}
+    fixed |= {
+        "style_hash": source_hash(style),
+        "script_hash": source_hash(script),
+        "title": html.escape(title),
+    }
     fixed |= {"header": script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
     kind = "triangle" if "texture" in header else "Gaussian"

@@ -1,4 +1,5 @@
-"""A page of a template: its places filled in, scripts and styles named by hash, values that cannot end a script."""
+"""A page of a template: its places filled in, scripts and styles named by hash, values that cannot
+end a script."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from typing import Any
 
 
 def filled(page: str, pieces: Mapping[str, str]) -> str:
-    """Return ``page`` with each ``{{name}}`` replaced by the piece of that name; pieces are not looked into."""
+    """Return ``page`` with each ``{{name}}`` replaced by the piece of that name; pieces are not
+    looked into."""
     first, *rest = page.split("{{")
     text = [first]
     for part in rest:

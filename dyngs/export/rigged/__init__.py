@@ -1,1 +1,2 @@
-"""People with their skeleton in files of other programs: skinned, textured meshes, and Gaussians with joints."""
+"""People with their skeleton in files of other programs: skinned, textured meshes, and Gaussians
+with joints."""

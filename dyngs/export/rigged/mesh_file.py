@@ -1,4 +1,5 @@
-"""A trained person as ``.glb``: the template's mesh, skinned and textured, for programs that know no Gaussians."""
+"""A trained person as ``.glb``: the template's mesh, skinned and textured, for programs that know
+no Gaussians."""
 
 from __future__ import annotations
 
@@ -59,15 +60,18 @@ class MeshFile:
 
 
 def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> MeshFile:
-    """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up, facing +z.
+    """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up,
+    facing +z.
 
-    The size is that of the capture; the soles stand at y = 0. Colours have the light of the capture in them, hence a
-    material without light. ``played`` becomes an animation. Raises DyngsError: not the run of a person, or its template
-    is missing or without texture coordinates.
+    The size is that of the capture; the soles stand at y = 0. Colours have the light of the capture
+    in them, hence a material without light. ``played`` becomes an animation. Raises DyngsError: not
+    the run of a person, or its template is missing or without texture coordinates.
     """
     scene, body = person_and_template(run, "--format mesh")
     if path.suffix.lower() != SUFFIX:
-        raise DyngsError(f"{path}: a mesh is written as {SUFFIX}; give --out {path.with_suffix(SUFFIX).name}")
+        raise DyngsError(
+            f"{path}: a mesh is written as {SUFFIX}; give --out {path.with_suffix(SUFFIX).name}"
+        )
     inputs_of(run).require_output(path)
     with torch.no_grad():
         vertices = rest_vertices(scene, body)
@@ -77,11 +81,16 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
         filled = fill_unseen(bake_texels(scene, texels, normals), texels)
         image = texture_image(filled.rgb, texels)
         samples = atlas_texels(body, min(size // 2, _MOST_SAMPLES), vertices)
-        surface = fitted_surface(scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals))
-        mesh, rig = body_mesh(scene, body, surface.vertices), rig_of(scene, surface.vertices)
+        surface = fitted_surface(
+            scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals)
+        )
+        mesh = body_mesh(scene, body, surface.vertices)
+        rig = rig_of(scene, surface.vertices)
         animation = None
         if played is not None:
-            animation = animation_of(scene, rig, surface.vertices, body.weights, played.fps, played.name)
+            animation = animation_of(
+                scene, rig, surface.vertices, body.weights, played.fps, played.name
+            )
     document = mesh_document(mesh, rig, image, animation)
     with atomic_file(path) as temporary:
         document.write(temporary)
@@ -91,7 +100,9 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
         f"has colours from around it, {100 * filled.mirrored / max(len(texels), 1):.1f} % from its mirror side"
     ]
     if surface.margin is None:
-        notes.append(f"the surface is that of the template, whose silhouettes agree best ({surface.plain:.3f})")
+        notes.append(
+            f"the surface is that of the template, whose silhouettes agree best ({surface.plain:.3f})"
+        )
     else:
         notes.append(
             f"the surface is moved to the Gaussians: silhouettes agree at {surface.agreement:.3f} (intersection over "
@@ -108,30 +119,39 @@ def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTe
 
     Raises DyngsError: the run is not that of a person, or the template cannot be read.
     """
-    scene, model = avatar_of(run.scene), run.config.model
+    scene = avatar_of(run.scene)
+    model = run.config.model
     if scene is None or not isinstance(model, HumanModel):
-        raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}")
+        raise DyngsError(
+            f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
+        )
     return scene, load_template(model)
 
 
 def texture_size(scene: HumanScene) -> int:
-    """Return the texels along a side of the texture, by the distance of most anchors in the atlas."""
+    """Return the texels along a side of the texture, by the distance of most anchors in the
+    atlas."""
     columns, counts = scene.anchors.uv[:, 0].unique(return_counts=True)
     columns = columns[2 * counts >= counts.double().quantile(0.75)]  # without those of finer texels
     finest = float(columns.diff().min()) if len(columns) > 1 else 1.0
     return min(_FINER * max(round(1 / finest), 1), _LARGEST)
 
 
-def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointAnimation | None) -> GlbDocument:
+def mesh_document(
+    mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointAnimation | None
+) -> GlbDocument:
     """Return a mesh with its skeleton, texture and animation as a glTF document."""
     from PIL import Image
 
-    document, nodes = GlbDocument(), list[dict[str, Any]]()
+    document = GlbDocument()
+    nodes = list[dict[str, Any]]()
     armature, first = add_skeleton(document, rig, nodes)
     nodes.append({"name": "person", "mesh": 0, "skin": 0})
     uv = torch.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], dim=1)
     attributes = {
-        "POSITION": document.add_numbers(rig.placed(mesh.vertices).float().numpy(), VERTICES, limits=True),
+        "POSITION": document.add_numbers(
+            rig.placed(mesh.vertices).float().numpy(), VERTICES, limits=True
+        ),
         "NORMAL": document.add_numbers(mesh.normals.float().numpy(), VERTICES),
         "TEXCOORD_0": document.add_numbers(uv.float().numpy(), VERTICES),
     } | add_weights(document, mesh.weights)
@@ -145,8 +165,19 @@ def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointA
         "scene": 0,
         "scenes": [{"nodes": [armature, len(nodes) - 1]}],
         "nodes": nodes,
-        "meshes": [{"name": "person", "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "materials": [{"name": "person", "pbrMetallicRoughness": texture, "extensions": {"KHR_materials_unlit": {}}}],
+        "meshes": [
+            {
+                "name": "person",
+                "primitives": [{"attributes": attributes, "indices": indices, "material": 0}],
+            }
+        ],
+        "materials": [
+            {
+                "name": "person",
+                "pbrMetallicRoughness": texture,
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"name": "albedo", "bufferView": view, "mimeType": "image/png"}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],

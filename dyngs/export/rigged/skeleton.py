@@ -1,6 +1,8 @@
-"""The body of a trained person as a mesh, and its skeleton in glTF: nodes, a skin, a motion as an animation.
+"""The body of a trained person as a mesh, and its skeleton in glTF: nodes, a skin, a motion as an
+animation.
 
-Local letters: M vertices and T triangles of the template, V vertices of the mesh, J joints, N Gaussians, F frames.
+Local letters: M vertices and T triangles of the template, V vertices of the mesh, J joints, N
+Gaussians, F frames.
 """
 
 from __future__ import annotations
@@ -19,7 +21,12 @@ from dyngs.human.avatar.anchors import Anchors, heaviest_joints
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.placement import upright
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.pose.skinning import (
+    apply_transforms,
+    axis_angle_to_matrix,
+    blend_transforms,
+    joint_transforms,
+)
 from dyngs.human.template.body import BodyTemplate, apply_shape
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.ops.quaternions import shorter_ways
@@ -35,13 +42,16 @@ class BodyMesh:
     normals: Tensor  # (V, 3) outward unit normals
     uv: Tensor  # (V, 2) texture coordinates, row of the image = (1 - v) * H
     faces: Tensor  # (T, 3) int64, counter-clockwise from outside
-    source: Tensor  # (V,) int64 vertex of the template that each is a copy of; more than one where the atlas has a seam
+    # (V,) int64 vertex of the template that each is a copy of; more than one where the atlas has a
+    # seam
+    source: Tensor
     weights: Tensor  # (V, J) skinning weights, rows sum to 1
     skeleton: Skeleton  # of the person
 
 
 def body_mesh(scene: HumanScene, body: BodyTemplate, vertices: Tensor) -> BodyMesh:
-    """Return the mesh of a person: the template's triangles over ``vertices`` (M, 3) at rest, the person's joints.
+    """Return the mesh of a person: the template's triangles over ``vertices`` (M, 3) at rest, the
+    person's joints.
 
     Raises DyngsError: the template has no texture coordinates.
     """
@@ -66,12 +76,16 @@ def body_mesh(scene: HumanScene, body: BodyTemplate, vertices: Tensor) -> BodyMe
 def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
     """Return the template's vertices (M, 3) at rest in the shape of a trained person.
 
-    Runs hold no shape parameters, but joints and points of the surface, which are linear in these: they follow by least
-    squares, exactly. Raises DyngsError: the template is not the one that the person was trained on.
+    Runs hold no shape parameters, but joints and points of the surface, which are linear in these:
+    they follow by least squares, exactly. Raises DyngsError: the template is not the one that the
+    person was trained on.
     """
-    anchors, joints = scene.anchors, scene.skeleton.joints
+    anchors = scene.anchors
+    joints = scene.skeleton.joints
     if joints.shape != body.joints.shape or int(anchors.face.max()) >= len(body.faces):
-        raise DyngsError(f"the template '{body.name}' is not the one that this person was trained on")
+        raise DyngsError(
+            f"the template '{body.name}' is not the one that this person was trained on"
+        )
     if body.shape_dirs is None or body.joint_shape_dirs is None:
         return body.vertices
     rows = torch.nonzero(anchors.height == 0)[:, 0]  # on the skin
@@ -88,7 +102,8 @@ def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Return outward unit normals (M, 3) at vertices, of the triangles around each, weighted by area."""
+    """Return outward unit normals (M, 3) at vertices, of the triangles around each, weighted by
+    area."""
     a, b, c = vertices[faces].unbind(1)
     flat = torch.linalg.cross(b - a, c - a, dim=-1)
     total = torch.zeros_like(vertices)
@@ -156,9 +171,11 @@ def animation_of(
 ) -> JointAnimation:
     """Return the motion that a person plays: y up, on the floor y = 0, around the origin.
 
-    ``vertices``: (V, 3) at rest, m, of which the lowest one stands on the floor. ``weights``: (V, J).
+    ``vertices``: (V, 3) at rest, m, of which the lowest one stands on the floor. ``weights``: (V,
+    J).
     """
-    joints, parents = rig.skeleton.joints, rig.skeleton.parents
+    joints = rig.skeleton.joints
+    parents = rig.skeleton.parents
     clip = upright(scene.moves_as, scene.clip, joints)
     frames = torch.linspace(0, len(clip) - 1, min(len(clip), _FLOOR_FRAMES), device="cpu").long()
     lowest = []
@@ -172,12 +189,16 @@ def animation_of(
     poses = clip.poses.double().numpy()
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
     seconds = np.arange(len(root)) / fps
-    return JointAnimation(name, seconds, shorter_ways(quats), root, clip.scale.double().numpy() / rig.scale)
+    return JointAnimation(
+        name, seconds, shorter_ways(quats), root, clip.scale.double().numpy() / rig.scale
+    )
 
 
 def add_skeleton(document: GlbDocument, rig: Rig, nodes: list[dict[str, Any]]) -> tuple[int, int]:
-    """Add the nodes of the joints below one called Armature, and a skin; return the nodes Armature and first joint."""
-    joints, parents = rig.joints.double(), rig.skeleton.parents
+    """Add the nodes of the joints below one called Armature, and a skin; return the nodes Armature
+    and first joint."""
+    joints = rig.joints.double()
+    parents = rig.skeleton.parents
     first = len(nodes)
     for i, (name, parent) in enumerate(zip(rig.names, parents, strict=True)):
         place = joints[i] - joints[parent] if parent >= 0 else joints[i]
@@ -189,13 +210,18 @@ def add_skeleton(document: GlbDocument, rig: Rig, nodes: list[dict[str, Any]]) -
     bind = np.tile(np.eye(4, dtype=np.float32), (len(joints), 1, 1))
     bind[:, 3, :3] = -joints.numpy()  # columns first
     matrices = document.add_numbers(bind.reshape(-1, 16))
-    skin = {"joints": list(range(first, first + len(joints))), "inverseBindMatrices": matrices, "skeleton": roots[0]}
+    skin = {
+        "joints": list(range(first, first + len(joints))),
+        "inverseBindMatrices": matrices,
+        "skeleton": roots[0],
+    }
     document.json["skins"] = [skin]
     return len(nodes) - 1, first
 
 
 def add_animation(document: GlbDocument, animation: JointAnimation, first: int) -> None:
-    """Add an animation of the joints, whose nodes begin at ``first``; joints that never turn have no channel."""
+    """Add an animation of the joints, whose nodes begin at ``first``; joints that never turn have
+    no channel."""
     channels = [(first, "translation", animation.root)]
     if np.abs(animation.root_scale - 1).max() > _STILL:
         channels.append((first, "scale", np.repeat(animation.root_scale[:, None], 3, axis=1)))
@@ -206,7 +232,8 @@ def add_animation(document: GlbDocument, animation: JointAnimation, first: int) 
 
 
 def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
-    """Add the joints and weights (V, J) of vertices; return the accessors by attribute, the heaviest four first."""
+    """Add the joints and weights (V, J) of vertices; return the accessors by attribute, the
+    heaviest four first."""
     joints, fractions = heaviest_joints(weights)
     filled = -(-fractions.shape[1] // 4) * 4 - fractions.shape[1]
     joints, fractions = (torch.nn.functional.pad(x, (0, filled)) for x in (joints, fractions))

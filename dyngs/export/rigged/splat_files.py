@@ -1,4 +1,5 @@
-"""A person's Gaussians at rest with joints and weights: ``.ply`` with further columns, ``.glb`` with a skin.
+"""A person's Gaussians at rest with joints and weights: ``.ply`` with further columns, ``.glb``
+with a skin.
 
 Local letters: N Gaussians, J joints, K joints that one Gaussian follows.
 """
@@ -41,7 +42,8 @@ SUFFIXES = (".ply", ".glb")
 
 @dataclass(frozen=True)
 class RiggedSplats:
-    """Files of Gaussians with joints that were written: where, and a line about each thing that they cannot hold."""
+    """Files of Gaussians with joints that were written: where, and a line about each thing that
+    they cannot hold."""
 
     path: Path
     notes: tuple[str, ...]
@@ -49,31 +51,41 @@ class RiggedSplats:
 
 @torch.no_grad()
 def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None) -> RiggedSplats:
-    """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing +z, soles at y = 0.
+    """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing
+    +z, soles at y = 0.
 
-    ``.ply``: columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7`` after those of 3DGS,
-    and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``: KHR_gaussian_splatting with a skin, and
-    ``played`` as an animation. Raises DyngsError: not the run of a person, or its template is missing.
+    ``.ply``: columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7``
+    after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
+    KHR_gaussian_splatting with a skin, and ``played`` as an animation. Raises DyngsError: not the
+    run of a person, or its template is missing.
     """
     scene, body = person_and_template(run, "--joints")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise DyngsError(f"{path}: joints are written as {' or '.join(SUFFIXES)}; give --out with one of these")
+        raise DyngsError(
+            f"{path}: joints are written as {' or '.join(SUFFIXES)}; give --out with one of these"
+        )
     if suffix == ".ply" and played is not None:
-        raise DyngsError("--motion does not go with --joints in a .ply, which shows the rest pose; write a .glb")
+        raise DyngsError(
+            "--motion does not go with --joints in a .ply, which shows the rest pose; write a .glb"
+        )
     inputs_of(run).require_output(path)
     vertices = rest_vertices(scene, body)
     rig = rig_of(scene, vertices)
-    gaussians, notes = scene.gaussians, ()
+    gaussians = scene.gaussians
+    notes = ()
     if scene.colour is not None:
         colours = frontal_colours(scene, anchor_normals(scene.anchors, body, vertices))
         gaussians = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None])
-        notes = ("the colours of the run are a network; the file has those seen from straight above the skin",)
+        notes = (
+            "the colours of the run are a network; the file has those seen from straight above the skin",
+        )
     if scene.shapes is not None:
         notes = (*notes, "offsets that depend on the pose are left out: skinning weights hold none")
     notes = (*notes, *scene.left_out)
     gaussians = gaussians.replace(
-        means=rig.placed(gaussians.means), log_scales=gaussians.log_scales + float(np.log(rig.scale))
+        means=rig.placed(gaussians.means),
+        log_scales=gaussians.log_scales + float(np.log(rig.scale)),
     )
     require_writable(path, gaussians)
     if suffix == ".ply":
@@ -89,14 +101,18 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
     return RiggedSplats(path, (*notes, unsure))
 
 
-def _write_columns(path: Path, run: LoadedRun, scene: HumanScene, rig: Rig, gaussians: Gaussians) -> None:
+def _write_columns(
+    path: Path, run: LoadedRun, scene: HumanScene, rig: Rig, gaussians: Gaussians
+) -> None:
     joints, weights = heaviest_joints(scene.weights)
     columns = {f"joint_{k}": joints[:, k].numpy() for k in range(joints.shape[1])}
     columns |= {f"weight_{k}": weights[:, k].numpy() for k in range(weights.shape[1])}
     places = [" ".join(f"{x:.6f}" for x in place) for place in rig.joints.tolist()]
     lines = [
         f"joint {i} {name} {parent} {place}"
-        for i, (name, parent, place) in enumerate(zip(rig.names, rig.skeleton.parents, places, strict=True))
+        for i, (name, parent, place) in enumerate(
+            zip(rig.names, rig.skeleton.parents, places, strict=True)
+        )
     ]
     model = run.config.model
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, comments=tuple(lines), up="y")

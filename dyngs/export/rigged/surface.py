@@ -24,12 +24,14 @@ from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.mesh import rasterize
 
 MARGINS = (0.0, 0.004, 0.008, 0.012, 0.016)
-"""Distances, m, from the uppermost Gaussians to the surface that are tried: Gaussians reach beyond their centres."""
+"""Distances, m, from the uppermost Gaussians to the surface that are tried: Gaussians reach beyond
+their centres."""
 _BOUNDS = (-0.02, 0.06)  # least and greatest displacement, m
 _SMOOTH = 0.01  # standard deviation, m, of the weights by which displacements are averaged
 _NEAR = 64  # samples that displace a vertex
 _FOLDS = (0.01, 0.02, 0.03)
-"""Distances, m, above a sample at which the body must not be for the sample to count: mouth, eye sockets."""
+"""Distances, m, above a sample at which the body must not be for the sample to count: mouth, eye
+sockets."""
 _SIZE = 256
 _ANGLES = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 """Silhouettes that are compared: pixels along a side, and directions around the body."""
@@ -40,7 +42,8 @@ class FittedSurface:
     """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians."""
 
     vertices: Tensor  # (M, 3)
-    margin: float | None  # the distance of ``MARGINS`` that was taken; None: the template as it is agrees better
+    # the distance of ``MARGINS`` that was taken; None: the template as it is agrees better
+    margin: float | None
     agreement: float  # intersection over union of the silhouettes
     plain: float  # the same for the template as it is
 
@@ -48,10 +51,11 @@ class FittedSurface:
 def fitted_surface(
     gaussians: Gaussians, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels
 ) -> FittedSurface:
-    """Return the surface whose silhouettes agree best with the Gaussians', of the template's and some moved ones.
+    """Return the surface whose silhouettes agree best with the Gaussians', of the template's and
+    some moved ones.
 
-    A vertex is displaced by the mean displacement of the samples around it in space, along their normals, up to what is
-    seen there. ``vertices`` (M, 3) are at rest in the person's shape.
+    A vertex is displaced by the mean displacement of the samples around it in space, along their
+    normals, up to what is seen there. ``vertices`` (M, 3) are at rest in the person's shape.
     """
     cameras = _cameras(vertices)
     shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5
@@ -62,25 +66,35 @@ def fitted_surface(
         moved = pull.moved(margin)
         agreement = _agreement(moved, body, cameras, shown)
         if agreement > best:
-            best, found = agreement, FittedSurface(moved, margin, agreement, plain)
+            best = agreement
+            found = FittedSurface(moved, margin, agreement, plain)
     return found
 
 
 class _Pull:
     """Displacements of vertices by samples of the surface."""
 
-    def __init__(self, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels) -> None:
+    def __init__(
+        self, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels
+    ) -> None:
         self._vertices = vertices
-        counts = _on_largest_part(body)[samples.faces] & ~_folded(body, vertices, samples) & (baked.alpha >= SEEN)
+        counts = (
+            _on_largest_part(body)[samples.faces]
+            & ~_folded(body, vertices, samples)
+            & (baked.alpha >= SEEN)
+        )
         rows = torch.nonzero(counts)[:, 0]
         self.is_known = len(rows) > 0
         if self.is_known:
             count = min(_NEAR, len(rows))
             distance, at = KDTree(samples.points[rows].numpy()).query(vertices.numpy(), k=count)
             self._rows = rows[torch.from_numpy(at.reshape(len(vertices), count))]
-            near = torch.from_numpy(np.exp(-0.5 * (distance.reshape(len(vertices), count) / _SMOOTH) ** 2)).float()
+            near = torch.from_numpy(
+                np.exp(-0.5 * (distance.reshape(len(vertices), count) / _SMOOTH) ** 2)
+            ).float()
             self._weights = near * (samples.size.square() * baked.alpha)[self._rows]
-            self._heights, self._normals = baked.top, samples.normals
+            self._heights = baked.top
+            self._normals = samples.normals
 
     def moved(self, margin: float) -> Tensor:
         """Return the vertices (M, 3) displaced by what is seen plus ``margin``."""
@@ -92,7 +106,8 @@ class _Pull:
 
 
 def _on_largest_part(body: BodyTemplate) -> Tensor:
-    """Return whether each of T triangles belongs to the largest connected part: eyes and tongue do not."""
+    """Return whether each of T triangles belongs to the largest connected part: eyes and tongue do
+    not."""
     count = len(body.vertices)
     ends = body.faces.repeat(1, 2)[:, [0, 1, 1, 2]].reshape(-1, 2).numpy()
     edges = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -102,22 +117,30 @@ def _on_largest_part(body: BodyTemplate) -> Tensor:
 
 def _folded(body: BodyTemplate, vertices: Tensor, samples: Texels) -> Tensor:
     """Return whether each of P samples faces the body itself at a small distance."""
-    flat = torch.linalg.cross(*(vertices[body.faces][:, k] - vertices[body.faces][:, 0] for k in (1, 2)), dim=-1)
+    flat = torch.linalg.cross(
+        *(vertices[body.faces][:, k] - vertices[body.faces][:, 0] for k in (1, 2)), dim=-1
+    )
     normals = torch.nn.functional.normalize(flat, dim=-1)
     places = KDTree(vertices[body.faces].mean(1).numpy())
     found = torch.zeros(len(samples), dtype=torch.bool, device="cpu")
     for height in _FOLDS:
-        distance, at = places.query((samples.points + height * samples.normals).numpy(), k=min(4, places.n))
+        distance, at = places.query(
+            (samples.points + height * samples.normals).numpy(), k=min(4, places.n)
+        )
         near = torch.from_numpy(at.reshape(len(samples), -1))
         opposite = (normals[near] * samples.normals[:, None]).sum(-1) < -0.2
-        found |= (torch.from_numpy(distance.reshape(len(samples), -1) < 0.7 * height) & opposite).any(1)
+        found |= (
+            torch.from_numpy(distance.reshape(len(samples), -1) < 0.7 * height) & opposite
+        ).any(1)
     return found
 
 
 def _cameras(vertices: Tensor) -> Cameras:
     """Return cameras around the body, upright, at eye level of its middle."""
-    lowest, highest = vertices.amin(0), vertices.amax(0)
-    middle, reach = (lowest + highest) / 2, float((highest - lowest).norm()) / 2
+    lowest = vertices.amin(0)
+    highest = vertices.amax(0)
+    middle = (lowest + highest) / 2
+    reach = float((highest - lowest).norm()) / 2
     distance = 6 * reach
     poses = torch.eye(4, device="cpu").repeat(len(_ANGLES), 1, 1)
     for pose, angle in zip(poses, _ANGLES, strict=True):
@@ -126,18 +149,27 @@ def _cameras(vertices: Tensor) -> Cameras:
         pose[:3, :3] = torch.stack([right, torch.tensor([0.0, -1.0, 0.0], device="cpu"), -backward])
         pose[:3, 3] = -pose[:3, :3] @ (middle + distance * backward)
     focal = 0.47 * _SIZE * distance / reach
-    intrinsics = torch.tensor([[focal, 0, _SIZE / 2], [0, focal, _SIZE / 2], [0, 0, 1.0]], device="cpu")
+    intrinsics = torch.tensor(
+        [[focal, 0, _SIZE / 2], [0, focal, _SIZE / 2], [0, 0, 1.0]], device="cpu"
+    )
     return Cameras(poses, intrinsics.repeat(len(_ANGLES), 1, 1), _SIZE, _SIZE)
 
 
 def _agreement(vertices: Tensor, body: BodyTemplate, cameras: Cameras, shown: np.ndarray) -> float:
-    """Return intersection over union of silhouettes of the mesh with those ``shown`` (V, H, W) from all cameras."""
+    """Return intersection over union of silhouettes of the mesh with those ``shown`` (V, H, W) from
+    all cameras."""
     common = either = 0
-    for pose, intrinsics, mask in zip(cameras.cam_from_world, cameras.intrinsics, shown, strict=True):
+    for pose, intrinsics, mask in zip(
+        cameras.cam_from_world, cameras.intrinsics, shown, strict=True
+    ):
         pixels = (vertices @ pose[:3, :3].T + pose[:3, 3]) @ intrinsics.T
-        flat = torch.cat([pixels[:, :2] / pixels[:, 2:] - 0.5, torch.ones_like(pixels[:, :1])], dim=1)
+        flat = torch.cat(
+            [pixels[:, :2] / pixels[:, 2:] - 0.5, torch.ones_like(pixels[:, :1])], dim=1
+        )
         own = np.zeros(mask.size, bool)
-        own[rasterize(flat[body.faces].double().numpy(), cameras.width, cameras.height).index] = True
+        own[rasterize(flat[body.faces].double().numpy(), cameras.width, cameras.height).index] = (
+            True
+        )
         common += int((own & mask.ravel()).sum())
         either += int((own | mask.ravel()).sum())
     return common / max(either, 1)

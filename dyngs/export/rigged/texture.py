@@ -1,4 +1,5 @@
-"""The texture of a person: what the Gaussians at rest look like from straight above each texel of the atlas.
+"""The texture of a person: what the Gaussians at rest look like from straight above each texel of
+the atlas.
 
 Local letters: N Gaussians, P texels, K Gaussians near a texel.
 """
@@ -27,7 +28,8 @@ _HEIGHTS = (-0.015, 0.005, 0.025, 0.05)
 """Heights, m, where they are looked for: below the skin, on it, in clothes and hair."""
 _REACH = (-0.04, 0.07)  # heights, m, between which Gaussians belong to a texel
 _FACING = 0.3
-"""Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not colour the trunk."""
+"""Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not
+colour the trunk."""
 _TOP = 0.1  # fraction of what is seen from which a texel counts as covered
 _CHUNK = 8192
 SEEN = 0.1  # opacity from which a texel has a colour of its own
@@ -42,13 +44,17 @@ class BakedTexels:
 
     rgb: Tensor  # (P, 3) in [0, 1], display-referred as the images were
     alpha: Tensor  # (P,) opacity
-    top: Tensor  # (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is reached
+    # (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is
+    # reached
+    top: Tensor
 
 
 def bake_texels(scene: HumanScene, texels: Texels, normals: Tensor) -> BakedTexels:
-    """Return what the Gaussians at rest show along the normal of each texel, blended from the outside in.
+    """Return what the Gaussians at rest show along the normal of each texel, blended from the
+    outside in.
 
-    ``texels``: P of the template in the person's shape. ``normals``: (N, 3) of the surface below each Gaussian at rest.
+    ``texels``: P of the template in the person's shape. ``normals``: (N, 3) of the surface below
+    each Gaussian at rest.
     """
     colours = frontal_colours(scene, normals)
     gaussians = scene.gaussians
@@ -56,7 +62,8 @@ def bake_texels(scene: HumanScene, texels: Texels, normals: Tensor) -> BakedTexe
     places = KDTree(gaussians.means.numpy())
     parts = []
     for rows in torch.arange(len(texels), device="cpu").split(_CHUNK):
-        points, along = texels.points[rows], texels.normals[rows]
+        points = texels.points[rows]
+        along = texels.normals[rows]
         near = _neighbours(places, points, along)
         offset = points[:, None] - gaussians.means[near]
         turn = to_own[near]
@@ -74,10 +81,14 @@ def bake_texels(scene: HumanScene, texels: Texels, normals: Tensor) -> BakedTexe
 
 
 def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
-    """Return the colours (N, 3) of Gaussians seen against ``normals`` (N, 3) at rest; a network's, in the rest pose."""
-    gaussians, seen_along = scene.gaussians, -normals
+    """Return the colours (N, 3) of Gaussians seen against ``normals`` (N, 3) at rest; a network's,
+    in the rest pose."""
+    gaussians = scene.gaussians
+    seen_along = -normals
     if scene.colour is not None:
-        upright = scene.playing(rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents))
+        upright = scene.playing(
+            rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
+        )
         moment = upright.time_step(None)
         shader = upright.shader(moment)
         if shader is not None:
@@ -92,16 +103,22 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
 
 
 def _neighbours(places: KDTree, points: Tensor, along: Tensor) -> Tensor:
-    """Return the Gaussians (P, K) near and above ``points`` (P, 3), ascending; some more than once."""
+    """Return the Gaussians (P, K) near and above ``points`` (P, 3), ascending; some more than
+    once."""
     count = min(_NEAR, places.n)
-    found = [places.query((points + h * along).numpy(), k=count)[1].reshape(len(points), count) for h in _HEIGHTS]
+    found = [
+        places.query((points + h * along).numpy(), k=count)[1].reshape(len(points), count)
+        for h in _HEIGHTS
+    ]
     return torch.from_numpy(np.sort(np.concatenate(found, axis=1), axis=1))
 
 
 def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return colours (P, 3), opacity (P,) and top (P,) of (P, K) Gaussians blended from the highest down."""
+    """Return colours (P, 3), opacity (P,) and top (P,) of (P, K) Gaussians blended from the highest
+    down."""
     order = height.argsort(dim=1, descending=True, stable=True)
-    alpha, height = alpha.gather(1, order), height.gather(1, order)
+    alpha = alpha.gather(1, order)
+    height = height.gather(1, order)
     clear = (1 - alpha).cumprod(dim=1)
     weight = alpha * torch.cat([torch.ones_like(clear[:, :1]), clear[:, :-1]], dim=1)
     colours = colours.gather(1, order[..., None].expand(-1, -1, 3))
@@ -113,7 +130,8 @@ def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Te
 
 @dataclass(frozen=True)
 class Filled:
-    """Colours (P, 3) of all texels, and how many came from the other side of the body or from neighbours."""
+    """Colours (P, 3) of all texels, and how many came from the other side of the body or from
+    neighbours."""
 
     rgb: Tensor
     mirrored: int
@@ -121,43 +139,57 @@ class Filled:
 
 
 def fill_unseen(baked: BakedTexels, texels: Texels) -> Filled:
-    """Return colours of all texels: small gaps from around them, else those of the mirror side, else what is nearest.
+    """Return colours of all texels: small gaps from around them, else those of the mirror side,
+    else what is nearest.
 
-    Texels count as the same surface where their normals agree, so that an arm does not colour the trunk.
+    Texels count as the same surface where their normals agree, so that an arm does not colour the
+    trunk.
     """
     seen = baked.alpha >= SEEN
     rgb = baked.rgb.clone()
-    missing, known = torch.nonzero(~seen)[:, 0], torch.nonzero(seen)[:, 0]
+    missing = torch.nonzero(~seen)[:, 0]
+    known = torch.nonzero(seen)[:, 0]
     if not len(missing) or not len(known):
         return Filled(rgb, 0, 0)
     places = KDTree(_with_normals(texels.points[known], texels.normals[known]))
     own = _with_normals(texels.points[missing], texels.normals[missing])
-    distance, at = (x.reshape(len(missing), -1) for x in places.query(own, k=min(_AROUND, len(known))))
+    distance, at = (
+        x.reshape(len(missing), -1) for x in places.query(own, k=min(_AROUND, len(known)))
+    )
     weight = torch.from_numpy(1 / np.maximum(distance, 1e-6) ** 2).float()
     around = baked.rgb[known[torch.from_numpy(at)]]
     rgb[missing] = (weight[..., None] * around).sum(1) / weight.sum(1, keepdim=True)
     far = torch.from_numpy(distance[:, 0] > _GAP)
     flip = texels.points.new_tensor([-1.0, 1.0, 1.0])
-    distance, at = places.query(_with_normals(texels.points[missing] * flip, texels.normals[missing] * flip))
+    distance, at = places.query(
+        _with_normals(texels.points[missing] * flip, texels.normals[missing] * flip)
+    )
     mirrored = far & torch.from_numpy(distance < _MIRROR)
     rgb[missing[mirrored]] = baked.rgb[known[torch.from_numpy(at)[mirrored]]]
     return Filled(rgb, int(mirrored.sum()), len(missing) - int(mirrored.sum()))
 
 
 def texture_image(rgb: Tensor, texels: Texels) -> np.ndarray:
-    """Return the atlas (S, S, 3) uint8; what no triangle covers has the colour of the nearest texel.
+    """Return the atlas (S, S, 3) uint8; what no triangle covers has the colour of the nearest
+    texel.
 
     So neither interpolation nor smaller copies of the image show seams.
     """
     size = texels.resolution
     image = np.zeros((size * size, 3), np.float32)
     empty = np.ones(size * size, bool)
-    image[texels.index.numpy()], empty[texels.index.numpy()] = rgb.numpy(), False
+    image[texels.index.numpy()] = rgb.numpy()
+    empty[texels.index.numpy()] = False
     nearest = np.empty((2, size, size), np.int32)
-    distance_transform_edt(empty.reshape(size, size), return_distances=False, return_indices=True, indices=nearest)
-    return np.rint(image.reshape(size, size, 3)[nearest[0], nearest[1]].clip(0, 1) * 255).astype(np.uint8)
+    distance_transform_edt(
+        empty.reshape(size, size), return_distances=False, return_indices=True, indices=nearest
+    )
+    return np.rint(image.reshape(size, size, 3)[nearest[0], nearest[1]].clip(0, 1) * 255).astype(
+        np.uint8
+    )
 
 
 def _with_normals(points: Tensor, normals: Tensor) -> np.ndarray:
-    """Return (P, 6): places and normals, where opposite normals are as far apart as points at 10 cm."""
+    """Return (P, 6): places and normals, where opposite normals are as far apart as points at 10
+    cm."""
     return torch.cat([points, 0.05 * normals], dim=1).double().numpy()

@@ -1,1 +1,2 @@
-"""Colour that costs only what it shows: a shared network in place of harmonics, and harmonics only where they pay."""
+"""Colour that costs only what it shows: a shared network in place of harmonics, and harmonics only
+where they pay."""

@@ -21,7 +21,8 @@ _FAR = 1e4  # Distance of the camera, in largest distances of a Gaussian from th
 
 @dataclass(frozen=True)
 class Baked:
-    """Gaussians with harmonics, and the root mean squared error of their colours over all directions."""
+    """Gaussians with harmonics, and the root mean squared error of their colours over all
+    directions."""
 
     gaussians: Gaussians
     error: float
@@ -29,9 +30,11 @@ class Baked:
 
 @torch.no_grad()
 def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Baked:
-    """Return the Gaussians with the harmonics of ``degree`` that come nearest to the colours of ``shader``.
+    """Return the Gaussians with the harmonics of ``degree`` that come nearest to the colours of
+    ``shader``.
 
-    Least squares over directions that are evenly spread on the sphere, those included from which no image was taken.
+    Least squares over directions that are evenly spread on the sphere, those included from which no
+    image was taken.
     """
     directions = sphere(DIRECTIONS).to(gaussians.means.dtype)
     basis = harmonics_basis(directions, degree)
@@ -46,7 +49,9 @@ def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Bak
         squares += float(colors.double().square().sum())
     # What least squares leaves is orthogonal to what it explains.
     explained = torch.einsum("nkc,kl,nlc->", sh.double(), (basis.T @ basis).double(), sh.double())
-    error = math.sqrt(max(squares - float(explained), 0.0) / max(3 * DIRECTIONS * len(gaussians), 1))
+    error = math.sqrt(
+        max(squares - float(explained), 0.0) / max(3 * DIRECTIONS * len(gaussians), 1)
+    )
     return Baked(gaussians.replace(sh=sh), error)
 
 

@@ -1,9 +1,11 @@
-"""Colours from three base values per Gaussian and one small network for all of them (MEGA, Zhang et al. 2024).
+"""Colours from three base values per Gaussian and one small network for all of them (MEGA, Zhang et
+al. 2024).
 
-MEGA draws sigmoid(c_dc + F(mu, d, t, c_dc)) with F a perceptron, d the unit direction from the camera to the centre
-mu. Here F is added to the base colour of the harmonics before their clamp, max(0, rgb + F(...)): so files that hold the
-base colours alone stay right, and a network whose last layer is zero changes nothing. Gradients of F by mu and d are
-stopped, so that colours do not move Gaussians.
+MEGA draws sigmoid(c_dc + F(mu, d, t, c_dc)) with F a perceptron, d the unit direction from the
+camera to the centre mu. Here F is added to the base colour of the harmonics before their clamp,
+max(0, rgb + F(...)): so files that hold the base colours alone stay right, and a network whose last
+layer is zero changes nothing. Gradients of F by mu and d are stopped, so that colours do not move
+Gaussians.
 """
 
 from __future__ import annotations
@@ -38,22 +40,28 @@ class ColourNetwork:
     layers: tuple[Layer, ...]
     box: Tensor  # (2, 3) centre and half sides of the scene, world units
     sees_time: bool
-    # the cosine between the shortest axis of the Gaussian and the direction, and the direction mirrored at that axis,
-    # are inputs
+    # the cosine between the shortest axis of the Gaussian and the direction, and the direction
+    # mirrored at that axis, are inputs
     sees_normals: bool
 
     @property
     def num_values(self) -> int:
-        return self.box.numel() + sum(layer.weight.numel() + layer.bias.numel() for layer in self.layers)
+        return self.box.numel() + sum(
+            layer.weight.numel() + layer.bias.numel() for layer in self.layers
+        )
 
     def state(self) -> State:
-        tensors = {"box": self.box, "sees": torch.tensor([self.sees_time, self.sees_normals], device="cpu")}
+        tensors = {
+            "box": self.box,
+            "sees": torch.tensor([self.sees_time, self.sees_normals], device="cpu"),
+        }
         for i, layer in enumerate(self.layers):
             tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}
         return with_role(tensors, Role.SHARED)
 
     def shader(self, time: float | None, frame: RestFrame | None = None) -> Shader:
-        """Return the shader at ``time`` (clamped to [0, 1], None is 0); ``frame`` for Gaussians on a body."""
+        """Return the shader at ``time`` (clamped to [0, 1], None is 0); ``frame`` for Gaussians on
+        a body."""
 
         def colors(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
             views = [
@@ -65,10 +73,17 @@ class ColourNetwork:
         return colors
 
     def _seen_from(
-        self, gaussians: Gaussians, center: Tensor, drawn: Tensor, time: float | None, frame: RestFrame | None
+        self,
+        gaussians: Gaussians,
+        center: Tensor,
+        drawn: Tensor,
+        time: float | None,
+        frame: RestFrame | None,
     ) -> Tensor:
-        """Return (N, 3) colours seen from ``center``; zero, and not computed, for those that are not ``drawn`` (N,)."""
-        rows, dtype = torch.nonzero(drawn)[:, 0], gaussians.means.dtype
+        """Return (N, 3) colours seen from ``center``; zero, and not computed, for those that are
+        not ``drawn`` (N,)."""
+        rows = torch.nonzero(drawn)[:, 0]
+        dtype = gaussians.means.dtype
         moment = min(max(0.0 if time is None else time, 0.0), 1.0)
         sight = Sight(
             gaussians.means,
@@ -87,26 +102,38 @@ class ColourNetwork:
 
 
 def box_around(means: Tensor) -> Tensor:
-    """Return (2, 3) centre and half sides of the box of ``means`` (N, 3) but their outer percent; no side is zero."""
+    """Return (2, 3) centre and half sides of the box of ``means`` (N, 3) but their outer percent;
+    no side is zero."""
     if not len(means):
-        return torch.stack([torch.zeros(3, device=means.device), torch.ones(3, device=means.device)])
+        return torch.stack(
+            [torch.zeros(3, device=means.device), torch.ones(3, device=means.device)]
+        )
     ordered = means.detach().sort(dim=0).values
     last = len(ordered) - 1
-    low, high = ordered[round(0.01 * last)], ordered[round(0.99 * last)]
+    low = ordered[round(0.01 * last)]
+    high = ordered[round(0.99 * last)]
     half_size = 0.5 * (high - low)
-    return torch.stack([0.5 * (low + high), half_size.clamp_min(max(1e-3 * float(half_size.max()), 1e-6))])
+    return torch.stack(
+        [0.5 * (low + high), half_size.clamp_min(max(1e-3 * float(half_size.max()), 1e-6))]
+    )
 
 
 def network_of(state: Mapping[str, Tensor]) -> ColourNetwork | None:
-    """Return the network of a checkpoint, from the state of its colours; None where there is none."""
+    """Return the network of a checkpoint, from the state of its colours; None where there is
+    none."""
     count = sum(name.startswith("weight") for name in state)
     if not count:
         return None
-    sees_time, sees_normals = (bool(x) for x in require_tensor("sees", state["sees"], (2,), torch.bool))
+    sees_time, sees_normals = (
+        bool(x) for x in require_tensor("sees", state["sees"], (2,), torch.bool)
+    )
     require_positive("box", require_tensor("box", state["box"], (2, 3), None)[1])
-    layers, width = [], num_inputs(sees_time=sees_time, sees_normals=sees_normals)
+    layers = []
+    width = num_inputs(sees_time=sees_time, sees_normals=sees_normals)
     for i in range(count):
-        weight = require_tensor(f"weight{i}", state[f"weight{i}"], (3 if i == count - 1 else None, width), None)
+        weight = require_tensor(
+            f"weight{i}", state[f"weight{i}"], (3 if i == count - 1 else None, width), None
+        )
         width = len(weight)
         layers.append(Layer(weight, require_tensor(f"bias{i}", state[f"bias{i}"], (width,), None)))
     return ColourNetwork(tuple(layers), state["box"], sees_time, sees_normals)

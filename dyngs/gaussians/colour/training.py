@@ -25,7 +25,8 @@ from dyngs.tensor_checks import require_tensor
 
 WARM_UP = 100  # Steps in which the network's rate is reached
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)
-"""Fractions of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k steps)."""
+"""Fractions of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k
+steps)."""
 HELD_OUT_EVERY = 8
 _HELD_OUT = 5  # Index, in each eight views, of the one that is held out
 
@@ -45,7 +46,8 @@ class HarmonicsDropped:
     """Gaussians whose harmonics are dropped for good."""
 
     text: str  # what was found, for people
-    rows: Tensor | None = None  # (N,) bool, those without harmonics from now on; None: all keep theirs
+    # (N,) bool, those without harmonics from now on; None: all keep theirs
+    rows: Tensor | None = None
     offsets: Tensor | None = None  # (N, 3) colour to add to their base
 
 
@@ -78,14 +80,16 @@ class ColourTraining:
         return None
 
     def frozen_rest(self) -> Tensor | None:
-        """Return (N,) bool, Gaussians whose harmonics stay zero but for the base colour; None: of none."""
+        """Return (N,) bool, Gaussians whose harmonics stay zero but for the base colour; None: of
+        none."""
         return None
 
     def follow(self, edit: TopologyEdit) -> None:
         """Follow a change of the set of Gaussians."""
 
     def optimize(self, step: int) -> Count:
-        """Update what is learned next to the harmonics, and return the number of rows left out for bad gradients."""
+        """Update what is learned next to the harmonics, and return the number of rows left out for
+        bad gradients."""
         return 0
 
     def place(self, device: torch.device) -> None:
@@ -102,7 +106,13 @@ class NetworkTraining(ColourTraining):
     """A network that all Gaussians share, learned by Adam."""
 
     def __init__(
-        self, options: NetworkColour, steps: int, box: Tensor, generator: torch.Generator, *, sees_time: bool
+        self,
+        options: NetworkColour,
+        steps: int,
+        box: Tensor,
+        generator: torch.Generator,
+        *,
+        sees_time: bool,
     ) -> None:
         super().__init__(options)
         self.options, self.steps, self.box, self.sees_time = options, steps, box, sees_time
@@ -113,7 +123,9 @@ class NetworkTraining(ColourTraining):
     @property
     def network(self) -> ColourNetwork:
         count = self.options.depth + 1
-        layers = (Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count))
+        layers = (
+            Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count)
+        )
         return ColourNetwork(tuple(layers), self.box, self.sees_time, sees_normals=True)
 
     @property
@@ -135,7 +147,8 @@ class NetworkTraining(ColourTraining):
 
 
 class AutoTraining(ColourTraining):
-    """Harmonics for all Gaussians at first, later only for those where they are measured to improve images."""
+    """Harmonics for all Gaussians at first, later only for those where they are measured to improve
+    images."""
 
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)
@@ -159,7 +172,9 @@ class AutoTraining(ColourTraining):
                 "too few views are trained on as yet to measure where view dependence pays: all harmonics stay"
             )
         judged = list(views.views(held_out))
-        found = find_view_dependent(views.views(seen), judged, views.options, views.background, self.tolerance)
+        found = find_view_dependent(
+            views.views(seen), judged, views.options, views.background, self.tolerance
+        )
         self.freeze(~found.keeps)
         return HarmonicsDropped(str(found), ~found.keeps, found.offsets)
 
@@ -182,14 +197,17 @@ class AutoTraining(ColourTraining):
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
         frozen = tensors.get("frozen")
-        self._frozen = None if frozen is None else require_tensor("frozen", frozen, (count,), torch.bool)
+        self._frozen = (
+            None if frozen is None else require_tensor("frozen", frozen, (count,), torch.bool)
+        )
 
 
 def opacity_entropy(logits: Tensor) -> Tensor:
-    """Return the mean of -o ln o over opacities o with ``logits`` (N,), of which there may be none (Zhang et al. 2024).
+    """Return the mean of -o ln o over opacities o with ``logits`` (N,), of which there may be none
+    (Zhang et al. 2024).
 
-    It is largest at o = 1/e: what is fainter is pushed towards 0, what is more opaque towards 1. The gradient by a
-    logit, -(ln o + 1) o (1 - o), is finite everywhere.
+    It is largest at o = 1/e: what is fainter is pushed towards 0, what is more opaque towards 1.
+    The gradient by a logit, -(ln o + 1) o (1 - o), is finite everywhere.
     """
     if not len(logits):
         return logits.sum()
@@ -197,13 +215,15 @@ def opacity_entropy(logits: Tensor) -> Tensor:
 
 
 def rate_factor(step: int, steps: int) -> float:
-    """Return the factor on the rate of ``step``, from 1: a linear warm-up, then a third after each milestone."""
+    """Return the factor on the rate of ``step``, from 1: a linear warm-up, then a third after each
+    milestone."""
     passed = sum(step > fraction * steps for fraction in _MILESTONES)
     return min(1.0, step / WARM_UP) / 3**passed
 
 
 def _start_values(widths: list[int], generator: torch.Generator) -> dict[str, Tensor]:
-    """Return Glorot weights and zero biases; the last layer is all zero, so that nothing is added at first."""
+    """Return Glorot weights and zero biases; the last layer is all zero, so that nothing is added
+    at first."""
     values: dict[str, Tensor] = {}
     for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
         weight = glorot(fan_in, fan_out, generator)

@@ -24,10 +24,13 @@ from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.ops.quaternions import quats_of
 from dyngs.state import fields_moved_to
 
-MAX_JOINTS = 8  # limit on the joints that one Gaussian follows; vertices of the free template follow no more
+# limit on the joints that one Gaussian follows; vertices of the free template follow no more
+MAX_JOINTS = 8
 _WIDTH, _THICKNESS = 0.5, 0.25
-"""Standard deviations of an initial Gaussian in the tangent plane and along the normal, in sides of its texel."""
-_LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1  # initial opacities: on the lowest scaffold, and on those above it
+"""Standard deviations of an initial Gaussian in the tangent plane and along the normal, in sides of
+its texel."""
+# initial opacities: on the lowest scaffold, and on those above it
+_LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1
 
 
 @dataclass(frozen=True)
@@ -59,21 +62,30 @@ class Anchors:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-def texel_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) -> tuple[Gaussians, Anchors]:
-    """Return grey discs on every texel, at all ``heights`` (m) above the surface at rest; nearly opaque at the lowest.
+def texel_gaussians(
+    texels: Texels, heights: Sequence[float], sh_degree: int
+) -> tuple[Gaussians, Anchors]:
+    """Return grey discs on every texel, at all ``heights`` (m) above the surface at rest; nearly
+    opaque at the lowest.
 
-    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by texel. Raises
-    DyngsError: no height, or one that is not finite.
+    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by
+    texel. Raises DyngsError: no height, or one that is not finite.
     """
     levels = texels.points.new_tensor(heights)
     if levels.numel() == 0 or not bool(levels.isfinite().all()):
-        raise DyngsError(f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}")
+        raise DyngsError(
+            f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}"
+        )
     rows = torch.arange(len(texels), device=levels.device).repeat(len(levels))
     height = levels.repeat_interleave(len(texels))
     size = texels.size[rows]
     joints, weights = heaviest_joints(texels.weights)
-    row, column = (texels.index // texels.resolution, texels.index % texels.resolution)
-    uv = torch.stack([column + 0.5, texels.resolution - 0.5 - row], dim=1).to(size) / texels.resolution
+    row = texels.index // texels.resolution
+    column = texels.index % texels.resolution
+    uv = (
+        torch.stack([column + 0.5, texels.resolution - 0.5 - row], dim=1).to(size)
+        / texels.resolution
+    )
     anchors = Anchors(
         points=texels.points[rows] + height[:, None] * texels.normals[rows],
         size=size,
@@ -97,28 +109,39 @@ def texel_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) ->
 
 
 def heaviest_joints(weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the joints (P, K) int64 of the largest of ``weights`` (P, J), and these, normalised; ties by index."""
+    """Return the joints (P, K) int64 of the largest of ``weights`` (P, J), and these, normalised;
+    ties by index."""
     count = min(MAX_JOINTS, weights.shape[1])
     ordered = weights.sort(dim=1, descending=True, stable=True)
     kept = ordered.values[:, :count]
     return ordered.indices[:, :count].contiguous(), kept / kept.sum(1, keepdim=True)
 
 
-def skinning_weights(anchors: Anchors, num_joints: int, corrections: Tensor | None = None) -> Tensor:
-    """Return skinning weights (N, J); with ``corrections`` c (N, K), w e^c, normalised, for the followed joints.
+def skinning_weights(
+    anchors: Anchors, num_joints: int, corrections: Tensor | None = None
+) -> Tensor:
+    """Return skinning weights (N, J); with ``corrections`` c (N, K), w e^c, normalised, for the
+    followed joints.
 
-    Corrections have no effect where a Gaussian follows a single joint: they act where parts of the body meet.
+    Corrections have no effect where a Gaussian follows a single joint: they act where parts of the
+    body meet.
     """
     if corrections is None:
-        return anchors.weights.new_zeros(len(anchors), num_joints).scatter_add_(1, anchors.joints, anchors.weights)
-    return cast(Any, _CorrectedWeights).apply(corrections, anchors.weights, anchors.joints, num_joints)
+        return anchors.weights.new_zeros(len(anchors), num_joints).scatter_add_(
+            1, anchors.joints, anchors.weights
+        )
+    return cast(Any, _CorrectedWeights).apply(
+        corrections, anchors.weights, anchors.joints, num_joints
+    )
 
 
 class _CorrectedWeights(torch.autograd.Function):
     """See ``skinning_weights``; differentiable once, in the corrections."""
 
     @staticmethod
-    def forward(ctx: Any, corrections: Tensor, weights: Tensor, joints: Tensor, num_joints: int) -> Tensor:
+    def forward(
+        ctx: Any, corrections: Tensor, weights: Tensor, joints: Tensor, num_joints: int
+    ) -> Tensor:
         parts = corrections.exp().mul_(weights)
         parts /= parts.sum(1, keepdim=True)
         ctx.save_for_backward(parts, joints)
@@ -138,18 +161,24 @@ _LIMBS = ("wrist", "ankle", "foot", "index", "middle", "pinky", "ring", "thumb")
 
 
 def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> float:
-    """Return the side of a pixel on the person, m of the template: the median over the cameras; infinite without any.
+    """Return the side of a pixel on the person, m of the template: the median over the cameras;
+    infinite without any.
 
     The mean position in ``clip`` counts; ``pelvis`` (3,) is at rest, m.
     """
     scale = float(clip.scale.mean())
     place = clip.trans.mean(0) + scale * pelvis
-    away = [float((camera.centers[0] - place).norm() / camera.intrinsics[0, 0, 0]) for camera in cameras]
+    away = [
+        float((camera.centers[0] - place).norm() / camera.intrinsics[0, 0, 0]) for camera in cameras
+    ]
     return sorted(away)[len(away) // 2] / scale if away else torch.inf
 
 
-def surface_texels(body: BodyTemplate, resolution: int, vertices: Tensor, pixel: float) -> list[Texels]:
-    """Return the texels of the atlas, and apart from them smaller ones of hands and feet where images show more.
+def surface_texels(
+    body: BodyTemplate, resolution: int, vertices: Tensor, pixel: float
+) -> list[Texels]:
+    """Return the texels of the atlas, and apart from them smaller ones of hands and feet where
+    images show more.
 
     ``vertices`` (M, 3) are the rest shape, m; ``pixel`` is the side of a pixel on the person, m.
     """
@@ -164,8 +193,11 @@ def surface_texels(body: BodyTemplate, resolution: int, vertices: Tensor, pixel:
 
 
 def surface_gaussians(parts: Sequence[Texels], sh_degree: int) -> tuple[Gaussians, Anchors, Tensor]:
-    """Return the ``texel_gaussians`` on the skin of all parts, part by part, their anchors, and normals (N, 3)."""
+    """Return the ``texel_gaussians`` on the skin of all parts, part by part, their anchors, and
+    normals (N, 3)."""
     made = [texel_gaussians(texels, (0.0,), sh_degree) for texels in parts]
     normals = torch.cat([texels.normals for texels in parts])
-    anchors = {name: torch.cat([a.tensors()[name] for _, a in made]) for name in made[0][1].tensors()}
+    anchors = {
+        name: torch.cat([a.tensors()[name] for _, a in made]) for name in made[0][1].tensors()
+    }
     return Gaussians.joined([g for g, _ in made]), Anchors(**anchors), normals

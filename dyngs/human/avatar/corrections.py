@@ -1,7 +1,8 @@
-"""Learned corrections of the body fit next to the Gaussians: poses of the frames, skeleton, skinning weights.
+"""Learned corrections of the body fit next to the Gaussians: poses of the frames, skeleton,
+skinning weights.
 
-Body fits are never exact, and the template is not the person. All corrections start at zero. Local letters: F frames,
-J joints, N Gaussians, K joints that one Gaussian follows.
+Body fits are never exact, and the template is not the person. All corrections start at zero. Local
+letters: F frames, J joints, N Gaussians, K joints that one Gaussian follows.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ LR = {
 OF_FRAMES = ("poses", "trans")  # what is learned of single frames
 LR_DECAY = 0.1  # last over first learning rate
 POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
-"""Of the squared corrections of poses and joints, of skinning weights, and of the light, in the loss."""
+"""Of the squared corrections of poses and joints, of skinning weights, and of the light, in the
+loss."""
 POSE_CM = 0.05  # rotation of a joint, rad, that is penalized as much as a centimetre
 
 
@@ -57,10 +59,12 @@ def new_corrections(
     anchors: Anchors,
     normals: Tensor | None = None,
 ) -> Parameters:
-    """Return the corrections to learn, all zero; with ``normals`` (N, 3) also the light that falls on them (``Light``).
+    """Return the corrections to learn, all zero; with ``normals`` (N, 3) also the light that falls
+    on them (``Light``).
 
-    ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before those of the clip; ``trans`` (F, 3);
-    ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K).
+    ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before those of the clip;
+    ``trans`` (F, 3); ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m;
+    ``log_scale`` (1,); ``weights`` (N, K).
     """
     unit = float(clip.scale.mean())
     zeros = {
@@ -79,7 +83,8 @@ def new_corrections(
 
 
 def correction_penalties(learned: Parameters) -> dict[str, Tensor]:
-    """Return weighted mean squares that keep poses, joints and skinning weights near what was given."""
+    """Return weighted mean squares that keep poses, joints and skinning weights near what was
+    given."""
     turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
     terms = {"pose": POSE_WEIGHT * (turns + (100 * learned["joints"]).square().mean())}
     if "light" in learned:
@@ -99,19 +104,28 @@ def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
 
 
 def corrected_clip(
-    fit: SharedCorrection, clip: MotionClip, poses: Tensor | None = None, trans: Tensor | None = None
+    fit: SharedCorrection,
+    clip: MotionClip,
+    poses: Tensor | None = None,
+    trans: Tensor | None = None,
 ) -> MotionClip:
-    """Return the clip with ``fit`` applied, and the corrections ``poses`` (F, J, 3) and ``trans`` (F, 3) of its frames.
+    """Return the clip with ``fit`` applied, and the corrections ``poses`` (F, J, 3) and ``trans``
+    (F, 3) of its frames.
 
     The same poses as ``corrected_pose``, as axis-angle vectors.
     """
     from scipy.spatial.transform import Rotation
 
     own = fit.turns.expand_as(clip.poses) if poses is None else fit.turns + poses
-    given, extra = (Rotation.from_rotvec(x.detach().double().reshape(-1, 3).cpu().numpy()) for x in (clip.poses, own))
+    given, extra = (
+        Rotation.from_rotvec(x.detach().double().reshape(-1, 3).cpu().numpy())
+        for x in (clip.poses, own)
+    )
     return replace(
         clip,
-        poses=torch.from_numpy((given * extra).as_rotvec()).to(clip.poses).reshape(clip.poses.shape),
+        poses=torch.from_numpy((given * extra).as_rotvec())
+        .to(clip.poses)
+        .reshape(clip.poses.shape),
         trans=clip.trans if trans is None else clip.trans + trans.detach(),
         scale=clip.scale * math.exp(fit.log_scale),
     )
@@ -123,9 +137,11 @@ def corrected_skeleton(learned: Parameters, skeleton: Skeleton) -> Skeleton:
 
 
 def share_sides(learned: Parameters) -> None:
-    """Give the joints at rest the mean gradient of both sides of the body, so that they stay mirror images.
+    """Give the joints at rest the mean gradient of both sides of the body, so that they stay mirror
+    images.
 
-    People are nearly symmetric, rarely move both sides alike, and a motion shows only the joints that it bends.
+    People are nearly symmetric, rarely move both sides alike, and a motion shows only the joints
+    that it bends.
     """
     gradient = learned["joints"].grad
     if gradient is not None:

@@ -40,7 +40,8 @@ def start(run: RunStart) -> GaussianModel:
 
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
-    config, model = run.config, run.config.model
+    config = run.config
+    model = run.config.model
     if not isinstance(model, HumanModel):
         raise TypeError(f"not a person: {model!r}")
     gaussians, subject = human_start(config, model, run.capture, run.images)
@@ -50,7 +51,11 @@ def start(run: RunStart) -> GaussianModel:
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
     outlines = None if colours.network is not None else outline_loss(run)
     behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
-    refit = PoseRefit(run.images, behind, config.train.steps) if model.refine and config.train.minutes is None else None
+    refit = (
+        PoseRefit(run.images, behind, config.train.steps)
+        if model.refine and config.train.minutes is None
+        else None
+    )
     training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines, refit)
     lit = model.light and model.refine and colours.network is None
     scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
@@ -59,11 +64,15 @@ def start(run: RunStart) -> GaussianModel:
 
 def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
     """Return the scene of a checkpoint."""
-    scene = HumanScene.restored(Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
+    scene = HumanScene.restored(
+        Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
+    )
     return drawn_as_trained(scene, model, checkpoint)
 
 
-def human_start(config: Config, model: HumanModel, capture: Capture, images: ImageLoader) -> tuple[Gaussians, Subject]:
+def human_start(
+    config: Config, model: HumanModel, capture: Capture, images: ImageLoader
+) -> tuple[Gaussians, Subject]:
     """Return the first Gaussians of a person, and the person.
 
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
@@ -73,12 +82,17 @@ def human_start(config: Config, model: HumanModel, capture: Capture, images: Ima
     if problem is not None or capture.body is None:
         raise DyngsError(f"{capture.root}: {problem}")
     if sh_degree > 1:
-        raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
-    given, body = capture.body["train"], load_template(model)
+        raise DyngsError(
+            f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1"
+        )
+    given = capture.body["train"]
+    body = load_template(model)
     vertices, joints = rest_shape(body, given)
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
     cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
-    parts = surface_texels(body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0]))
+    parts = surface_texels(
+        body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0])
+    )
     gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
     shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))

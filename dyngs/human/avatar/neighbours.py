@@ -16,15 +16,17 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions
 from dyngs.human.avatar.anchors import Anchors
 
-_SAME_JOINTS = 0.5  # least cosine between the skinning weights of points that belong to the same part of the body
+# least cosine between the skinning weights of points that belong to the same part of the body
+_SAME_JOINTS = 0.5
 _LOOKED_AT = 4  # points that are looked at, over the number of requested neighbours
 
 
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
-    """Return the rows (Q, count) int64 of the nearest other points of each of ``points`` (Q, 3), nearest first.
+    """Return the rows (Q, count) int64 of the nearest other points of each of ``points`` (Q, 3),
+    nearest first.
 
-    Points may coincide; none is its own neighbour. There are at most Q - 1 columns. Raises DyngsError: a point that is
-    not finite.
+    Points may coincide; none is its own neighbour. There are at most Q - 1 columns. Raises
+    DyngsError: a point that is not finite.
     """
     from scipy.spatial import KDTree
 
@@ -42,14 +44,18 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
 
 
 def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
-    """Return the rows (Q, count) int64 of the nearest other points that follow the same joints, nearest first.
+    """Return the rows (Q, count) int64 of the nearest other points that follow the same joints,
+    nearest first.
 
-    They do where the cosine between their skinning weights (Q, J) is above a half, among four times ``count`` points
-    around each; where fewer do, the point itself is in their place. At most Q - 1 columns.
+    They do where the cosine between their skinning weights (Q, J) is above a half, among four times
+    ``count`` points around each; where fewer do, the point itself is in their place. At most Q - 1
+    columns.
     """
     near = nearest_neighbours(points, _LOOKED_AT * count)
     unit = torch.nn.functional.normalize(weights, dim=1)
-    alike = [(unit * unit.index_select(0, column)).sum(1) > _SAME_JOINTS for column in near.unbind(1)]
+    alike = [
+        (unit * unit.index_select(0, column)).sum(1) > _SAME_JOINTS for column in near.unbind(1)
+    ]
     if not alike:
         return near
     others = ~torch.stack(alike, dim=1)
@@ -59,7 +65,8 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
 
 
 class _Strains(torch.autograd.Function):
-    """See ``strains``. Numbers of one kind lie side by side: sums over rows of three are slow in torch."""
+    """See ``strains``. Numbers of one kind lie side by side: sums over rows of three are slow in
+    torch."""
 
     @staticmethod
     def forward(
@@ -69,7 +76,9 @@ class _Strains(torch.autograd.Function):
         rest, posed, uneven = (x - x.index_select(1, near) for x in columns)
         before, after = (x.square().sum(0).add_(_SHORTEST**2).sqrt_() for x in (rest, posed))
         strain = after / scale - before
-        ctx.save_for_backward(rest.mul_(strain / before), posed.mul_(strain / after), uneven, near, scale)
+        ctx.save_for_backward(
+            rest.mul_(strain / before), posed.mul_(strain / after), uneven, near, scale
+        )
         return strain.square().mean(), uneven.square().sum() / len(near)
 
     @staticmethod
@@ -77,7 +86,8 @@ class _Strains(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         rest, posed, uneven, near, scale = ctx.saved_tensors
         by_strain, by_uneven = (2 / len(near) * x for x in grads)
-        by_rest, by_posed = by_uneven * uneven - by_strain * rest, by_strain / scale * posed
+        by_rest = by_uneven * uneven - by_strain * rest
+        by_posed = by_strain / scale * posed
         by_means, by_moved = (x.index_add(1, near, x, alpha=-1).T for x in (by_rest, by_posed))
         return by_means, by_moved, None, None, None
 
@@ -85,40 +95,51 @@ class _Strains(torch.autograd.Function):
 _SHORTEST = 1e-6  # added to all distances, squared: points that coincide pull each other nowhere
 
 
-def strains(means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean squares () of changes of the distance to a neighbour, and of unlike offsets; differentiable once.
+def strains(
+    means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return mean squares () of changes of the distance to a neighbour, and of unlike offsets;
+    differentiable once.
 
-    ``means`` (N, 3) at rest, which are offset from ``points`` (N, 3), are ``moved`` (N, 3) to a pose, in a world with
-    ``scale`` () units per unit of theirs; ``near`` (N,) are rows of their neighbours.
+    ``means`` (N, 3) at rest, which are offset from ``points`` (N, 3), are ``moved`` (N, 3) to a
+    pose, in a world with ``scale`` () units per unit of theirs; ``near`` (N,) are rows of their
+    neighbours.
     """
     return cast(Any, _Strains).apply(means, moved, points, near, scale)
 
 
-ENOUGH = 1.0  # sightings (see sightings) at which a Gaussian's own values count as much as what is around it
+# sightings (see sightings) at which a Gaussian's own values count as much as what is around it
+ENOUGH = 1.0
 MIRRORED = 0.9  # trust in the other side of the body, where that was seen
-HARDLY = 0.5  # trust in a Gaussian's own values below which it is counted as unseen in the line for people
+# trust in a Gaussian's own values below which it is counted as unseen in the line for people
+HARDLY = 0.5
 _NEIGHBOURS = 8
 _SAME_PLACE = 1.5
-"""Distance from the mirrored anchor, in sides of its texel, within which a Gaussian is its mirror image."""
+"""Distance from the mirrored anchor, in sides of its texel, within which a Gaussian is its mirror
+image."""
 _OWN = 1e-6  # least weight of own values, which decides where nothing around is seen either
 _SURE = 1e-3  # least doubt in own values, so that the numbers stay in range
 _RESIDUAL, _MAX_ROUNDS = 1e-5, 1000
-"""Largest residual of the linear system at which its solution is good enough, and bound on the rounds it takes."""
+"""Largest residual of the linear system at which its solution is good enough, and bound on the
+rounds it takes."""
 
 
 @torch.no_grad()
 def sightings(
     drawn: Iterable[tuple[Gaussians, Cameras]], sizes: Tensor, scale: float, options: RenderOptions
 ) -> Tensor:
-    """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen there.
+    """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen
+    there.
 
-    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the Gaussians in the pose of
-    each view, and its camera; ``sizes`` (N,) sides of the texels, m; ``scale`` world units per metre.
+    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the
+    Gaussians in the pose of each view, and its camera; ``sizes`` (N,) sides of the texels, m;
+    ``scale`` world units per metre.
     """
     total = torch.zeros_like(sizes)
     for gaussians, camera in drawn:
         opacity = gaussians.opacities
-        pose, focal = camera.cam_from_world[0].to(opacity), camera.intrinsics[0, 0, 0].to(opacity)
+        pose = camera.cam_from_world[0].to(opacity)
+        focal = camera.intrinsics[0, 0, 0].to(opacity)
         depth = (gaussians.means @ pose[2, :3] + pose[2, 3]).clamp_min(options.near)
         seen = contributions(gaussians, camera, options)[0] / opacity.clamp_min(options.alpha_min)
         total += (seen / (sizes * scale * focal / depth).square()).square()
@@ -131,12 +152,15 @@ def trust_in(seen: Tensor) -> Tensor:
     return 1 - ENOUGH / (seen + ENOUGH)
 
 
-def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: float, trust: Tensor) -> dict[str, Tensor]:
-    """Return new ``sh``, ``means`` and ``logit_opacities`` of N Gaussians at rest; the same where trust is 1.
+def filled(
+    gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: float, trust: Tensor
+) -> dict[str, Tensor]:
+    """Return new ``sh``, ``means`` and ``logit_opacities`` of N Gaussians at rest; the same where
+    trust is 1.
 
-    Offsets, opacities and colours are mixed with those of the mirror image; base colours are made like those of linked
-    neighbours. ``weights`` (N, J) are the template's; ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) in
-    [0, 1].
+    Offsets, opacities and colours are mixed with those of the mirror image; base colours are made
+    like those of linked neighbours. ``weights`` (N, J) are the template's; ``middle`` is x of the
+    plane of symmetry, m; ``trust`` (N,) in [0, 1].
     """
     other, mixed, known = mirrored_trust(anchors, middle, trust)
     fraction = mixed[:, None]
@@ -155,7 +179,8 @@ def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: floa
 
 
 def mirrored_trust(anchors: Anchors, middle: float, trust: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rows (N,) of the mirror images, the fractions (N,) to mix of their values, and trust (N,) in the mixture.
+    """Return rows (N,) of the mirror images, the fractions (N,) to mix of their values, and trust
+    (N,) in the mixture.
 
     ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) is that in own values.
     """
@@ -166,7 +191,8 @@ def mirrored_trust(anchors: Anchors, middle: float, trust: Tensor) -> tuple[Tens
 
 
 def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
-    """Return (N,) rows of the Gaussians nearest to positions mirrored at x = ``middle``, and if they are near (N,)."""
+    """Return (N,) rows of the Gaussians nearest to positions mirrored at x = ``middle``, and if
+    they are near (N,)."""
     from scipy.spatial import KDTree
 
     points = anchors.points.detach().double().cpu().numpy()
@@ -177,15 +203,19 @@ def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
 
 
 def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -> Tensor:
-    """Return values (N, C) that are like those of linked neighbours, and like ``values`` where there is trust.
+    """Return values (N, C) that are like those of linked neighbours, and like ``values`` where
+    there is trust.
 
-    They minimize the sum of trust / (1 - trust) (x_i - v_i)^2 over Gaussians, and of w_ij (x_i - x_j)^2 over
-    neighbours that follow the same joints, where w falls with their distance; by conjugate gradients.
+    They minimize the sum of trust / (1 - trust) (x_i - v_i)^2 over Gaussians, and of w_ij (x_i -
+    x_j)^2 over neighbours that follow the same joints, where w falls with their distance; by
+    conjugate gradients.
     """
     from scipy.sparse import csr_array
 
-    count, given = len(values), values.detach().double().cpu().numpy()
-    near = linked_neighbours(anchors.points, weights, _NEIGHBOURS)  # a link to itself changes nothing
+    count = len(values)
+    given = values.detach().double().cpu().numpy()
+    # a link to itself changes nothing
+    near = linked_neighbours(anchors.points, weights, _NEIGHBOURS)
     if not near.shape[1]:
         return values
     steps = (anchors.points[near] - anchors.points[:, None]).norm(dim=-1) / anchors.size[:, None]
@@ -196,18 +226,25 @@ def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -
     sure = trust.detach().double().cpu().numpy()
     own = sure / np.maximum(1 - sure, _SURE) + _OWN
     diagonal = (np.asarray(links.sum(1)).ravel() + own)[:, None]
-    found = _conjugate_gradients(lambda x: diagonal * x - links @ x, own[:, None] * given, given, 1 / diagonal)
+    found = _conjugate_gradients(
+        lambda x: diagonal * x - links @ x, own[:, None] * given, given, 1 / diagonal
+    )
     return torch.where(trust[:, None] > 1 - _SURE, values, torch.from_numpy(found).to(values))
 
 
 def _conjugate_gradients(
-    applied: Callable[[np.ndarray], np.ndarray], wanted: np.ndarray, first: np.ndarray, scaling: np.ndarray
+    applied: Callable[[np.ndarray], np.ndarray],
+    wanted: np.ndarray,
+    first: np.ndarray,
+    scaling: np.ndarray,
 ) -> np.ndarray:
-    """Return x (N, C) with ``applied`` (x) = ``wanted``, a positive definite system, column by column, from ``first``.
+    """Return x (N, C) with ``applied`` (x) = ``wanted``, a positive definite system, column by
+    column, from ``first``.
 
     ``scaling`` (N, 1) is the inverse of its diagonal (Jacobi's preconditioner).
     """
-    x, residual = first, wanted - applied(first)
+    x = first
+    residual = wanted - applied(first)
     direction = scaled = scaling * residual
     size = (residual * scaled).sum(0)
     for _ in range(_MAX_ROUNDS):
@@ -215,8 +252,10 @@ def _conjugate_gradients(
             break
         image = applied(direction)
         step = size / np.maximum((direction * image).sum(0), 1e-300)
-        x, residual = x + step * direction, residual - step * image
+        x = x + step * direction
+        residual = residual - step * image
         scaled = scaling * residual
-        before, size = size, (residual * scaled).sum(0)
+        before = size
+        size = (residual * scaled).sum(0)
         direction = scaled + size / np.maximum(before, 1e-300) * direction
     return x

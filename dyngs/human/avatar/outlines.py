@@ -1,7 +1,9 @@
-"""Colours near outlines, before what stands behind the person: edges of found masks are wrong by a pixel or two.
+"""Colours near outlines, before what stands behind the person: edges of found masks are wrong by a
+pixel or two.
 
-A mask cuts background into the person, or the person away, and an avatar learns these colours. Where the camera stands,
-other frames show what is behind: the render is put before that, and compared with the image as it was taken.
+A mask cuts background into the person, or the person away, and an avatar learns these colours.
+Where the camera stands, other frames show what is behind: the render is put before that, and
+compared with the image as it was taken.
 
 Local letters: F images of one camera, H height, W width.
 """
@@ -29,8 +31,10 @@ from dyngs.ops.loss import l1_ssim_loss
 REACH = 2  # distance from the mask up to which images are compared as they were taken, px
 OUTSIDE = 0.02  # alpha up to which a pixel is outside of the mask
 FRAMES = 21  # of a camera, whose median is what is behind
-STANDS = 12 / 255  # median difference, over pixels outside of the masks, from which the camera or the light has moved
-WORTH_TELLING = 0.01  # least fraction of the pixels near outlines, behind which something is known, to use any
+# median difference, over pixels outside of the masks, from which the camera or the light has moved
+STANDS = 12 / 255
+# least fraction of the pixels near outlines, behind which something is known, to use any
+WORTH_TELLING = 0.01
 _STRIP = 32  # rows whose median is taken at once
 
 
@@ -43,13 +47,19 @@ class Plate:
 
 
 class OutlineLoss(Loss):
-    """L1 and D-SSIM of the image; in masks and up to ``REACH`` px around them, before the plate where that is known.
+    """L1 and D-SSIM of the image; in masks and up to ``REACH`` px around them, before the plate
+    where that is known.
 
     There the render's own opacity, not the mask, says how much of the plate is seen.
     """
 
     def __init__(
-        self, photos: ImageLoader, plates: Mapping[int, Plate], behind: Tensor, ssim_weight: float, known: float
+        self,
+        photos: ImageLoader,
+        plates: Mapping[int, Plate],
+        behind: Tensor,
+        ssim_weight: float,
+        known: float,
     ) -> None:
         """Keep all of it.
 
@@ -59,15 +69,22 @@ class OutlineLoss(Loss):
             behind: (3,) colour of the run's background.
             known: fraction of the pixels near outlines where a plate is known, for people.
         """
-        self._photos, self._plates, self._behind, self._ssim_weight = photos, plates, behind, ssim_weight
+        self._photos, self._plates, self._behind, self._ssim_weight = (
+            photos,
+            plates,
+            behind,
+            ssim_weight,
+        )
         self.finding = (
             f"masks are found ones: {known:.0%} of the pixels at their outlines are compared before what other frames "
             "show behind the person"
         )
 
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
-        rendered, truth = look.rendered, look.truth
-        plate, alpha = self._plates.get(self._photos.views[look.index].camera_id), look.image.alpha
+        rendered = look.rendered
+        truth = look.truth
+        plate = self._plates.get(self._photos.views[look.index].camera_id)
+        alpha = look.image.alpha
         if plate is not None and alpha is not None and truth.shape == plate.colours.shape:
             photo = self._photos[look.index].rgb_premultiplied
             colours, known, photo, behind = (
@@ -81,9 +98,15 @@ class OutlineLoss(Loss):
 
 
 def outline_loss(run: RunStart) -> OutlineLoss | None:
-    """Return how colours are compared near outlines; None where masks come with the images, or no camera stands."""
-    views, config = run.images.views, run.config
-    if run.background == "random" or config.train.exposure != "never" or config.camera.refine == "always":
+    """Return how colours are compared near outlines; None where masks come with the images, or no
+    camera stands."""
+    views = run.images.views
+    config = run.config
+    if (
+        run.background == "random"
+        or config.train.exposure != "never"
+        or config.camera.refine == "always"
+    ):
         return None
     if any(view.silhouette is None for view in views):
         return None
@@ -99,11 +122,16 @@ def outline_loss(run: RunStart) -> OutlineLoss | None:
         if plate is None:
             continue
         plates[camera] = plate
-        rims = near & ~torch.stack([x > 1 - OUTSIDE for i in shown if (x := run.images[i].alpha) is not None])
-        known, total = known + float((rims & plate.known).sum()), total + float(rims.sum())
+        rims = near & ~torch.stack(
+            [x > 1 - OUTSIDE for i in shown if (x := run.images[i].alpha) is not None]
+        )
+        known = known + float((rims & plate.known).sum())
+        total = total + float(rims.sum())
     if not plates or known < WORTH_TELLING * total:
         return None
-    return OutlineLoss(photos, plates, background_colour(run.background), config.train.ssim_weight, known / total)
+    return OutlineLoss(
+        photos, plates, background_colour(run.background), config.train.ssim_weight, known / total
+    )
 
 
 def _standing(views: Sequence[View]) -> dict[int, list[int]]:
@@ -113,7 +141,8 @@ def _standing(views: Sequence[View]) -> dict[int, list[int]]:
         rows[view.camera_id].append(row)
 
     def stands(own: list[int]) -> bool:
-        first, places = views[own[0]], np.stack([views[i].cam_from_world for i in own])
+        first = views[own[0]]
+        places = np.stack([views[i].cam_from_world for i in own])
         lenses = {(views[i].intrinsics.tobytes(), views[i].width, views[i].height) for i in own}
         return len(lenses) == 1 and np.allclose(places, first.cam_from_world, atol=1e-6)
 
@@ -136,7 +165,8 @@ def _plate(photos: Tensor, near: Tensor) -> Plate | None:
     ``near`` (F, H, W) says where the person may be. None: it is not one thing, or never seen.
     """
     known = (~near).sum(0) >= SEEN_BARE
-    colours, away = torch.zeros(*photos.shape[1:], device=photos.device), []
+    colours = torch.zeros(*photos.shape[1:], device=photos.device)
+    away = []
     for first in range(0, len(known), _STRIP):
         rows = slice(first, first + _STRIP)
         bare = (photos[:, rows] / 255).masked_fill(near[:, rows, :, None], torch.nan)

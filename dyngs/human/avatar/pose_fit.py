@@ -1,6 +1,8 @@
-"""Body poses in which an avatar, which stays as it is, looks most like images, or has their silhouettes.
+"""Body poses in which an avatar, which stays as it is, looks most like images, or has their
+silhouettes.
 
-So do GART (Lei et al. 2024) and Anim-NeRF (Chen et al. 2021) before they score new poses. F time steps, V images each.
+So do GART (Lei et al. 2024) and Anim-NeRF (Chen et al. 2021) before they score new poses. F time
+steps, V images each.
 """
 
 from __future__ import annotations
@@ -31,46 +33,62 @@ SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
 class Comparison:
     """How renders of a person are compared with images, and what keeps the pose near that given."""
 
-    # the loss () between a rendering and an image on a background (3,), with sides divided by a factor
+    # the loss () between a rendering and an image on a background (3,), with sides divided by a
+    # factor
     difference: Callable[[Rendering, Image, Tensor, int], Tensor]
     turn_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
     shift_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
-    views_to_turn: int = 1  # images of a time step from which on rotations are fitted; with fewer the shift is
+    # images of a time step from which on rotations are fitted; with fewer the shift is
+    views_to_turn: int = 1
     most_windows: int | None = None  # after which a round ends; None: ``MOST_WINDOWS``
 
 
 def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
     """Return 0.8 L1 + 0.2 (1 - SSIM) + 0.1 of the mean error of alpha ()."""
-    rendered, truth, mask = drawn.rgb[0], image.composite(background), image.mask
+    rendered = drawn.rgb[0]
+    truth = image.composite(background)
+    mask = image.mask
     error = None if image.alpha is None else (drawn.alpha[0] - image.alpha)[..., None]
     if mask is not None:
-        rendered, truth = rendered * mask[..., None], truth * mask[..., None]
+        rendered = rendered * mask[..., None]
+        truth = truth * mask[..., None]
         error = None if error is None else error * mask[..., None]
         mask = shrunk(mask[..., None], shrink)[..., 0]
     loss = l1_ssim_loss(shrunk(rendered, shrink), shrunk(truth, shrink), SSIM_WEIGHT, mask)
     return loss if error is None else loss + ALPHA_WEIGHT * shrunk(error, shrink).abs().mean()
 
 
-def difference_of_silhouettes(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
-    """Return the squared error of alpha, over the area of the silhouette (); nothing else of the image is looked at.
+def difference_of_silhouettes(
+    drawn: Rendering, image: Image, background: Tensor, shrink: int
+) -> Tensor:
+    """Return the squared error of alpha, over the area of the silhouette (); nothing else of the
+    image is looked at.
 
     Raises ValueError: an image without alpha.
     """
     if image.alpha is None:
         raise ValueError(f"{image.name}: has no silhouette")
-    error, truth = drawn.alpha[0] - image.alpha, image.alpha
+    error = drawn.alpha[0] - image.alpha
+    truth = image.alpha
     if image.mask is not None:
-        error, truth = error * image.mask, truth * image.mask
-    return shrunk(error[..., None], shrink).square().sum() / shrunk(truth[..., None], shrink).sum().clamp_min(1)
+        error = error * image.mask
+        truth = truth * image.mask
+    return shrunk(error[..., None], shrink).square().sum() / shrunk(
+        truth[..., None], shrink
+    ).sum().clamp_min(1)
 
 
 IMAGES = Comparison(difference_of_images, turn_weight=POSE_WEIGHT / POSE_CM**2)
-SILHOUETTES = Comparison(difference_of_silhouettes, turn_weight=1.0, shift_weight=10.0, views_to_turn=2)
-"""One view hides how far limbs reach towards the camera: rotations fitted to it look wrong from elsewhere."""
+SILHOUETTES = Comparison(
+    difference_of_silhouettes, turn_weight=1.0, shift_weight=10.0, views_to_turn=2
+)
+"""One view hides how far limbs reach towards the camera: rotations fitted to it look wrong from
+elsewhere."""
 
 
 def shrunk(image: Tensor, factor: int) -> Tensor:
-    """Return the (H, W, C) image with its sides divided by ``factor``, averaged over pixel areas."""
+    """Return the (H, W, C) image with its sides divided by ``factor``, averaged over pixel
+    areas."""
     if factor == 1:
         return image
     height, width = (max(1, round(side / factor)) for side in image.shape[:2])
@@ -78,18 +96,20 @@ def shrunk(image: Tensor, factor: int) -> Tensor:
 
 
 COARSE_PX = 40  # height of the person, px, in the coarsest of the three rounds
-FIRST_RATES, LAST_RATES = (5e-3, 5e-3, 3e-3), (2.5e-3, 1.2e-3, 5e-4)
+FIRST_RATES = (5e-3, 5e-3, 3e-3)
+LAST_RATES = (2.5e-3, 1.2e-3, 5e-4)
 """Learning rates of rotations, rad, in the three rounds."""
 SHIFT_RATE = 0.5  # learning rate of the translation, m, over that of rotations, rad
 BETAS = (0.9, 0.99)
 WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
-"""After so many updates (at least one for each image) the rate is halved unless the mean loss fell by that share; a
-round ends below the last rate, or after so many windows."""
+"""After so many updates (at least one for each image) the rate is halved unless the mean loss fell
+by that share; a round ends below the last rate, or after so many windows."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Of one pose: rotations ``turns`` (J, 3) axis-angle applied before the given ones, rad; ``shift`` (3,) m."""
+    """Of one pose: rotations ``turns`` (J, 3) axis-angle applied before the given ones, rad;
+    ``shift`` (3,) m."""
 
     turns: Tensor
     shift: Tensor
@@ -114,34 +134,44 @@ def fitted_to_images(
     comparison: Comparison = IMAGES,
     which: Collection[int] | None = None,
 ) -> FittedPoses:
-    """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
+    """Return the person in the poses in which it looks most like ``images``: rotations of joints
+    and translation.
 
-    All images of a time step decide its pose. The fit begins with the pose that is played, or with that corrected as
-    the one before was, whichever looks more alike. ``scene`` plays the clip to correct; ``background`` (3,) is behind
-    both. ``which`` are the indices of the images that count, None: all.
+    All images of a time step decide its pose. The fit begins with the pose that is played, or with
+    that corrected as the one before was, whichever looks more alike. ``scene`` plays the clip to
+    correct; ``background`` (3,) is behind both. ``which`` are the indices of the images that count,
+    None: all.
     """
     groups = by_time(images, which)
     times = sorted(groups)
     parts = [scene.moves_as.at(time) for time in times]
-    poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
+    poses, trans, scale = (
+        torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale")
+    )
     starts = MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
     found: list[Correction] = []
     counts: list[int] = []
     for row, time in enumerate(times):
         start = starts.select(torch.tensor([row], device="cpu"))
-        fit = _Fit(scene, start, time, background, tuple(images[i] for i in groups[time]), comparison)
+        fit = _Fit(
+            scene, start, time, background, tuple(images[i] for i in groups[time]), comparison
+        )
         correction, count = fit.fitted(found[-1] if found else None)
         found.append(correction)
         counts.append(count)
-    fit, none = scene.fit, SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
-    turns, shifts = torch.stack([x.turns for x in found]), torch.stack([x.shift for x in found])
+    fit = scene.fit
+    none = SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
+    turns = torch.stack([x.turns for x in found])
+    shifts = torch.stack([x.shift for x in found])
     clip = corrected_clip(none, starts, turns, shifts * starts.scale[:, None])
-    exactly = corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip)  # ``playing`` applies both again
+    # ``playing`` applies both again
+    exactly = corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip)
     return FittedPoses(scene.playing(exactly), tuple(counts))
 
 
 def by_time(images: ImageLoader, which: Collection[int] | None = None) -> dict[float, list[int]]:
-    """Return indices of images by their time; those without one are of time 0. ``which`` count, None: all."""
+    """Return indices of images by their time; those without one are of time 0. ``which`` count,
+    None: all."""
     groups: dict[float, list[int]] = {}
     for index, time in enumerate(images.times):
         if which is None or index in which:
@@ -167,7 +197,10 @@ class _Fit:
         """
         joints = self.scene.skeleton.joints
         none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))
-        heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in self.images]
+        heights = [
+            int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height
+            for x in self.images
+        ]
         coarse = max(1, round(max(heights) / COARSE_PX))
         shrinks = coarse, round(math.sqrt(coarse)), 1
         found = none if guess is None else self._better(none, guess, shrinks[0])
@@ -183,12 +216,16 @@ class _Fit:
             losses = [float(self._loss(x, self.images, shrink)) for x in (a, b)]
         return b if losses[1] < losses[0] else a
 
-    def _round(self, start: Correction, shrink: int, rate: float, last: float) -> tuple[Correction, int]:
-        """Return the correction after one round, and its number of updates; each is for one image, in turn."""
+    def _round(
+        self, start: Correction, shrink: int, rate: float, last: float
+    ) -> tuple[Correction, int]:
+        """Return the correction after one round, and its number of updates; each is for one image,
+        in turn."""
         now = Correction(start.turns.clone(), start.shift.clone())
         moments = [torch.zeros_like(x) for x in (now.turns, now.turns, now.shift, now.shift)]
         window = len(self.images) * math.ceil(WINDOW / len(self.images))
-        before, update = math.inf, 0
+        before = math.inf
+        update = 0
         for _ in range(self.comparison.most_windows or MOST_WINDOWS):
             total = 0.0
             for _ in range(window):
@@ -200,7 +237,14 @@ class _Fit:
                 total += float(loss.detach())
                 if len(self.images) >= self.comparison.views_to_turn:
                     adam_step_(now.turns, by_turns, *moments[:2], lr=rate, step=update, betas=BETAS)
-                adam_step_(now.shift, by_shift, *moments[2:], lr=SHIFT_RATE * rate, step=update, betas=BETAS)
+                adam_step_(
+                    now.shift,
+                    by_shift,
+                    *moments[2:],
+                    lr=SHIFT_RATE * rate,
+                    step=update,
+                    betas=BETAS,
+                )
             if total > (1 - LEAST_GAIN) * before:
                 rate /= 2
                 if rate < last:
@@ -209,8 +253,10 @@ class _Fit:
         return now, update
 
     def _loss(self, correction: Correction, images: Sequence[Image], shrink: int) -> Tensor:
-        """Return the loss () of a correction: the mean over ``images``, compared after shrinking, and its size."""
-        start, how = self.start, self.comparison
+        """Return the loss () of a correction: the mean over ``images``, compared after shrinking,
+        and its size."""
+        start = self.start
+        how = self.comparison
         posing = BodyPose(
             start.rotations[0] @ axis_angle_to_matrix(correction.turns),
             start.trans[0] + correction.shift * start.scale[0],
@@ -219,7 +265,12 @@ class _Fit:
         moment = self.scene.in_pose(posing, self.time)
         losses = []
         for image in images:
-            drawn = self.scene.render(image.cameras, moment, options=self.scene.options, background=self.background)
+            drawn = self.scene.render(
+                image.cameras, moment, options=self.scene.options, background=self.background
+            )
             losses.append(how.difference(drawn, image, self.background, shrink))
-        size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
+        size = (
+            how.turn_weight * correction.turns.square().mean()
+            + how.shift_weight * correction.shift.square().mean()
+        )
         return torch.stack(losses).mean() + size

@@ -1,4 +1,5 @@
-"""The human scene: Gaussians on a body template at rest, which its skeleton poses as a clip says."""
+"""The human scene: Gaussians on a body template at rest, which its skeleton poses as a clip
+says."""
 
 from __future__ import annotations
 
@@ -49,27 +50,37 @@ class HumanScene(GaussianScene):
     clip: MotionClip  # that of training, as it was given
     learned: Parameters  # corrections to all of these, see ``new_corrections``
     shapes: PoseBlendShapes | None = None  # the template's pose blend shapes, or None
-    # another clip to play, given as that of training was; None: that of training, corrected frame by frame
+    # another clip to play, given as that of training was; None: that of training, corrected frame
+    # by frame
     played: MotionClip | None = None
-    # (N,) in [0, 1] how far colours are what the training views showed, not filled; None: that was not found out
+    # (N,) in [0, 1] how far colours are what the training views showed, not filled; None: that was
+    # not found out
     seen: Tensor | None = None
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        """Return the scene of what ``state`` returned, playing the clip of training. Raises KeyError or ValueError."""
+        """Return the scene of what ``state`` returned, playing the clip of training. Raises
+        KeyError or ValueError."""
         tensors = dict(tensors)
         tensors.setdefault(
             "learned.weights", torch.zeros_like(tensors["anchors.weights"])
         )  # files hold the sum of both
         require_avatar(gaussians, tensors)
-        anchors = Anchors(**{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)})
+        anchors = Anchors(
+            **{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)}
+        )
         given = (tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale"))
         clip = MotionClip(*given)
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
-        own, shapes = part_of(tensors, "learned"), None
+        own = part_of(tensors, "learned")
+        shapes = None
         if "shapes.directions" in tensors:
-            require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
-            shapes = PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
+            require_shapes(
+                tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"])
+            )
+            shapes = PoseBlendShapes(
+                tensors["shapes.directions"].float(), tensors["shapes.faces"].long()
+            )
         learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
@@ -128,7 +139,9 @@ class HumanScene(GaussianScene):
     @property
     def fit(self) -> SharedCorrection:
         """The correction of all poses."""
-        return SharedCorrection(self.learned["turns"].detach(), float(self.learned["log_scale"].detach()))
+        return SharedCorrection(
+            self.learned["turns"].detach(), float(self.learned["log_scale"].detach())
+        )
 
     @property
     def up(self) -> Tensor:
@@ -148,7 +161,8 @@ class HumanScene(GaussianScene):
     def moves_as(self) -> MotionClip:
         """The clip that is played, with what was learned about the person applied."""
         if "clip" not in self._derived:
-            poses, trans = self.learned["poses"].detach(), self.learned["trans"].detach()
+            poses = self.learned["poses"].detach()
+            trans = self.learned["trans"].detach()
             self._derived["clip"] = (
                 corrected_clip(self.fit, self.clip, poses, trans)
                 if self.played is None
@@ -172,23 +186,32 @@ class HumanScene(GaussianScene):
         return self.in_pose(frame_pose(self.moves_as.at(now), 0), now)
 
     def in_pose(self, posing: BodyPose, time: float) -> GaussianTimeStep:
-        """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
+        """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
+        in the pose."""
         offsets = rest_offsets(self.anchors, posing, self.shapes)
-        gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
-        return GaussianTimeStep(gaussians, time, RestFrame(self.gaussians.means, posing.rotations[0]))
+        gaussians = pose_gaussians(
+            self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light
+        )
+        return GaussianTimeStep(
+            gaussians, time, RestFrame(self.gaussians.means, posing.rotations[0])
+        )
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
-        """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.
+        """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that
+        is learned.
 
         With ``given_weights`` (N, J) nothing that was learned about the body is applied.
         """
-        skeleton, light = self.skeleton, None
+        skeleton = self.skeleton
+        light = None
         if given_weights is None:
-            posing, skeleton = corrected_pose(self.learned, self.clip, row), corrected_skeleton(self.learned, skeleton)
+            posing = corrected_pose(self.learned, self.clip, row)
+            skeleton = corrected_skeleton(self.learned, skeleton)
             weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
             light = learned_light(self.learned)
         else:
-            posing, weights = frame_pose(self.clip, row), given_weights
+            posing = frame_pose(self.clip, row)
+            weights = given_weights
         offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
         return gaussians, posing
@@ -214,12 +237,14 @@ class HumanScene(GaussianScene):
     def playing(self, clip: MotionClip) -> HumanScene:
         """Return the same person in another clip, whose poses are given as those of training were.
 
-        What was learned about all poses is applied: the person's size, and how the joints are turned.
+        What was learned about all poses is applied: the person's size, and how the joints are
+        turned.
         """
         return replace(self, played=clip)
 
     def drawing_state(self) -> State:
-        """Return what drawing needs; learned corrections of skinning weights are applied to them."""
+        """Return what drawing needs; learned corrections of skinning weights are applied to
+        them."""
         state = super().drawing_state()
         state.pop("model.seen", None)
         corrections = state.pop("model.learned.weights").tensor
@@ -230,16 +255,26 @@ class HumanScene(GaussianScene):
         return state
 
     def _model_state(self) -> State:
-        """Return everything that the avatar needs besides its Gaussians: no file is read to draw it."""
-        clip, skeleton = self.clip, self.skeleton
+        """Return everything that the avatar needs besides its Gaussians: no file is read to draw
+        it."""
+        clip = self.clip
+        skeleton = self.skeleton
         state = prefixed("learned", self.learned.state())
         state |= prefixed("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
         if self.seen is not None:
             state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
-        given = {f"clip.{name}": getattr(clip, name) for name in ("times", "poses", "trans", "scale")}
-        given |= {"joints": skeleton.joints, "parents": torch.tensor(skeleton.parents, device="cpu")}
+        given = {
+            f"clip.{name}": getattr(clip, name) for name in ("times", "poses", "trans", "scale")
+        }
+        given |= {
+            "joints": skeleton.joints,
+            "parents": torch.tensor(skeleton.parents, device="cpu"),
+        }
         if self.shapes is not None:
-            given |= {"shapes.directions": self.shapes.directions.half(), "shapes.faces": self.shapes.faces.int()}
+            given |= {
+                "shapes.directions": self.shapes.directions.half(),
+                "shapes.faces": self.shapes.faces.int(),
+            }
         return state | {name: StateTensor(x, Role.SHARED) for name, x in given.items()}
 
 
@@ -253,7 +288,9 @@ _MOST_FACES = 2**31
 
 def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     """Check the state of an avatar against its Gaussians. Raises KeyError or ValueError."""
-    n, j, f = len(gaussians), len(state["joints"]), len(state["clip.times"])
+    n = len(gaussians)
+    j = len(state["joints"])
+    f = len(state["clip.times"])
     require_body(n, gaussians.sh.shape[1], state["parents"], j)
     require_moments("clip.times", state["clip.times"])
     shapes = dict.fromkeys(("joints", "learned.joints", "learned.turns"), (j, 3))
@@ -266,14 +303,25 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     if not f:
         raise ValueError("the clip has no frame")
     k = state["anchors.weights"].shape[-1]
-    shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
+    shapes = {
+        "points": (n, 3),
+        "size": (n,),
+        "barycentric": (n, 3),
+        "uv": (n, 2),
+        "height": (n,),
+        "weights": (n, k),
+    }
     for name, shape in shapes.items():
         require_tensor(f"anchors.{name}", state[f"anchors.{name}"], shape)
     require_indices("anchors.joints", state["anchors.joints"], (n, k), j)
     require_indices("anchors.face", state["anchors.face"], (n,), _MOST_FACES)
-    if bool((state["anchors.weights"] < 0).any()) or not bool((state["anchors.weights"].sum(1) > 0).all()):
+    if bool((state["anchors.weights"] < 0).any()) or not bool(
+        (state["anchors.weights"].sum(1) > 0).all()
+    ):
         raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
-    require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
+    require_tensor(
+        "learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape)
+    )
     if "learned.light" in state:
         require_tensor("learned.light", state["learned.light"], (TERMS, 3))
         require_tensor("learned.normals", state["learned.normals"], (n, 3))
@@ -286,11 +334,14 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
 
 
 def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: int) -> None:
-    """Check that the Gaussians have 1 or 4 harmonics and the skeleton is of a known family. Raises ValueError."""
+    """Check that the Gaussians have 1 or 4 harmonics and the skeleton is of a known family. Raises
+    ValueError."""
     if num_joints not in SMPLX_ROWS or terms not in (1, 4):
         raise ValueError(f"{num_gaussians} Gaussians of {terms} harmonics on {num_joints} joints")
     if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
-        raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
+        raise ValueError(
+            f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)"
+        )
     check_tree(tuple(parents.tolist()))
 
 
@@ -299,4 +350,6 @@ def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:
     require_tensor("shapes.directions", directions, (9 * (num_joints - 1), None), torch.float16)
     require_indices("shapes.faces", faces, (None, 3), directions.shape[1] // 3, torch.int32)
     if directions.shape[1] % 3:
-        raise ValueError(f"'shapes.directions' has {directions.shape[1]} columns, not three for each vertex")
+        raise ValueError(
+            f"'shapes.directions' has {directions.shape[1]} columns, not three for each vertex"
+        )

@@ -18,8 +18,21 @@ from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
-from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
-from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
+from dyngs.human.avatar.corrections import (
+    OF_FRAMES,
+    correction_penalties,
+    new_corrections,
+    share_sides,
+)
+from dyngs.human.avatar.neighbours import (
+    HARDLY,
+    filled,
+    linked_neighbours,
+    mirror_images,
+    sightings,
+    strains,
+    trust_in,
+)
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.pose_refit import PoseRefit
@@ -30,18 +43,23 @@ from dyngs.state import Role, State, with_role
 
 NEIGHBOURS = 5
 FRAMES_FROM = 0.25
-"""Fraction of the run after which poses of single frames are learned: what all frames share comes first."""
+"""Fraction of the run after which poses of single frames are learned: what all frames share comes
+first."""
 CENTIMETRE = 0.01
-SIDES_WEIGHT = 0.1  # of the squared difference between colours of both sides, where light is learned, in the loss
-LOOKS = 100  # number of training views, at most, in which it is counted how much they show of each Gaussian
+# of the squared difference between colours of both sides, where light is learned, in the loss
+SIDES_WEIGHT = 0.1
+# number of training views, at most, in which it is counted how much they show of each Gaussian
+LOOKS = 100
 WORTH_TELLING = 0.01  # least fraction of Gaussians that are hardly seen at which a line says so
 
 
 class HumanTraining(SceneTraining[HumanScene]):
-    """See ``SceneTraining``; ``frames`` are numbers of the rows of the clip of training, ``rates`` say how rates fall.
+    """See ``SceneTraining``; ``frames`` are numbers of the rows of the clip of training, ``rates``
+    say how rates fall.
 
-    ``views`` are camera and frame of the training views; without any, what they do not show is not filled. ``outlines``
-    is how colours are compared near the outlines of found masks, ``refit`` how poses are fitted again.
+    ``views`` are camera and frame of the training views; without any, what they do not show is not
+    filled. ``outlines`` is how colours are compared near the outlines of found masks, ``refit`` how
+    poses are fitted again.
     """
 
     moves_by = ("pose", "model")
@@ -65,8 +83,11 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._images: tuple[Tensor, Tensor] | None = None
         self._refit = refit
 
-    def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
-        """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
+    def first_scene(
+        self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
+    ) -> HumanScene:
+        """Return the scene of the first Gaussians: nothing is learned yet; light only with their
+        ``normals`` (N, 3)."""
         clip = subject.motion.clip
         learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
@@ -92,7 +113,9 @@ class HumanTraining(SceneTraining[HumanScene]):
         if self._refines(step):
             penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
-                penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
+                penalties["sides"] = SIDES_WEIGHT * difference_of_sides(
+                    scene.gaussians, *self._images_in(scene)
+                )
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
         frame = RestFrame(scene.gaussians.means, posing.rotations[0])
         return GaussianTimeStep(gaussians, image.time, frame, penalties)
@@ -115,12 +138,17 @@ class HumanTraining(SceneTraining[HumanScene]):
     def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene, and after the last step new values for what the images hardly show.
 
-        After the first step with a line about outlines, if there is one. In between poses may be fitted again.
+        After the first step with a line about outlines, if there is one. In between poses may be
+        fitted again.
         """
         if step == 1 and self._finding is not None:
             return scene, EditResult(None, finding=self._finding)
         if step == self.rates.steps:
-            return self._filled(scene, step) if self.options.fill_unseen and self.views and len(scene) else None
+            return (
+                self._filled(scene, step)
+                if self.options.fill_unseen and self.views and len(scene)
+                else None
+            )
         found = None if self._refit is None else self._refit.revised(scene, step)
         return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
 
@@ -135,10 +163,14 @@ class HumanTraining(SceneTraining[HumanScene]):
                 )
                 for camera, frame in shown
             )
-            seen = sightings(drawn, scene.anchors.size, float(scene.clip.scale.mean()), scene.options)
+            seen = sightings(
+                drawn, scene.anchors.size, float(scene.clip.scale.mean()), scene.options
+            )
             trust = trust_in(seen * (len(self.views) / len(shown)))
             middle = float(scene.skeleton.joints[0, 0])
-            changes = filled(scene.gaussians.detach(), scene.anchors, scene.given_weights(), middle, trust)
+            changes = filled(
+                scene.gaussians.detach(), scene.anchors, scene.given_weights(), middle, trust
+            )
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
         finding = line if hardly >= WORTH_TELLING else None
@@ -149,7 +181,9 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        self._near, self._given_weights, self._images = tensors.get("near"), None, None
+        self._near = tensors.get("near")
+        self._given_weights = None
+        self._images = None
         if self._refit is not None:
             self._refit.goes_on = "poses_stay" not in tensors
         return HumanScene.restored(gaussians, tensors)
@@ -178,7 +212,9 @@ class HumanTraining(SceneTraining[HumanScene]):
 
     def _penalties(self, scene: HumanScene) -> dict[str, Tensor]:
         """Return penalties for Gaussians far from their scaffolds, or larger than their texels."""
-        terms, options, now = {}, self.options, scene.gaussians
+        terms = {}
+        options = self.options
+        now = scene.gaussians
         if options.offset_weight > 0:
             away = (now.means - scene.anchors.points) / CENTIMETRE
             terms["offset"] = options.offset_weight * away.square().sum() / len(away)
@@ -187,12 +223,16 @@ class HumanTraining(SceneTraining[HumanScene]):
             terms["scale"] = options.scale_weight * longer.clamp_min(0).square().sum() / len(longer)
         return terms
 
-    def _between_neighbours(self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int) -> dict[str, Tensor]:
-        """Return penalties between neighbours at rest, in cm^2; in each step for one of the five neighbours.
+    def _between_neighbours(
+        self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int
+    ) -> dict[str, Tensor]:
+        """Return penalties between neighbours at rest, in cm^2; in each step for one of the five
+        neighbours.
 
         Rigidity: distances do not change. Smoothness: offsets from the scaffold are alike.
         """
-        options, means = self.options, scene.gaussians.means
+        options = self.options
+        means = scene.gaussians.means
         if options.rigidity == 0 and options.smoothness == 0:
             return {}
         if self._near is None:

@@ -22,7 +22,8 @@ class Detection:
     """A person in an image.
 
     Attributes:
-        keypoints: (17, 3) float32 in the order of COCO: column and row in pixels, and confidence in [0, 1].
+        keypoints: (17, 3) float32 in the order of COCO: column and row in pixels, and confidence in
+            [0, 1].
         mask: (H, W) uint8, 255 = the person.
     """
 
@@ -31,13 +32,18 @@ class Detection:
 
     @cached_property
     def box(self) -> np.ndarray:
-        """First and last column, first and last row (left, top, right, bottom), pixels; zeros where nothing is sure."""
+        """First and last column, first and last row (left, top, right, bottom), pixels; zeros where
+        nothing is sure."""
         person = self.mask > 127
         if person.any():
             rows, columns = (person.any(side).nonzero()[0] for side in (1, 0))
             return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)
         sure = self.keypoints[self.keypoints[:, 2] > SURE, :2]
-        return np.concatenate([sure.min(0), sure.max(0)]).astype(np.float64) if len(sure) else np.zeros(4)
+        return (
+            np.concatenate([sure.min(0), sure.max(0)]).astype(np.float64)
+            if len(sure)
+            else np.zeros(4)
+        )
 
     @property
     def height(self) -> float:
@@ -54,7 +60,8 @@ class Detector(Protocol):
         ...
 
     def detect(self, images: Sequence[Path]) -> list[list[Detection]]:
-        """Return the people in each of the images of one camera, which are PNG files of one size in order of time.
+        """Return the people in each of the images of one camera, which are PNG files of one size in
+        order of time.
 
         Raises DyngsError: it cannot be started, or fails.
         """

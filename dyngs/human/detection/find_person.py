@@ -58,11 +58,12 @@ def find_person(
     say: Callable[[str], None] = show,
     number: int = 1,
 ) -> FitInputs:
-    """Find a person in all views, write masks and key points to ``folder``, and return where they are.
+    """Find a person in all views, write masks and key points to ``folder``, and return where they
+    are.
 
-    Left and right are made the same over time. Where a camera stands, outlines of masks are those of what stands before
-    its background. Views without the person, or a camera that never shows them, get empty masks. Says what was found,
-    and what will be bad about it.
+    Left and right are made the same over time. Where a camera stands, outlines of masks are those
+    of what stands before its background. Views without the person, or a camera that never shows
+    them, get empty masks. Says what was found, and what will be bad about it.
     Raises DyngsError: nobody is found, or not so many.
 
     Args:
@@ -79,9 +80,13 @@ def find_person(
             _write_empty_masks(camera, folder / "masks")
             continue
         if not 1 <= number <= len(people):
-            raise DyngsError(f"{capture.root}: {where}--person {number}, but people found: {len(people)}")
+            raise DyngsError(
+                f"{capture.root}: {where}--person {number}, but people found: {len(people)}"
+            )
         person, swapped = with_sides(people[number - 1])
-        say(f"{where}{_summary(person, detector)}; left and right swapped in {counted(swapped, 'image')}")
+        say(
+            f"{where}{_summary(person, detector)}; left and right swapped in {counted(swapped, 'image')}"
+        )
         others = [x for x in people if x is not people[number - 1]]
         for warning in warnings_of(camera.images, person, others, alone=len(cameras) == 1):
             say(f"warning: {where}{warning}")
@@ -103,7 +108,11 @@ def _cameras_of(capture: Capture) -> list[_Camera]:
     for views in by_camera(capture.splits).values():
         size = target_size(views[0].width, views[0].height, 1.0, SIDE)
         images = [read_image(view.image_path, (view.width, view.height))[..., :3] for view in views]
-        cameras.append(_Camera(tuple(views), np.stack([area_downscale_uint8(x, *size).numpy() for x in images])))
+        cameras.append(
+            _Camera(
+                tuple(views), np.stack([area_downscale_uint8(x, *size).numpy() for x in images])
+            )
+        )
     return cameras
 
 
@@ -125,14 +134,18 @@ def _summary(person: Sequence[Detection | None], detector: Detector) -> str:
     return f"{detector.name} finds the person, {height:.0f} px high, in {len(seen)} of {counted(len(person), 'image')}"
 
 
-def _write_masks(camera: _Camera, person: Sequence[Detection | None], folder: Path, say: Callable[[str], None]) -> None:
+def _write_masks(
+    camera: _Camera, person: Sequence[Detection | None], folder: Path, say: Callable[[str], None]
+) -> None:
     """Write the masks of all views at their size; nothing where the detector makes no masks."""
     size = camera.images.shape[1:3]
     masks = np.stack([np.zeros(size, bool) if x is None else x.mask > 127 for x in person])
     better = outlined(camera.images, masks)
     if better is not None:
         common = (better & masks).sum() / max(int((better | masks).sum()), 1)
-        say(f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)")
+        say(
+            f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)"
+        )
     for view, mask in zip(camera.views, masks if better is None else better, strict=True):
         write_image(folder / f"{view.name}.png", at_size(mask, view))
 
@@ -160,10 +173,11 @@ def write_found_person(
     say: Callable[[str], None] = show,
     number: int = 1,
 ) -> FittedCapture:
-    """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the new folder ``out``.
+    """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
+    new folder ``out``.
 
-    ``options.root`` is a video or a folder of the frames of one standing camera, or a capture with cameras. Raises
-    DyngsError: see ``find_person`` and ``write_fitted_capture``.
+    ``options.root`` is a video or a folder of the frames of one standing camera, or a capture with
+    cameras. Raises DyngsError: see ``find_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
     clip = options.format == "auto" and not is_capture(options.root) and is_plain_clip(options.root)
@@ -179,7 +193,8 @@ def write_found_person(
 def with_found_person(
     data: DataConfig, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> DataConfig:
-    """Return the options with the capture of the person that is found in a clip; the same clip is looked at once.
+    """Return the options with the capture of the person that is found in a clip; the same clip is
+    looked at once.
 
     Raises DyngsError: no detector, or see ``write_found_person``.
     """

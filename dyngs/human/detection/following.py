@@ -13,12 +13,13 @@ from scipy.optimize import linear_sum_assignment
 
 from dyngs.human.detection.detector import SURE, Detection
 
-REACH = 0.6  # how far a person moves between images at most, in heights, beside what the last motion explains
+# how far a person moves between images at most, in heights, beside what the last motion explains
+REACH = 0.6
 GROWTH = 1.6  # largest ratio of a person's heights in following detections
 PATIENCE = 10  # images that a person may be missing
 SWAP = 0.04
-"""What a swapped image costs, in heights of the person by which each key point moves: a limb taken for the other one in
-a few images moves them more, and who has turned around stays so for long."""
+"""What a swapped image costs, in heights of the person by which each key point moves: a limb taken
+for the other one in a few images moves them more, and who has turned around stays so for long."""
 _IMPOSSIBLE = 1e3
 _PAIRS = {
     "all": ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)),
@@ -36,7 +37,8 @@ class _Track:
     last: list[tuple[int, np.ndarray]] = field(default_factory=list)  # the last two: image, box
 
     def expected(self, number: int) -> tuple[np.ndarray, float]:
-        """Return the middle (2,) of the person in image ``number`` at constant velocity, and the height, pixels."""
+        """Return the middle (2,) of the person in image ``number`` at constant velocity, and the
+        height, pixels."""
         (image, box) = self.last[-1]
         middle = _middle(box)
         if len(self.last) > 1:
@@ -56,16 +58,20 @@ class _Track:
 
 
 def followed(images: Sequence[Sequence[Detection]]) -> list[list[Detection | None]]:
-    """Return the people in the images (F) of one camera, each with their detection per image, the largest first.
+    """Return the people in the images (F) of one camera, each with their detection per image, the
+    largest first.
 
-    Detections are joined where middle and height of the boxes go on as before, all of an image at once (assignment of
-    least total distance). A person who is away for more than ``PATIENCE`` images comes back as another one.
+    Detections are joined where middle and height of the boxes go on as before, all of an image at
+    once (assignment of least total distance). A person who is away for more than ``PATIENCE``
+    images comes back as another one.
     """
     tracks: list[_Track] = []
     for number, people in enumerate(images):
         people = [person for person in people if person.height > 0]
         open_ones = [track for track in tracks if number - track.last[-1][0] <= PATIENCE]
-        costs = np.array([[_cost(track, number, person) for person in people] for track in open_ones])
+        costs = np.array(
+            [[_cost(track, number, person) for person in people] for track in open_ones]
+        )
         joined: dict[int, _Track] = {}
         if costs.size:
             pairs = zip(*linear_sum_assignment(np.minimum(costs, _IMPOSSIBLE)), strict=True)
@@ -94,11 +100,13 @@ def _cost(track: _Track, number: int, person: Detection) -> float:
 
 
 def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
-    """Return the detections of a person (F) with left and right as over time, and in how many images that changed.
+    """Return the detections of a person (F) with left and right as over time, and in how many
+    images that changed.
 
-    Detectors take one arm for the other where they cross, and front for back. First all pairs of key points, then arms,
-    then legs are swapped in those images where the key points then move so much less that ``SWAP`` is worth it: the
-    cheapest sequence of swapped and not, by dynamic programming.
+    Detectors take one arm for the other where they cross, and front for back. First all pairs of
+    key points, then arms, then legs are swapped in those images where the key points then move so
+    much less that ``SWAP`` is worth it: the cheapest sequence of swapped and not, by dynamic
+    programming.
     """
     numbers = [number for number, x in enumerate(person) if x is not None]
     detections = [x for x in person if x is not None]
@@ -108,7 +116,10 @@ def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | Non
     for pairs in _PAIRS.values():
         swapped = _swapped(points, np.array(pairs), heights)
         for left, right in pairs:
-            points[swapped, left], points[swapped, right] = points[swapped, right], points[swapped, left]
+            points[swapped, left], points[swapped, right] = (
+                points[swapped, right],
+                points[swapped, left],
+            )
         changed ^= swapped
     result = list(person)
     for number, detection, own in zip(numbers, detections, points.astype(np.float32), strict=True):
@@ -117,15 +128,21 @@ def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | Non
 
 
 def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Return in which images (F,) bool the ``pairs`` (P, 2) of ``points`` (F, 17, 3) are better swapped."""
+    """Return in which images (F,) bool the ``pairs`` (P, 2) of ``points`` (F, 17, 3) are better
+    swapped."""
     count = len(points)
-    both = np.stack([points[:, pairs], points[:, pairs[:, ::-1]]])  # (2, F, P, 2, 3): as they are, swapped
+    # (2, F, P, 2, 3): as they are, swapped
+    both = np.stack([points[:, pairs], points[:, pairs[:, ::-1]]])
     sure: np.ndarray = np.all(points[:, pairs, 2] > SURE, axis=-1)  # (F, P)
-    best, came_from = np.array([0.0, SWAP]), np.zeros((count, 2), int)
+    best = np.array([0.0, SWAP])
+    came_from = np.zeros((count, 2), int)
     for t in range(1, count):
         weights = (sure[t] & sure[t - 1])[None, None, :, None]
-        moved = np.linalg.norm(both[None, :, t, ..., :2] - both[:, None, t - 1, ..., :2], axis=-1)  # (2, 2, P, 2)
-        steps = (moved * weights).sum((2, 3)) / max(heights[t], 1e-6) / max(2 * int(weights.sum()), 1)
+        # (2, 2, P, 2)
+        moved = np.linalg.norm(both[None, :, t, ..., :2] - both[:, None, t - 1, ..., :2], axis=-1)
+        steps = (
+            (moved * weights).sum((2, 3)) / max(heights[t], 1e-6) / max(2 * int(weights.sum()), 1)
+        )
         total = best[:, None] + steps
         came_from[t] = total.argmin(0)
         best = total.min(0) + np.array([0.0, SWAP])

@@ -1,7 +1,8 @@
-"""MediaPipe's pose detector, in a process of its own environment: it wants another NumPy than dyngs.
+"""MediaPipe's pose detector, in a process of its own environment: it wants another NumPy than
+dyngs.
 
-BlazePose (Bazarevsky et al. 2020): 33 landmarks and a silhouette of one person, who is followed from image to image.
-The package brings its models with it.
+BlazePose (Bazarevsky et al. 2020): 33 landmarks and a silhouette of one person, who is followed
+from image to image. The package brings its models with it.
 """
 
 from __future__ import annotations
@@ -39,33 +40,49 @@ class MediaPipe:
     name = "MediaPipe"
 
     def __init__(self, python: Path | None = None) -> None:
-        """``python``: the interpreter of that environment; None: ``$DYNGS_MEDIAPIPE``. Raises DyngsError: not there."""
+        """``python``: the interpreter of that environment; None: ``$DYNGS_MEDIAPIPE``. Raises
+        DyngsError: not there."""
         named = os.environ.get(VARIABLE, "")
         chosen = python or (Path(named).expanduser() if named else None)
         if chosen is None:
-            raise DyngsError(f"no detector finds the person: install MediaPipe with {INSTALL}; {OTHERS}")
+            raise DyngsError(
+                f"no detector finds the person: install MediaPipe with {INSTALL}; {OTHERS}"
+            )
         if not chosen.is_file():
-            raise DyngsError(f"{chosen}: no such Python interpreter; install MediaPipe with {INSTALL}")
+            raise DyngsError(
+                f"{chosen}: no such Python interpreter; install MediaPipe with {INSTALL}"
+            )
         self._python = chosen
 
     def detect(self, images: Sequence[Path]) -> list[list[Detection]]:
-        """Return at most one person per image; the images must lie in one folder that holds no others."""
+        """Return at most one person per image; the images must lie in one folder that holds no
+        others."""
         if not images:
             return []
         with tempfile.TemporaryDirectory(prefix="dyngs-mediapipe-") as out:
-            self._run(images[0].parent, Path(out), _SECONDS_TO_START + _SECONDS_PER_IMAGE * len(images))
+            self._run(
+                images[0].parent, Path(out), _SECONDS_TO_START + _SECONDS_PER_IMAGE * len(images)
+            )
             return [_read(Path(out) / f"{image.stem}.npz") for image in images]
 
     def _run(self, images: Path, out: Path, seconds: float) -> None:
-        # -I: neither PYTHONPATH nor the current folder put packages of dyngs's environment before those of this one
+        # -I: neither PYTHONPATH nor the current folder put packages of dyngs's environment before
+        # those of this one
         command = [str(self._python), "-I", str(mediapipe_worker.__file__), str(images), str(out)]
         environment = {**os.environ, "GLOG_minloglevel": "3", "TF_CPP_MIN_LOG_LEVEL": "3"}
         try:
             done = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=seconds, check=False
+                command,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=seconds,
+                check=False,
             )
         except subprocess.TimeoutExpired:
-            raise DyngsError(f"{self._python}: MediaPipe ran for {seconds:.0f} s; try fewer frames") from None
+            raise DyngsError(
+                f"{self._python}: MediaPipe ran for {seconds:.0f} s; try fewer frames"
+            ) from None
         except OSError as error:
             raise DyngsError(f"cannot start {self._python}: {error.strerror or error}") from error
         if done.returncode == mediapipe_worker.NO_MEDIAPIPE:
@@ -74,7 +91,9 @@ class MediaPipe:
                 f"`{as_word(self._python)} -m pip install {PACKAGE}`"
             )
         if done.returncode:
-            raise DyngsError(f"{self._python}: MediaPipe failed ({done.returncode}): {_last_line(done.stderr)}")
+            raise DyngsError(
+                f"{self._python}: MediaPipe failed ({done.returncode}): {_last_line(done.stderr)}"
+            )
 
 
 def _last_line(said: str) -> str:

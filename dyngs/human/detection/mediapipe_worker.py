@@ -1,9 +1,11 @@
-"""Runs MediaPipe's pose detector; started with the interpreter of MediaPipe's own environment, which lacks dyngs.
+"""Runs MediaPipe's pose detector; started with the interpreter of MediaPipe's own environment,
+which lacks dyngs.
 
     PYTHON -I mediapipe_worker.py IMAGES OUT
 
-IMAGES is a folder of PNG files in order of time, OUT a folder to which ``NAME.npz`` is written for each image in which
-somebody is found: ``landmarks`` (33, 3), column and row in pixels, and visibility; ``mask`` (H, W) uint8.
+IMAGES is a folder of PNG files in order of time, OUT a folder to which ``NAME.npz`` is written for
+each image in which somebody is found: ``landmarks`` (33, 3), column and row in pixels, and
+visibility; ``mask`` (H, W) uint8.
 """
 
 import importlib
@@ -15,7 +17,8 @@ NO_MEDIAPIPE = 3  # exit status
 
 def main() -> int:
     """Detect."""
-    images, out = Path(sys.argv[1]), Path(sys.argv[2])
+    images = Path(sys.argv[1])
+    out = Path(sys.argv[2])
     try:
         np = importlib.import_module("numpy")
         cv2 = importlib.import_module("cv2")
@@ -30,9 +33,13 @@ def main() -> int:
             if found.pose_landmarks is None or found.segmentation_mask is None:
                 continue
             height, width = rgb.shape[:2]
-            rows = [(x.x * width, x.y * height, x.visibility) for x in found.pose_landmarks.landmark]
+            rows = [
+                (x.x * width, x.y * height, x.visibility) for x in found.pose_landmarks.landmark
+            ]
             mask = (np.clip(found.segmentation_mask, 0, 1) * 255).round().astype(np.uint8)
-            np.savez_compressed(out / f"{path.stem}.npz", landmarks=np.array(rows, np.float32), mask=mask)
+            np.savez_compressed(
+                out / f"{path.stem}.npz", landmarks=np.array(rows, np.float32), mask=mask
+            )
     return 0
 
 

@@ -1,1 +1,2 @@
-"""Fitting the body template to images of a person: one shape, one skeleton, a pose for every frame."""
+"""Fitting the body template to images of a person: one shape, one skeleton, a pose for every
+frame."""

@@ -1,4 +1,5 @@
-"""The fit of a whole capture: reads silhouettes and given poses, fits the body, judges the result on views left out."""
+"""The fit of a whole capture: reads silhouettes and given poses, fits the body, judges the result
+on views left out."""
 
 from __future__ import annotations
 
@@ -42,19 +43,21 @@ MOST_VIEWS = 8  # views of one frame that are looked at
 GAIN, GAIN_OF_SHAPE = 0.01, 0.03
 """Gain of IoU for which more is learned, and for which given poses are touched at all.
 
-Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another shape explains thick
-clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
+Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another
+shape explains thick clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
-PLACING = 40  # most steps of Adam in which a clip is moved to its silhouettes: three numbers are learned
+# most steps of Adam in which a clip is moved to its silhouettes: three numbers are learned
+PLACING = 40
 TRIAL, PROMISING = 4, 0.75
-"""What is tried next is learned in the last of so many parts of its steps at first, when rates are low, and in all of
-them where that gains this fraction of ``GAIN``. Where a limb is off, it gains several times that."""
+"""What is tried next is learned in the last of so many parts of its steps at first, when rates are
+low, and in all of them where that gains this fraction of ``GAIN``. Where a limb is off, it gains
+several times that."""
 LONGER, HIGHER = 3, 0.3
-"""Poses that were found frame by frame are off by more than given ones: they get so many times the steps, at rates of
-10 to this power times as much at first. Found in 20 frames of four people."""
+"""Poses that were found frame by frame are off by more than given ones: they get so many times the
+steps, at rates of 10 to this power times as much at first. Found in 20 frames of four people."""
 MOST_OF_THE_BORDER = 0.6
-"""Mean fraction of the outermost pixels of images beyond which a silhouette is that of the background: people who are
-cut off on three sides cover less."""
+"""Mean fraction of the outermost pixels of images beyond which a silhouette is that of the
+background: people who are cut off on three sides cover less."""
 SHAPE = ("log_scale", "betas", "padding", "offset", "shift")  # what is the same in all frames
 
 
@@ -75,14 +78,16 @@ class FitEffort:
 class Known:
     """What is known next to images and given poses."""
 
-    joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.keypoints``; None without
+    # in 3D, of frames of the capture, see ``dyngs.human.fit.keypoints``; None without
+    joints: Joints3D | None = None
     # the capture is one camera that stands at the origin, with a guessed focal length to be refined
     guessed_lens: bool = False
     shape: bool = False  # the body has the shape of the person already
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """Names of what is learned for all frames; one camera does not tell a small person from a distant one."""
+        """Names of what is learned for all frames; one camera does not tell a small person from a
+        distant one."""
         fixed = ("log_scale",) * self.guessed_lens + ("betas",) * self.shape
         return tuple(name for name in SHAPE if name not in fixed)
 
@@ -105,8 +110,11 @@ class CaptureFit:
     motion: CapturedMotion  # the given clip, F frames
     chosen: TriedFit  # the candidate that was taken
     tried: tuple[TriedFit, ...]  # all candidates; the first one has the poses as given
-    held_out: int  # views left out of the fit, on which the candidates were measured; 0: measured on those fitted to
-    lens: LensFit | None = None  # the focal length of one fixed camera that was guessed; None where cameras are known
+    # views left out of the fit, on which the candidates were measured; 0: measured on those fitted
+    # to
+    held_out: int
+    # the focal length of one fixed camera that was guessed; None where cameras are known
+    lens: LensFit | None = None
 
 
 @dataclass(frozen=True)
@@ -142,12 +150,14 @@ def fit_capture(
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
-    With given poses: first the shape; then rotations that are the same in all frames, and then those of every frame,
-    each where it explains views clearly better that were left out. Without: poses are found first (``first_poses``).
-    Raises DyngsError: no silhouettes, or nobody in them.
+    With given poses: first the shape; then rotations that are the same in all frames, and then
+    those of every frame, each where it explains views clearly better that were left out. Without:
+    poses are found first (``first_poses``). Raises DyngsError: no silhouettes, or nobody in them.
     """
     if not capture.has_alpha:
-        raise DyngsError(f"{capture.root}: the images have no silhouettes; add masks of the person (docs/human.md)")
+        raise DyngsError(
+            f"{capture.root}: the images have no silhouettes; add masks of the person (docs/human.md)"
+        )
     capture = capture.replace(splits=numbered(capture.splits))
     views = capture.splits["train"]
     given = capture.body is not None
@@ -156,10 +166,13 @@ def fit_capture(
         if capture.body is None
         else captured_motion(capture.root, capture.body["train"], views, body.joints)
     )
-    seen, surface = look_at(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
+    seen = look_at(capture, motion, options, effort, keypoints or {})
+    surface = surface_of(body, RESOLUTION)
     joints = known.joints
     if joints is not None:
-        seen = seen.with_positions({row: joints[frame] for frame, row in motion.rows.items() if frame in joints})
+        seen = seen.with_positions(
+            {row: joints[frame] for frame, row in motion.rows.items() if frame in joints}
+        )
     if given:
         fitting = Fitting(motion.clip, surface, near_given(motion.clip))
         tried = _from_given(fitting, seen, known.learned, report, effort)
@@ -171,20 +184,29 @@ def fit_capture(
         tried = _from_silhouettes(fitting, seen, known.learned, report, effort)
     lens = None
     if known.guessed_lens:
-        fitting, steps = replace(fitting, expected=usual(motion.clip)), effort.steps_for(motion.clip)
+        fitting = replace(fitting, expected=usual(motion.clip))
+        steps = effort.steps_for(motion.clip)
         tick = ticker("focal length", report, 5 * steps)
-        refined, lens = fit_lens(fitting, tried[-1].learned, known.learned, seen.used.__getitem__, steps, tick)
+        refined, lens = fit_lens(
+            fitting, tried[-1].learned, known.learned, seen.used.__getitem__, steps, tick
+        )
         if lens.taken:
             tried = (*tried, measured("the focal length refined", refined, fitting, seen))
     first_gain = 0.0 if not given else GAIN if known.shape else GAIN_OF_SHAPE
-    chosen = tried[-1] if lens is not None and lens.taken else simplest_of_the_best(tried, first_gain)
-    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, lens)
+    chosen = (
+        tried[-1] if lens is not None and lens.taken else simplest_of_the_best(tried, first_gain)
+    )
+    return CaptureFit(
+        body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, lens
+    )
 
 
 def simplest_of_the_best(tried: Sequence[TriedFit], first_gain: float = GAIN_OF_SHAPE) -> TriedFit:
-    """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to complex.
+    """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to
+    complex.
 
-    ``first_gain`` is the gain of IoU for which the first one is left: given poses are touched for much only.
+    ``first_gain`` is the gain of IoU for which the first one is left: given poses are touched for
+    much only.
     """
     best = tried[0]
     for candidate in tried[1:]:
@@ -193,8 +215,11 @@ def simplest_of_the_best(tried: Sequence[TriedFit], first_gain: float = GAIN_OF_
     return best
 
 
-def split_views(views: Sequence[View], motion: CapturedMotion) -> tuple[dict[int, list[int]], dict[int, list[int]]]:
-    """Return, per row of the clip, the indices of the views to fit to, and of those left out to judge by.
+def split_views(
+    views: Sequence[View], motion: CapturedMotion
+) -> tuple[dict[int, list[int]], dict[int, list[int]]]:
+    """Return, per row of the clip, the indices of the views to fit to, and of those left out to
+    judge by.
 
     One view of each frame is left out, another one in each frame, where a frame has at least five.
     """
@@ -214,24 +239,36 @@ def split_views(views: Sequence[View], motion: CapturedMotion) -> tuple[dict[int
 
 
 def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
-    """Return a clip of the views' frames that says nothing about poses, for a body with ``joints`` (J, 3)."""
+    """Return a clip of the views' frames that says nothing about poses, for a body with ``joints``
+    (J, 3)."""
     times = {-1 if view.frame is None else view.frame: view.time for view in views}
     frames = tuple(sorted(times))
     last = max(len(frames) - 1, 1)
-    moments = [row / last if times[frame] is None else times[frame] for row, frame in enumerate(frames)]
+    moments = [
+        row / last if times[frame] is None else times[frame] for row, frame in enumerate(frames)
+    ]
     zeros = joints.new_zeros(len(frames), len(joints), 3)
     clip = MotionClip(
-        torch.tensor(moments, dtype=torch.float64, device="cpu"), zeros, zeros[:, 0], torch.ones_like(zeros[:, 0, 0])
+        torch.tensor(moments, dtype=torch.float64, device="cpu"),
+        zeros,
+        zeros[:, 0],
+        torch.ones_like(zeros[:, 0, 0]),
     )
     return CapturedMotion(clip, frames)
 
 
 def look_at(
-    capture: Capture, motion: CapturedMotion, options: DataConfig, effort: FitEffort, keypoints: Keypoints
+    capture: Capture,
+    motion: CapturedMotion,
+    options: DataConfig,
+    effort: FitEffort,
+    keypoints: Keypoints,
 ) -> Seen:
     """Return the squares around the person in all frames. Raises DyngsError: nobody is seen."""
     views = capture.splits["train"]
-    images = ImageLoader(views, options.model_copy(update={"longest_side": IMAGE_SIDE, "downscale": 1}))
+    images = ImageLoader(
+        views, options.model_copy(update={"longest_side": IMAGE_SIDE, "downscale": 1})
+    )
     used, left_out = split_views(views, motion)
     shown = [i for rows in (used, left_out) for own in rows.values() for i in own]
     if float(np.mean([_border_covered(images[i]) for i in shown])) > MOST_OF_THE_BORDER:
@@ -241,14 +278,20 @@ def look_at(
         )
     side = longest_box_side(images[i] for i in shown)
     if side < 8:
-        raise DyngsError(f"{capture.root}: nobody is seen in the silhouettes; check the masks (docs/human.md)")
+        raise DyngsError(
+            f"{capture.root}: nobody is seen in the silhouettes; check the masks (docs/human.md)"
+        )
     size = min(effort.side, 2 * (side // 2))
     marked = _marked(views, images, shown, keypoints)
 
     def frames(rows: dict[int, list[int]]) -> dict[int, ObservedFrame | None]:
-        return {row: observed_frame([images[i] for i in own], side, size, marked) for row, own in rows.items()}
+        return {
+            row: observed_frame([images[i] for i in own], side, size, marked)
+            for row, own in rows.items()
+        }
 
-    held_out, seen = sum(map(len, left_out.values())), frames(used)
+    held_out = sum(map(len, left_out.values()))
+    seen = frames(used)
     return Seen(seen, frames(left_out) if held_out else seen, held_out)
 
 
@@ -257,17 +300,23 @@ def _border_covered(image: Image) -> float:
     if image.alpha is None:
         return 0.0
     inside = image.alpha > 0.5
-    return float(torch.cat([inside[0], inside[-1], inside[1:-1, 0], inside[1:-1, -1]]).float().mean())
+    return float(
+        torch.cat([inside[0], inside[-1], inside[1:-1, 0], inside[1:-1, -1]]).float().mean()
+    )
 
 
-def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], points: Keypoints) -> Keypoints:
+def _marked(
+    views: Sequence[View], images: ImageLoader, shown: Sequence[int], points: Keypoints
+) -> Keypoints:
     """Return the key points (55, 3) in the pixels of the images, of those of the stored images."""
     found: Keypoints = {}
     for i in shown if points else ():
         view = views[i]
         if view.name in points:
             camera = images[i].cameras
-            scale = points[view.name].new_tensor([camera.width / view.width, camera.height / view.height, 1.0])
+            scale = points[view.name].new_tensor(
+                [camera.width / view.width, camera.height / view.height, 1.0]
+            )
             found[view.name] = points[view.name] * scale
     return found
 
@@ -277,7 +326,8 @@ def _from_given(
 ) -> tuple[TriedFit, ...]:
     start = new_fit(fitting.clip, fitting.surface)
     tick = ticker("shape", report, 3 * effort.steps)
-    half, full = InTurn(seen.halves), seen.used.__getitem__
+    half = InTurn(seen.halves)
+    full = seen.used.__getitem__
     # Clothes and hair are no sign of wrong poses.
     dressed = fitting.run(start, ("padding",), effort.steps, half, tick)
     tried = [measured("the poses as given", dressed, fitting, seen)]
@@ -287,7 +337,11 @@ def _from_given(
     tried.append(measured("one shape", shape, fitting, seen))
     more = (
         ("turns that are the same in all frames as well", (*shared, "turns"), effort.steps),
-        ("turns of every frame as well", (*shared, "turns", "poses", "trans"), effort.steps_for(fitting.clip)),
+        (
+            "turns of every frame as well",
+            (*shared, "turns", "poses", "trans"),
+            effort.steps_for(fitting.clip),
+        ),
     )
     for name, learned, steps in more:
         few = -(-steps // TRIAL)
@@ -304,8 +358,10 @@ def _from_given(
 def _from_silhouettes(
     fitting: Fitting, seen: Seen, shape: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[TriedFit, ...]:
-    start, steps = new_fit(fitting.clip, fitting.surface), LONGER * effort.steps_for(fitting.clip)
-    tick, found = ticker("shape", report, 2 * steps), start
+    start = new_fit(fitting.clip, fitting.surface)
+    steps = LONGER * effort.steps_for(fitting.clip)
+    tick = ticker("shape", report, 2 * steps)
+    found = start
     first = measured("poses found frame by frame", start, fitting, seen)
     for look in (seen.halves.__getitem__, seen.used.__getitem__):
         found = fitting.run(found, (*shape, "poses", "trans"), steps, look, tick, fallen=-HIGHER)
@@ -332,8 +388,11 @@ def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> Tr
         found.append(torch.zeros(0, device="cpu"))
         if frame is not None:
             drawn = drawn_frame(learned, fitting.clip, fitting.surface, row, frame.cameras)
-            ours, theirs, known = drawn > 0.5, frame.alpha > 0.5, frame.known > 0
-            both, either = (ours & theirs & known), ((ours | theirs) & known)
+            ours = drawn > 0.5
+            theirs = frame.alpha > 0.5
+            known = frame.known > 0
+            both = ours & theirs & known
+            either = (ours | theirs) & known
             found[-1] = both.sum((1, 2)) / either.sum((1, 2)).clamp_min(1)
     per_frame = tuple(float(x.mean()) if len(x) else float("nan") for x in found)
     return TriedFit(name, learned, float(torch.cat(found).mean()), per_frame)
@@ -347,7 +406,8 @@ class NewClip:
     """Another clip of a fitted person."""
 
     motion: CapturedMotion  # its poses as given
-    shift: Tensor  # (3,) to add to its translations, in the unit of the world, in place of that of the fit
+    # (3,) to add to its translations, in the unit of the world, in place of that of the fit
+    shift: Tensor
     iou: float  # with the shift of the fit
     iou_moved: float | None  # with that of the clip itself; None where that was not taken
 
@@ -355,7 +415,9 @@ class NewClip:
         """Return a line for people."""
         if self.iou_moved is None:
             return f"new poses: at the place of the fit; overlap of silhouettes {self.iou:.3f}"
-        return f"new poses: moved to their silhouettes; overlap {self.iou:.3f} -> {self.iou_moved:.3f}"
+        return (
+            f"new poses: moved to their silhouettes; overlap {self.iou:.3f} -> {self.iou_moved:.3f}"
+        )
 
 
 def placed_clip(
@@ -366,7 +428,8 @@ def placed_clip(
     report: ReportProgress,
     effort: FitEffort = FitEffort(),
 ) -> NewClip | None:
-    """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without such a clip.
+    """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without
+    such a clip.
 
     All views of ``capture`` have frame numbers; ``found`` is the fit of those of training.
     """
@@ -395,32 +458,43 @@ def placed_clip(
 def fitted_clips(
     capture: Capture, body: BodyTemplate, found: CaptureFit, new_poses: NewClip | None
 ) -> dict[Split, CapturedMotion]:
-    """Return the clip of training, with the frames of val and test, and that of ``pose``, if the capture has one.
+    """Return the clip of training, with the frames of val and test, and that of ``pose``, if the
+    capture has one.
 
-    Frames that were not fitted have what holds for all frames applied to their given poses; without given poses they
-    lie between their neighbours. All views of ``capture`` have frame numbers; ``new_poses`` is the clip of ``pose``.
+    Frames that were not fitted have what holds for all frames applied to their given poses; without
+    given poses they lie between their neighbours. All views of ``capture`` have frame numbers;
+    ``new_poses`` is the clip of ``pose``.
     """
     clips: dict[Split, CapturedMotion] = {"train": _of_training(capture, body, found)}
     if new_poses is not None:
         fit = replace(found.fit, shift=new_poses.shift)
-        clips["pose"] = CapturedMotion(fit.applied(_expanded(new_poses.motion)), new_poses.motion.frames)
+        clips["pose"] = CapturedMotion(
+            fit.applied(_expanded(new_poses.motion)), new_poses.motion.frames
+        )
     return clips
 
 
 def _of_training(capture: Capture, body: BodyTemplate, found: CaptureFit) -> CapturedMotion:
     fitted = replace(found.motion, clip=found.fit.fitted(found.motion.clip))
-    known, rows = _expanded(fitted), fitted.rows
+    known = _expanded(fitted)
+    rows = fitted.rows
     views = [view for split in ("train", "val", "test") for view in capture.splits.get(split, ())]
     times = {-1 if view.frame is None else view.frame: view.time for view in views}
     frames = tuple(sorted(times))
     if capture.body is not None:
         motion = captured_motion(capture.root, capture.body["train"], views, body.joints)
-        others, at = found.fit.applied(motion.clip), motion.rows
-        parts = [known.select(_row(rows[f])) if f in rows else others.select(_row(at[f])) for f in frames]
+        others = found.fit.applied(motion.clip)
+        at = motion.rows
+        parts = [
+            known.select(_row(rows[f])) if f in rows else others.select(_row(at[f])) for f in frames
+        ]
     else:
-        parts = [known.select(_row(rows[f])) if f in rows else fitted.clip.at(times[f]) for f in frames]
+        parts = [
+            known.select(_row(rows[f])) if f in rows else fitted.clip.at(times[f]) for f in frames
+        ]
     tensors = {
-        name: torch.cat([getattr(part, name) for part in parts]) for name in ("times", "poses", "trans", "scale")
+        name: torch.cat([getattr(part, name) for part in parts])
+        for name in ("times", "poses", "trans", "scale")
     }
     return CapturedMotion(MotionClip(**tensors), frames)
 

@@ -15,7 +15,13 @@ import torch
 from torch import Tensor
 
 from dyngs.capture.background import with_background_masks
-from dyngs.capture.fixed_camera import FORMAT, is_plain_clip, read_fixed_camera, silhouettes_of, zoomed
+from dyngs.capture.fixed_camera import (
+    FORMAT,
+    is_plain_clip,
+    read_fixed_camera,
+    silhouettes_of,
+    zoomed,
+)
 from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig, HumanModel
 from dyngs.conventions import ReportProgress, report_nothing
@@ -32,7 +38,14 @@ from dyngs.files.outputs import new_folder
 from dyngs.files.temporary import cache_folder
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
-from dyngs.human.fit.capture_fit import CaptureFit, Known, NewClip, fit_capture, fitted_clips, placed_clip
+from dyngs.human.fit.capture_fit import (
+    CaptureFit,
+    Known,
+    NewClip,
+    fit_capture,
+    fitted_clips,
+    placed_clip,
+)
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.fit.known_person import (
     AvatarPoses,
@@ -51,7 +64,8 @@ from dyngs.human.template.body_reader import has_same_shapes, load_template, rea
 from dyngs.human.template.joints import JOINT_NAMES
 
 _LOOKED_AT, _PRESENT = 128, 0.2
-"""Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""
+"""Longest side of the images in which somebody is looked for, and the least fraction of the usual
+area that counts."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +74,8 @@ class FitInputs:
 
     keypoints: Path | None = None  # folder or file of 2D key points
     masks: Path | None = None  # folder of masks, white = the person
-    background: Path | None = None  # image of the place without the person, or a folder of one for each camera
+    # image of the place without the person, or a folder of one for each camera
+    background: Path | None = None
     joints: Path | None = None  # file or folder of 3D joints or posed vertices, see ``read_joints``
     body: Path | None = None  # body file whose vertices these are; None: the template
     person: Path | None = None  # capture or run of the same person, whose shape is kept
@@ -74,11 +89,15 @@ def has_guessed_lens(capture: Capture) -> bool:
     return capture.format == FORMAT
 
 
-def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = show) -> Capture:
-    """Return a capture with silhouettes: of a capture, or a video or a folder of images of one fixed camera.
+def read_person(
+    options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = show
+) -> Capture:
+    """Return a capture with silhouettes: of a capture, or a video or a folder of images of one
+    fixed camera.
 
-    Masks of ``given`` take the place of those of the capture; without any they are made from the background, in the
-    folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and none that can be made.
+    Masks of ``given`` take the place of those of the capture; without any they are made from the
+    background, in the folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and
+    none that can be made.
     """
     source = options.root
     if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
@@ -90,12 +109,18 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
         if given.masks is not None:
             splits: dict[Split, tuple[View, ...]] = {}
             for split, views in capture.splits.items():
-                found = silhouettes_of(given.masks, [f"{view.name}{view.image_path.suffix}" for view in views])
-                splits[split] = tuple(replace(view, silhouette=own) for view, own in zip(views, found, strict=True))
+                found = silhouettes_of(
+                    given.masks, [f"{view.name}{view.image_path.suffix}" for view in views]
+                )
+                splits[split] = tuple(
+                    replace(view, silhouette=own) for view, own in zip(views, found, strict=True)
+                )
             capture = capture.replace(splits=splits, has_alpha=True)
     if given.background is not None or not capture.has_alpha:
         if capture.format == "neuman":
-            raise DyngsError(f"{source}: no silhouettes, and the camera moves; add masks of the person")
+            raise DyngsError(
+                f"{source}: no silhouettes, and the camera moves; add masks of the person"
+            )
         capture = with_background_masks(capture, work, given.background, say)
     found_only = has_guessed_lens(capture) or given.masks is not None
     return _without_empty_frames(capture, options, say) if found_only else capture
@@ -112,10 +137,16 @@ def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
     return capture.replace(splits=splits)
 
 
-def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[str], None]) -> Capture:
+def _without_empty_frames(
+    capture: Capture, options: DataConfig, say: Callable[[str], None]
+) -> Capture:
     views = capture.splits["train"]
-    small = ImageLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
-    areas = [0.0 if (alpha := small[i].alpha) is None else float(alpha.mean()) for i in range(len(views))]
+    small = ImageLoader(
+        views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1})
+    )
+    areas = [
+        0.0 if (alpha := small[i].alpha) is None else float(alpha.mean()) for i in range(len(views))
+    ]
     usual = sorted(areas)[len(areas) * 3 // 4]
     kept = tuple(view for view, area in zip(views, areas, strict=True) if area > _PRESENT * usual)
     if not kept:
@@ -136,10 +167,11 @@ def write_body(
     betas: np.ndarray,
     capture: Capture,
 ) -> None:
-    """Write the body parameters of a clip, also readable as a motion: rows are named by their frame numbers.
+    """Write the body parameters of a clip, also readable as a motion: rows are named by their frame
+    numbers.
 
-    They are in the coordinates of the files of ``capture``. ``betas`` (B,) are of the shape space of the template
-    ``body``.
+    They are in the coordinates of the files of ``capture``. ``betas`` (B,) are of the shape space
+    of the template ``body``.
     """
     clip = found.clip
     with atomic_file(path) as temporary, temporary.open("wb") as file:
@@ -159,9 +191,14 @@ def write_body(
 
 
 def write_split(
-    out: Path, split: Split, shown: Iterator[tuple[View, Image, Image]], rows: Mapping[int, int], capture: Capture
+    out: Path,
+    split: Split,
+    shown: Iterator[tuple[View, Image, Image]],
+    rows: Mapping[int, int],
+    capture: Capture,
 ) -> None:
-    """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
+    """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha,
+    undistorted.
 
     Where masks are files beside the images, they stay so (``silhouette_path``).
 
@@ -174,8 +211,11 @@ def write_split(
     for view, image, photo in shown:
         row = rows[-1 if view.frame is None else view.frame]
         stem = f"{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
-        name, mask = f"images/{stem}", f"masks/{stem}"
-        parts = [photo.rgb_premultiplied] + ([] if photo.alpha is None else [photo.alpha[..., None]])
+        name = f"images/{stem}"
+        mask = f"masks/{stem}"
+        parts = [photo.rgb_premultiplied] + (
+            [] if photo.alpha is None else [photo.alpha[..., None]]
+        )
         write_image(out / name, straight_uint8(torch.cat(parts, dim=-1)).numpy())
         if view.silhouette is not None and image.alpha is not None:
             write_image(out / mask, straight_uint8(image.alpha[..., None]).numpy())
@@ -186,17 +226,28 @@ def write_split(
         entry: dict[str, object] = {"file_path": name, "frame": row, "camera": view.camera_id}
         entry |= {} if view.silhouette is None else {"silhouette_path": mask}
         entry |= {} if view.time is None else {"time": view.time}
-        entry |= {"w": camera.width, "h": camera.height, "fl_x": intrinsics[0, 0], "fl_y": intrinsics[1, 1]}
-        frames.append(entry | {"cx": intrinsics[0, 2], "cy": intrinsics[1, 2], "transform_matrix": pose.tolist()})
+        entry |= {
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": intrinsics[0, 0],
+            "fl_y": intrinsics[1, 1],
+        }
+        frames.append(
+            entry
+            | {"cx": intrinsics[0, 2], "cy": intrinsics[1, 2], "transform_matrix": pose.tolist()}
+        )
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
 
 
-GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)  # colours of the outlines: red and green
+GIVEN = (0.9, 0.1, 0.1)
+FITTED = (0.0, 0.7, 0.1)  # colours of the outlines: red and green
 
 
 @torch.no_grad()
 def overlay(
-    image: Image, surface: Surface, bodies: Sequence[tuple[Tensor, BodyPose, tuple[float, float, float]]]
+    image: Image,
+    surface: Surface,
+    bodies: Sequence[tuple[Tensor, BodyPose, tuple[float, float, float]]],
 ) -> np.ndarray:
     """Return the image (H, W, 3) in [0, 1] over white with the outlines of bodies.
 
@@ -217,7 +268,8 @@ def side_by_side(sheets: Sequence[np.ndarray], columns: int) -> np.ndarray:
     rows = -(-len(sheets) // columns)
     whole = np.ones((rows * height, min(columns, len(sheets)) * width, 3), np.float32)
     for i, sheet in enumerate(sheets):
-        top, left = i // columns * height, i % columns * width
+        top = i // columns * height
+        left = i % columns * width
         whole[top : top + sheet.shape[0], left : left + sheet.shape[1]] = sheet
     return whole
 
@@ -225,12 +277,14 @@ def side_by_side(sheets: Sequence[np.ndarray], columns: int) -> np.ndarray:
 REPORT_NAME, OVERLAYS_NAME = "fit_report.json", "fit_overlays.png"
 _MASKS = ".masks"
 _SHOWN, _COLUMNS, _SHOWN_SIDE, _SHOWN_RESOLUTION = 8, 4, 400, 72
-"""Overlays, how many in a row, their longest side in pixels, and the texels per side of the body drawn over them."""
+"""Overlays, how many in a row, their longest side in pixels, and the texels per side of the body
+drawn over them."""
 
 
 @dataclass(frozen=True)
 class FittedCapture:
-    """Result of ``write_fitted_capture``: the new capture's folder, the fit, and the clips that an avatar posed."""
+    """Result of ``write_fitted_capture``: the new capture's folder, the fit, and the clips that an
+    avatar posed."""
 
     root: Path
     found: CaptureFit
@@ -241,8 +295,13 @@ class FittedCapture:
 
     def summary(self) -> str:
         """Return lines for people: how good the fit is."""
-        found, frames = self.found, len(self.found.motion.clip)
-        where = f"{counted(found.held_out, 'view')} left out of the fit" if found.held_out else "the views fitted to"
+        found = self.found
+        frames = len(self.found.motion.clip)
+        where = (
+            f"{counted(found.held_out, 'view')} left out of the fit"
+            if found.held_out
+            else "the views fitted to"
+        )
         worst = int(np.nanargmin(found.chosen.per_frame))
         tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
         lens = "" if found.lens is None else f"\n{found.lens.summary()}"
@@ -257,13 +316,20 @@ class FittedCapture:
 
 
 def write_fitted_capture(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = FitInputs(), *, with_images: bool = True
+    options: DataConfig,
+    out: Path,
+    report: ReportProgress,
+    given: FitInputs = FitInputs(),
+    *,
+    with_images: bool = True,
 ) -> FittedCapture:
-    """Fit the template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
+    """Fit the template to a capture and write it to the new folder ``out`` in the layout
+    ``body_json``.
 
-    Files: ``transforms_SPLIT.json``, ``images/`` and found ``masks/`` (else for ``data.body``), ``body_train.npz``,
-    ``body_pose.npz`` for another clip, ``fit_report.json``, and ``fit_overlays.png`` to look at. Raises DyngsError: see
-    ``fit_capture``; ``out`` is not empty; a template that cannot be read or has no texture coordinates.
+    Files: ``transforms_SPLIT.json``, ``images/`` and found ``masks/`` (else for ``data.body``),
+    ``body_train.npz``, ``body_pose.npz`` for another clip, ``fit_report.json``, and
+    ``fit_overlays.png`` to look at. Raises DyngsError: see ``fit_capture``; ``out`` is not empty; a
+    template that cannot be read or has no texture coordinates.
     """
     if given.person is not None and given.template.body is None:
         given = replace(given, template=template_of_run(given.person))
@@ -275,10 +341,16 @@ def write_fitted_capture(
         masks = folder / _MASKS
         capture = read_person(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
-        points = {} if given.keypoints is None else read_keypoints(given.keypoints, capture.splits["train"])
+        points = (
+            {}
+            if given.keypoints is None
+            else read_keypoints(given.keypoints, capture.splits["train"])
+        )
         joints = None
         if given.joints is not None:
-            joints = read_joints(given.joints, capture, body if given.body is None else read_body(given.body))
+            joints = read_joints(
+                given.joints, capture, body if given.body is None else read_body(given.body)
+            )
         known = Known(joints, has_guessed_lens(capture), person is not None)
         first = _given_shape(capture, body) if person is None else person
         shaped = with_shape(body, first)
@@ -289,17 +361,24 @@ def write_fitted_capture(
         clips = fitted_clips(capture, shaped, found, new_poses)
         by_avatar: dict[Split, AvatarPoses] = {}
         if given.avatar is not None:
-            by_avatar = {x: posed_by_avatar(given.avatar, capture.splits[x], options, clips[x]) for x in clips}
+            by_avatar = {
+                x: posed_by_avatar(given.avatar, capture.splits[x], options, clips[x])
+                for x in clips
+            }
         clips |= {split: found_by.clip for split, found_by in by_avatar.items()}
         if with_images:
             full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
             for split, views in capture.splits.items():
                 if not views:
                     continue
-                rows, photos = clips.get(split, clips["train"]).rows, [replace(x, silhouette=None) for x in views]
+                rows = clips.get(split, clips["train"]).rows
+                photos = [replace(x, silhouette=None) for x in views]
                 shown = zip(views, _in_order(views, full), _in_order(photos, full), strict=True)
                 write_split(folder, split, shown, rows, capture)
-            clips = {split: replace(clip, frames=tuple(range(len(clip.frames)))) for split, clip in clips.items()}
+            clips = {
+                split: replace(clip, frames=tuple(range(len(clip.frames))))
+                for split, clip in clips.items()
+            }
         for split, clip in clips.items():
             path = folder / f"body_{split}.npz"
             write_body(path, clip, body, betas.numpy(), capture)
@@ -326,14 +405,24 @@ def _require_texels(model: HumanModel, body: BodyTemplate) -> None:
 
 
 def _given_shape(capture: Capture, body: BodyTemplate) -> BodyFrames | None:
-    """Return the parameters of a capture with a shape of a template of SMPL's family, which the fit begins with."""
+    """Return the parameters of a capture with a shape of a template of SMPL's family, which the fit
+    begins with."""
     given = None if capture.body is None else capture.body["train"]
-    return given if given is not None and body.name != "anny" and has_same_shapes(body, given) else None
+    return (
+        given
+        if given is not None and body.name != "anny" and has_same_shapes(body, given)
+        else None
+    )
 
 
 def _added(learned: Tensor, first: Tensor | None) -> Tensor:
-    """Return shape parameters learned (B,), added to those of the shape that the fit began with (at least B)."""
-    return learned if first is None else first + torch.nn.functional.pad(learned, (0, len(first) - len(learned)))
+    """Return shape parameters learned (B,), added to those of the shape that the fit began with (at
+    least B)."""
+    return (
+        learned
+        if first is None
+        else first + torch.nn.functional.pad(learned, (0, len(first) - len(learned)))
+    )
 
 
 def _in_order(views: Sequence[View], options: DataConfig) -> Iterator[Image]:
@@ -341,21 +430,34 @@ def _in_order(views: Sequence[View], options: DataConfig) -> Iterator[Image]:
     return (images[i] for i in range(len(images)))
 
 
-def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:
+def _overlays(
+    capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit
+) -> np.ndarray:
     views = capture.splits["train"]
-    images = ImageLoader(views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1}))
-    given, fitted, rows = found.motion.clip, found.fit.fitted(found.motion.clip), found.motion.rows
-    surface, sheets = surface_of(body, _SHOWN_RESOLUTION), []
+    images = ImageLoader(
+        views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1})
+    )
+    given = found.motion.clip
+    fitted = found.fit.fitted(found.motion.clip)
+    rows = found.motion.rows
+    surface = surface_of(body, _SHOWN_RESOLUTION)
+    sheets = []
     for i in evenly_spaced(len(views), _SHOWN):
         row = rows[-1 if views[i].frame is None else views[i].frame or 0]
         mean = torch.zeros_like(found.fit.betas)
-        before, after = frame_pose(given, row), frame_pose(fitted, row)
-        sheets.append(overlay(images[i], surface, [(mean, before, GIVEN), (found.fit.betas, after, FITTED)]))
+        before = frame_pose(given, row)
+        after = frame_pose(fitted, row)
+        sheets.append(
+            overlay(images[i], surface, [(mean, before, GIVEN), (found.fit.betas, after, FITTED)])
+        )
     return side_by_side(sheets, _COLUMNS)
 
 
-def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[AvatarPoses]) -> dict[str, object]:
-    fit, chosen = found.fit, found.chosen
+def _report(
+    found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[AvatarPoses]
+) -> dict[str, object]:
+    fit = found.fit
+    chosen = found.chosen
     turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
     lens: dict[str, object] = {} if found.lens is None else {"lens": {**vars(found.lens)}}
     return lens | {
@@ -363,9 +465,12 @@ def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[Av
         "taken": chosen.name,
         "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},
         "views_left_out": found.held_out,
-        "new_poses": None if new_poses is None else {"iou": new_poses.iou, "iou_moved": new_poses.iou_moved},
+        "new_poses": None
+        if new_poses is None
+        else {"iou": new_poses.iou, "iou_moved": new_poses.iou_moved},
         "by_avatar": [
-            {"iou": x.before, "iou_posed": x.after, "views_left_out": x.left_out, "taken": x.taken} for x in by_avatar
+            {"iou": x.before, "iou_posed": x.after, "views_left_out": x.left_out, "taken": x.taken}
+            for x in by_avatar
         ],
         "iou_per_frame": {
             str(frame): round(iou, 4)
@@ -373,13 +478,19 @@ def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[Av
             if iou == iou
         },
         "scale": float(np.exp(fit.shared.log_scale)),
-        "turns_degrees": {name: round(float(turn), 2) for name, turn in zip(JOINT_NAMES, turns, strict=False) if turn},
+        "turns_degrees": {
+            name: round(float(turn), 2)
+            for name, turn in zip(JOINT_NAMES, turns, strict=False)
+            if turn
+        },
     }
 
 
-KEYPOINTS = "keypoints"  # folder of a capture with key points of its images, as OpenPose writes them
+# folder of a capture with key points of its images, as OpenPose writes them
+KEYPOINTS = "keypoints"
 _LARGEST = 100_000_000
-"""Files of a capture larger than this many bytes, such as videos, are not what it says about bodies and cameras."""
+"""Files of a capture larger than this many bytes, such as videos, are not what it says about bodies
+and cameras."""
 
 
 def with_fitted_body(
@@ -392,15 +503,18 @@ def with_fitted_body(
 ) -> DataConfig:
     """Return the options with a fit of a template to the capture; the same capture is fitted once.
 
-    ``model`` names the template; None: the free one. Nothing is fitted where ``data.body`` names a fit, where the
-    capture holds one of this template, or without silhouettes; with ``only_if_needed`` where it has body parameters.
-    Raises DyngsError: neither body parameters nor silhouettes, or a template that cannot be read.
+    ``model`` names the template; None: the free one. Nothing is fitted where ``data.body`` names a
+    fit, where the capture holds one of this template, or without silhouettes; with
+    ``only_if_needed`` where it has body parameters. Raises DyngsError: neither body parameters nor
+    silhouettes, or a template that cannot be read.
     """
     model = model or HumanModel()
     if data.body is not None:
         path = data.body / "body_train.npz"
         if path.is_file() and not has_same_shapes(load_template(model), read_body_file(path)):
-            say(f"body:    {data.body} is a fit of another template: its poses are taken, not its shape")
+            say(
+                f"body:    {data.body} is a fit of another template: its poses are taken, not its shape"
+            )
         return data
     capture = read_capture(data)
     given = None if capture.body is None else capture.body["train"]
@@ -420,8 +534,12 @@ def with_fitted_body(
     own, what = "", "fitted"
     if model.body is not None:
         _require_texels(model, body)
-        own, what = f".{body.fingerprint}", f"{_called(model, body)} is fitted"
-    folder = cache_folder("bodies") / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}{own}"
+        own = f".{body.fingerprint}"
+        what = f"{_called(model, body)} is fitted"
+    folder = (
+        cache_folder("bodies")
+        / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}{own}"
+    )
 
     def fit() -> None:
         say(f"body:    {what} to the silhouettes first, as by `dyngs data fit`, into {folder}")
@@ -434,15 +552,21 @@ def with_fitted_body(
 
 
 def _is_fit_of(body: BodyTemplate, given: BodyFrames) -> bool:
-    """Return whether dyngs fitted ``body`` to get ``given``; of the free template nobody else has the shape space."""
-    return given.shape_space == "anny" if body.name == "anny" else given.fitted_to == body.fingerprint
+    """Return whether dyngs fitted ``body`` to get ``given``; of the free template nobody else has
+    the shape space."""
+    return (
+        given.shape_space == "anny" if body.name == "anny" else given.fitted_to == body.fingerprint
+    )
 
 
 def _digest(data: DataConfig) -> str:
-    """Return a digest of the capture's files (names, sizes, times of change) and of the options of reading it."""
+    """Return a digest of the capture's files (names, sizes, times of change) and of the options of
+    reading it."""
     root = data.root.resolve()
     with reading(root):
-        files = sorted(path for path in root.rglob("*") if path.is_file() and path.stat().st_size < _LARGEST)
+        files = sorted(
+            path for path in root.rglob("*") if path.is_file() and path.stat().st_size < _LARGEST
+        )
     chosen_by = {"format", "frames", "pose_frames", "train_cameras", "times", "frames_per_second"}
     names = chosen_by | {"test_every", "skip_missing"}
     options = data.model_dump(mode="json", include=names)

@@ -26,32 +26,104 @@ from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
 
 COCO = (
-    *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
-    *("right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle"),
+    *(
+        "nose",
+        "left_eye",
+        "right_eye",
+        "left_ear",
+        "right_ear",
+        "left_shoulder",
+        "right_shoulder",
+        "left_elbow",
+    ),
+    *(
+        "right_elbow",
+        "left_wrist",
+        "right_wrist",
+        "left_hip",
+        "right_hip",
+        "left_knee",
+        "right_knee",
+        "left_ankle",
+    ),
     "right_ankle",
 )
 BODY_25 = (
-    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
-    *("pelvis", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye"),
+    *(
+        "nose",
+        "neck",
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+        "left_shoulder",
+        "left_elbow",
+        "left_wrist",
+    ),
+    *(
+        "pelvis",
+        "right_hip",
+        "right_knee",
+        "right_ankle",
+        "left_hip",
+        "left_knee",
+        "left_ankle",
+        "right_eye",
+    ),
     "left_eye",
 )
 COCO_18 = (
-    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
-    *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye", "left_eye"),
+    *(
+        "nose",
+        "neck",
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+        "left_shoulder",
+        "left_elbow",
+        "left_wrist",
+    ),
+    *(
+        "right_hip",
+        "right_knee",
+        "right_ankle",
+        "left_hip",
+        "left_knee",
+        "left_ankle",
+        "right_eye",
+        "left_eye",
+    ),
 )
 _MARKED = ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 """Joints that detectors place where those of a body are; necks, collars and toes are elsewhere."""
 
 
 def _marked(names: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Return ``count`` names, those that are not joints of a body where they are marked, or not known, empty."""
+    """Return ``count`` names, those that are not joints of a body where they are marked, or not
+    known, empty."""
     kept = [name if name.partition("_")[2] in _MARKED else "" for name in names]
     return (*kept, *[""] * (count - len(kept)))
 
 
 _GOLIATH = (
-    *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
-    *("right_elbow", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
+    *(
+        "nose",
+        "left_eye",
+        "right_eye",
+        "left_ear",
+        "right_ear",
+        "left_shoulder",
+        "right_shoulder",
+        "left_elbow",
+    ),
+    *(
+        "right_elbow",
+        "left_hip",
+        "right_hip",
+        "left_knee",
+        "right_knee",
+        "left_ankle",
+        "right_ankle",
+    ),
 )
 _MHR = list(_marked(_GOLIATH, 70))
 _MHR[41], _MHR[62] = "right_wrist", "left_wrist"
@@ -63,29 +135,31 @@ ORDERS: dict[str, tuple[str, ...]] = {
     "smplx": JOINT_NAMES,
     "mhr70": tuple(_MHR),
 }
-"""Orders of 3D joints by name; the number of joints tells them apart. Empty: a joint that is not used. ``mhr70`` is
-that of SAM 3D Body."""
+"""Orders of 3D joints by name; the number of joints tells them apart. Empty: a joint that is not
+used. ``mhr70`` is that of SAM 3D Body."""
 _SEEN = ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-"""Joints that detectors mark where they are, on both sides. Nose and ears are no joints; necks and toes are marked
-elsewhere."""
+"""Joints that detectors mark where they are, on both sides. Nose and ears are no joints; necks and
+toes are marked elsewhere."""
 JOINTS = {
-    name: row for row, name in enumerate(JOINT_NAMES) if name.removeprefix("left_").removeprefix("right_") in _SEEN
+    name: row
+    for row, name in enumerate(JOINT_NAMES)
+    if name.removeprefix("left_").removeprefix("right_") in _SEEN
 }
 """Names of these joints, and their rows in ``JOINT_NAMES``."""
 _FARTHEST = 1e6  # key points further away, px, are taken for mistakes
 _ORDERS = {17: COCO, 133: COCO, 25: BODY_25, 18: COCO_18}
 """Number of key points of a format to the names of the first ones, as published."""
 Keypoints = dict[str, Tensor]
-"""Name of a view to (55, 3): column, row and confidence of joints in its stored image, undistorted; confidence 0
-where a joint is not marked."""
+"""Name of a view to (55, 3): column, row and confidence of joints in its stored image, undistorted;
+confidence 0 where a joint is not marked."""
 
 
 def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     """Return the key points of the views: of a folder of OpenPose files, or of one COCO file.
 
-    OpenPose: ``NAME_keypoints.json`` or ``NAME.json`` by the image's name, ``pose_keypoints_2d`` of 25 or 18 points.
-    COCO: 17 or 133 points. Of several people the most confident one is taken. Raises DyngsError: neither, or no known
-    view.
+    OpenPose: ``NAME_keypoints.json`` or ``NAME.json`` by the image's name, ``pose_keypoints_2d`` of
+    25 or 18 points. COCO: 17 or 133 points. Of several people the most confident one is taken.
+    Raises DyngsError: neither, or no known view.
     """
     stems = by_stem(views)
     rows = _openpose(path, stems) if path.is_dir() else _coco(path, stems)
@@ -138,12 +212,17 @@ def _coco(file: Path, stems: Mapping[str, str]) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise DyngsError(f"{file}: no such file or folder of key points")
     fields = read_json_object(file)
-    images, annotations = fields.get("images"), fields.get("annotations")
+    images = fields.get("images")
+    annotations = fields.get("annotations")
     if not isinstance(images, list) or not isinstance(annotations, list):
         raise DyngsError(f"{file}: lacks the lists 'images' and 'annotations' of COCO")
     names: dict[object, str] = {}
     for image in images:
-        path = PurePosixPath(str(image.get("file_name"))) if isinstance(image, dict) else PurePosixPath()
+        path = (
+            PurePosixPath(str(image.get("file_name")))
+            if isinstance(image, dict)
+            else PurePosixPath()
+        )
         name = stems.get(str(path.with_suffix("")) if path.name else "", stems.get(path.stem))
         if name is not None and isinstance(image, dict) and isinstance(image.get("id"), (int, str)):
             names[image["id"]] = name
@@ -163,7 +242,9 @@ def _points(file: Path, key: str, value: object) -> np.ndarray:
     points = numbers_of(f"{file}: '{key}'", value, None).reshape(-1)
     if len(points) % 3 or len(points) // 3 not in _ORDERS:
         known = ", ".join(map(str, sorted(_ORDERS)))
-        raise DyngsError(f"{file}: '{key}' holds {len(points) / 3:g} points of 3 numbers; known are {known}")
+        raise DyngsError(
+            f"{file}: '{key}' holds {len(points) / 3:g} points of 3 numbers; known are {known}"
+        )
     return points.reshape(-1, 3)
 
 
@@ -179,20 +260,26 @@ def _placed(view: View, points: np.ndarray) -> Tensor:
             joints[JOINTS[name]] = torch.from_numpy(points[row])
     positions = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
     near = (positions.abs() < _FARTHEST).all(1, keepdim=True)  # false for NaN
-    return torch.cat([torch.where(near, positions, 0.0), joints[:, 2:].clamp(0, 1) * near], dim=1).float()
+    return torch.cat(
+        [torch.where(near, positions, 0.0), joints[:, 2:].clamp(0, 1) * near], dim=1
+    ).float()
 
 
 NUM_JOINTS = 22  # joints of the body without hands and face, the same in SMPL, SMPL-H and SMPL-X
-NEAR = 0.5  # a vertex tells where a joint is if it follows that joint and its parent by this fraction at least
+# a vertex tells where a joint is if it follows that joint and its parent by this fraction at least
+NEAR = 0.5
 
 
 def joints_of_vertices(where: Path, body: BodyTemplate, vertices: np.ndarray) -> np.ndarray:
-    """Return the joints (F, 22, 3) of posed vertices (F, N, 3) of a body with N vertices; NaN where they do not tell.
+    """Return the joints (F, 22, 3) of posed vertices (F, N, 3) of a body with N vertices; NaN where
+    they do not tell.
 
-    The vertices around a joint, which follow it or its parent, are moved from rest to the pose by the similarity that
-    fits them best (Umeyama 1991); so is the joint. Raises DyngsError: another number of vertices; names ``where``.
+    The vertices around a joint, which follow it or its parent, are moved from rest to the pose by
+    the similarity that fits them best (Umeyama 1991); so is the joint. Raises DyngsError: another
+    number of vertices; names ``where``.
     """
-    rest, joints = body.vertices.double().cpu().numpy(), body.joints.double().cpu().numpy()
+    rest = body.vertices.double().cpu().numpy()
+    joints = body.joints.double().cpu().numpy()
     if vertices.ndim != 3 or vertices.shape[1:] != rest.shape:
         raise DyngsError(
             f"{where}: 'vertices' has the shape {'x'.join(map(str, vertices.shape))}, the body {len(rest)} of them; "
@@ -202,18 +289,25 @@ def joints_of_vertices(where: Path, body: BodyTemplate, vertices: np.ndarray) ->
     found = np.full((len(vertices), NUM_JOINTS, 3), np.nan)
     for joint, parent in enumerate(body.parents[:NUM_JOINTS]):
         own = weights[:, joint] + (weights[:, parent] if parent >= 0 else 0.0)
-        near = np.minimum(weights[:, joint], weights[:, parent]) if parent >= 0 else weights[:, joint]
+        near = (
+            np.minimum(weights[:, joint], weights[:, parent]) if parent >= 0 else weights[:, joint]
+        )
         rows = np.flatnonzero((own > NEAR) & (near > 0.05))
         if len(rows) >= 4:
-            found[:, joint] = [_moved(rest[rows], posed[rows].astype(np.float64), joints[joint]) for posed in vertices]
+            found[:, joint] = [
+                _moved(rest[rows], posed[rows].astype(np.float64), joints[joint])
+                for posed in vertices
+            ]
     return found
 
 
 def _moved(rest: np.ndarray, posed: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return the point (3,) moved by the similarity that takes points (P, 3) from rest to where they are posed."""
+    """Return the point (3,) moved by the similarity that takes points (P, 3) from rest to where
+    they are posed."""
     if not np.isfinite(posed).all():
         return np.full(3, np.nan)
-    middle, place = rest.mean(0), posed.mean(0)
+    middle = rest.mean(0)
+    place = posed.mean(0)
     u, s, v = np.linalg.svd((posed - place).T @ (rest - middle))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v)) or 1.0])
     scale = (s * signs).sum() / max(float(((rest - middle) ** 2).sum()), 1e-12)
@@ -222,12 +316,15 @@ def _moved(rest: np.ndarray, posed: np.ndarray, point: np.ndarray) -> np.ndarray
 
 Space = Literal["world", "camera"]
 INNER = 0.3
-"""Confidence of joints inside the trunk, which differ from model to model by centimetres, over that of limbs."""
+"""Confidence of joints inside the trunk, which differ from model to model by centimetres, over that
+of limbs."""
 _MHR_JOINTS = 70
 _MOST_FRAMES = 100_000
-_TURNED = (1.0, -1.0, -1.0)  # from the axes of a camera of OpenGL, y up and looking along -z, to those of OpenCV
+# from the axes of a camera of OpenGL, y up and looking along -z, to those of OpenCV
+_TURNED = (1.0, -1.0, -1.0)
 Joints3D = dict[int, Tensor]
-"""Frame number to (55, 4): place in the world of the cameras and confidence, 0 where a joint is not known."""
+"""Frame number to (55, 4): place in the world of the cameras and confidence, 0 where a joint is not
+known."""
 
 
 @dataclass(frozen=True)
@@ -243,10 +340,11 @@ class _Found:
 def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
     """Return the 3D joints of the frames of training; ``body`` is the template of vertices.
 
-    ``.npz``: ``joints`` (F, K, 3 or 4: with confidence) or ``vertices`` (F, N, 3), ``frames`` (F,) numbers, ``order``
-    and ``space``. ``.json``: the same, ``joints`` mapping images or frame numbers to lists. A folder: files of SAM 3D
-    Body, ``IMAGE.npz``. ``.pkl``: ``frame_data.pkl`` of Alldieck et al. (2018). Raises DyngsError: another layout, no
-    frame of the capture, or no numbers; names the file.
+    ``.npz``: ``joints`` (F, K, 3 or 4: with confidence) or ``vertices`` (F, N, 3), ``frames`` (F,)
+    numbers, ``order`` and ``space``. ``.json``: the same, ``joints`` mapping images or frame
+    numbers to lists. A folder: files of SAM 3D Body, ``IMAGE.npz``. ``.pkl``: ``frame_data.pkl`` of
+    Alldieck et al. (2018). Raises DyngsError: another layout, no frame of the capture, or no
+    numbers; names the file.
     """
     views = capture.splits["train"]
     with reading(path):
@@ -257,7 +355,10 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
             f"{path}: no joints for any frame of the capture; name them by their numbers or by the names of images "
             f"({first_few(sorted(map(str, found.joints)))} in the file, {views[0].name} in the capture)"
         )
-    return {frame: _placed_in_3d(found, joints, view, capture) for frame, (joints, view) in frames.items()}
+    return {
+        frame: _placed_in_3d(found, joints, view, capture)
+        for frame, (joints, view) in frames.items()
+    }
 
 
 def _read(path: Path, body: BodyTemplate) -> _Found:
@@ -272,17 +373,23 @@ def _read(path: Path, body: BodyTemplate) -> _Found:
             return _of_npz(path, body)
         case ".pkl":
             return _of_frame_data(path, body)
-    raise DyngsError(f"{path}: 3D joints are read from .npz, .json, frame_data.pkl, and folders of SAM 3D Body")
+    raise DyngsError(
+        f"{path}: 3D joints are read from .npz, .json, frame_data.pkl, and folders of SAM 3D Body"
+    )
 
 
 def _of_json(path: Path) -> _Found:
     fields = read_json_object(path)
     listed = entry(path, fields, "joints")
     if not isinstance(listed, dict) or not listed:
-        raise DyngsError(f"{path}: 'joints' must be an object of frames and their joints; export it again")
+        raise DyngsError(
+            f"{path}: 'joints' must be an object of frames and their joints; export it again"
+        )
     require_at_most(path, len(listed), _MOST_FRAMES, "frames")
     joints = {
-        int(name) if re.fullmatch("[0-9]{1,9}", name) else name: _joints_of(f"{path}, joints of {name:.40}", value)
+        int(name) if re.fullmatch("[0-9]{1,9}", name) else name: _joints_of(
+            f"{path}, joints of {name:.40}", value
+        )
         for name, value in listed.items()
     }
     return _checked(path, joints, fields.get("order"), fields.get("space"))
@@ -294,11 +401,15 @@ def _of_npz(path: Path, body: BodyTemplate) -> _Found:
     given = entry(path, found, "vertices" if "vertices" in found else "joints")
     rows = joints_of_vertices(path, body, given) if "vertices" in found else given
     if rows.ndim != 3 or not len(rows):
-        raise DyngsError(f"{path}: 'joints' must have the shape (frames, joints, 3 or 4); export it again")
+        raise DyngsError(
+            f"{path}: 'joints' must have the shape (frames, joints, 3 or 4); export it again"
+        )
     require_at_most(path, len(rows), _MOST_FRAMES, "frames")
     numbers = found.get("frames", np.arange(len(rows)))
     if numbers.shape != (len(rows),) or numbers.dtype.kind not in "iu":
-        raise DyngsError(f"{path}: 'frames' must hold one whole number for each row of 'joints'; export it again")
+        raise DyngsError(
+            f"{path}: 'frames' must hold one whole number for each row of 'joints'; export it again"
+        )
     joints: dict[int | str, np.ndarray] = {
         int(number): _joints_of(f"{path}, row {i}", row)
         for i, (number, row) in enumerate(zip(numbers, rows, strict=True))
@@ -331,7 +442,9 @@ def _of_frame_data(path: Path, body: BodyTemplate) -> _Found:
     if vertices is None:
         raise DyngsError(f"{path}: 'vertices' must hold numbers; export it again")
     rows = joints_of_vertices(path, body, vertices) * np.array(_TURNED)
-    joints: dict[int | str, np.ndarray] = {i: _joints_of(f"{path}, frame {i}", row) for i, row in enumerate(rows)}
+    joints: dict[int | str, np.ndarray] = {
+        i: _joints_of(f"{path}, frame {i}", row) for i, row in enumerate(rows)
+    }
     return _checked(path, joints, "smplx_body", "camera")
 
 
@@ -347,13 +460,17 @@ def _joints_of(where: str, value: object) -> np.ndarray:
     return np.where(np.logical_and(known, near), array, 0.0)
 
 
-def _checked(path: Path, joints: Mapping[int | str, np.ndarray], order: object, space: object) -> _Found:
+def _checked(
+    path: Path, joints: Mapping[int | str, np.ndarray], order: object, space: object
+) -> _Found:
     count = len(next(iter(joints.values())))
     by_count = {len(names): name for name, names in ORDERS.items()}
     wanted = by_count.get(count, "") if order is None else str(order)
     if wanted not in ORDERS:
         known = ", ".join(f"{name} ({len(names)})" for name, names in ORDERS.items())
-        raise DyngsError(f"{path}: the order of {count} joints is not known; 'order' is one of {known}")
+        raise DyngsError(
+            f"{path}: the order of {count} joints is not known; 'order' is one of {known}"
+        )
     strange = next((key for key, rows in joints.items() if len(rows) != len(ORDERS[wanted])), None)
     if strange is not None:
         raise DyngsError(
@@ -368,20 +485,31 @@ def _checked(path: Path, joints: Mapping[int | str, np.ndarray], order: object, 
     raise DyngsError(f"{path}: 'space' must be world or camera; export it again")
 
 
-def _by_frame(path: Path, found: _Found, views: Sequence[View]) -> dict[int, tuple[np.ndarray, View]]:
+def _by_frame(
+    path: Path, found: _Found, views: Sequence[View]
+) -> dict[int, tuple[np.ndarray, View]]:
     """Return frame number to joints and the view that they are for."""
-    stems, named = by_stem(views), {view.name: view for view in views}
+    stems = by_stem(views)
+    named = {view.name: view for view in views}
     first: dict[int, View] = {}
     for view in views:
         first.setdefault(-1 if view.frame is None else view.frame, view)
     frames: dict[int, tuple[np.ndarray, View]] = {}
     for key, joints in found.joints.items():
         name = stems.get(str(PurePosixPath(str(key)).with_suffix("")) if str(key) else "", "")
-        view = first.get(key) if isinstance(key, int) else named.get(name or stems.get(str(key), ""))
+        view = (
+            first.get(key) if isinstance(key, int) else named.get(name or stems.get(str(key), ""))
+        )
         if view is None:
             continue
-        if found.space == "camera" and isinstance(key, int) and len({view.camera_id for view in views}) > 1:
-            raise DyngsError(f"{path}: joints of a camera need the names of images, not frame numbers")
+        if (
+            found.space == "camera"
+            and isinstance(key, int)
+            and len({view.camera_id for view in views}) > 1
+        ):
+            raise DyngsError(
+                f"{path}: joints of a camera need the names of images, not frame numbers"
+            )
         frames[-1 if view.frame is None else view.frame] = (joints, view)
     return frames
 
@@ -391,7 +519,8 @@ def _placed_in_3d(found: _Found, joints: np.ndarray, view: View, capture: Captur
     placed = torch.zeros(len(JOINT_NAMES), 4, device="cpu")
     positions = (joints[:, :3] - capture.world_offset) / capture.world_scale
     if found.space == "camera":
-        rotation, shift = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
+        rotation = view.cam_from_world[:3, :3]
+        shift = view.cam_from_world[:3, 3]
         positions = (joints[:, :3] / capture.world_scale - shift) @ rotation
     for row, name in enumerate(ORDERS[found.order]):
         if name in JOINT_NAMES and joints[row, 3] > 0:

@@ -29,14 +29,17 @@ _BODY, _CONFIG = "body_train.npz", "config.yaml"
 def template_of_run(path: Path) -> HumanModel:
     """Return what names the template of an avatar's run, of anything else the free one."""
     model = load_config(path / _CONFIG).model if (path / _CONFIG).is_file() else None
-    return HumanModel(body=model.body, uv=model.uv) if isinstance(model, HumanModel) else HumanModel()
+    return (
+        HumanModel(body=model.body, uv=model.uv) if isinstance(model, HumanModel) else HumanModel()
+    )
 
 
 def known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
-    """Return the body parameters of a person, of whom only the shape counts, which is one of ``body``.
+    """Return the body parameters of a person, of whom only the shape counts, which is one of
+    ``body``.
 
-    ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one. Raises
-    DyngsError: none of these, or a shape of another template.
+    ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained
+    on one. Raises DyngsError: none of these, or a shape of another template.
     """
     with reading(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
         folder = path
@@ -44,7 +47,9 @@ def known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
             data = load_config(path / _CONFIG).data
             folder = data.root if data.body is None else data.body
         if not (folder / _BODY).is_file():
-            raise DyngsError(f"{path}: no fitted person there; give a capture that `dyngs data fit` wrote, or its run")
+            raise DyngsError(
+                f"{path}: no fitted person there; give a capture that `dyngs data fit` wrote, or its run"
+            )
         found = read_body_file(folder / _BODY)
     if not has_same_shapes(body, found):
         raise DyngsError(
@@ -55,7 +60,8 @@ def known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
 
 
 def with_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTemplate:
-    """Return the template that is fitted: its mean shape is that of a known person, and it has no expressions.
+    """Return the template that is fitted: its mean shape is that of a known person, and it has no
+    expressions.
 
     Of a file of SMPL's family it has the first ``NUM_FITTED`` shape parameters.
     """
@@ -63,13 +69,15 @@ def with_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTemplate:
     shaped = replace(body, vertices=vertices, joints=joints)
     if body.name == "anny" or body.shape_dirs is None or body.joint_shape_dirs is None:
         return shaped
-    dirs, joint_dirs = body.shape_dirs[..., :NUM_FITTED], body.joint_shape_dirs[..., :NUM_FITTED]
+    dirs = body.shape_dirs[..., :NUM_FITTED]
+    joint_dirs = body.joint_shape_dirs[..., :NUM_FITTED]
     without = replace(shaped, expression_dirs=None, joint_expression_dirs=None)
     return replace(without, shape_dirs=dirs, joint_shape_dirs=joint_dirs)
 
 
 def shape_of(body: BodyTemplate, known: BodyFrames) -> torch.Tensor:
-    """Return the known shape parameters (B,) of a template with B of them; 0 for those that are not known."""
+    """Return the known shape parameters (B,) of a template with B of them; 0 for those that are not
+    known."""
     betas = torch.zeros(body.num_shapes, device="cpu")
     given = torch.from_numpy(known.betas[: len(betas)]).float()
     betas[: len(given)] = given
@@ -77,15 +85,16 @@ def shape_of(body: BodyTemplate, known: BodyFrames) -> torch.Tensor:
 
 
 LONGEST_SIDE = 320
-"""Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
-size, since its edges are those of its images."""
+"""Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is
+compared at that size, since its edges are those of its images."""
 CHECKED = 3  # time steps, at most, at which a view is left out to see what the fit is worth
 _FEWEST_VIEWS = 3  # of a time step, so that one of them can be left out
 
 
 @dataclass(frozen=True)
 class KnownAvatar:
-    """The avatar of a person, and the longest side of the images it was trained on, px; None: as they are."""
+    """The avatar of a person, and the longest side of the images it was trained on, px; None: as
+    they are."""
 
     scene: HumanScene
     longest_side: int | None
@@ -98,7 +107,9 @@ class AvatarPoses:
     clip: CapturedMotion  # of all frames; as it was where ``taken`` is false
     before: float  # overlap of silhouettes (IoU) at some time steps, of the avatar
     after: float
-    left_out: int  # number of views, which were left out of the fit, that this was measured on; 0: on those fitted to
+    # number of views, which were left out of the fit, that this was measured on; 0: on those fitted
+    # to
+    left_out: int
 
     @property
     def taken(self) -> bool:
@@ -107,7 +118,11 @@ class AvatarPoses:
 
     def summary(self) -> str:
         """Return a line for people."""
-        where = f"{counted(self.left_out, 'view')} left out of the fit" if self.left_out else "the views fitted to"
+        where = (
+            f"{counted(self.left_out, 'view')} left out of the fit"
+            if self.left_out
+            else "the views fitted to"
+        )
         what = "taken" if self.taken else "not taken"
         return (
             f"poses by the silhouette of the person's avatar: {what}; overlap on {where} {self.before:.3f} -> "
@@ -118,19 +133,24 @@ class AvatarPoses:
 def posed_by_avatar(
     avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: CapturedMotion
 ) -> AvatarPoses:
-    """Return the poses of a clip in which the avatar has the silhouettes of its images, where that is better.
+    """Return the poses of a clip in which the avatar has the silhouettes of its images, where that
+    is better.
 
-    The size is that of ``start``, or that of the clip of training where the silhouettes show that the world has the
-    same unit. Frames of ``start`` without an image keep their poses.
+    The size is that of ``start``, or that of the clip of training where the silhouettes show that
+    the world has the same unit. Frames of ``start`` without an image keep their poses.
     """
     times = start.clip.times.tolist()
     shown = [replace(x, time=times[start.rows[-1 if x.frame is None else x.frame]]) for x in views]
-    side = min(LONGEST_SIDE, options.longest_side or LONGEST_SIDE, avatar.longest_side or LONGEST_SIDE)
+    side = min(
+        LONGEST_SIDE, options.longest_side or LONGEST_SIDE, avatar.longest_side or LONGEST_SIDE
+    )
     small = options.model_copy(update={"longest_side": side, "downscale": 1})
     left_out, others = _left_out(shown)
-    tested, images = ImageLoader(left_out or others, small), ImageLoader(others, small)
+    tested = ImageLoader(left_out or others, small)
+    images = ImageLoader(others, small)
     scene = avatar.scene
-    clip, size = start.clip, torch.full_like(start.clip.scale, float(scene.clip.scale.mean()))
+    clip = start.clip
+    size = torch.full_like(start.clip.scale, float(scene.clip.scale.mean()))
     pelvis = scene.skeleton.joints[0]  # stays where it is
     in_size = replace(clip, scale=size, trans=clip.trans + (clip.scale - size)[:, None] * pelvis)
     players = [scene.playing(clip), scene.playing(in_size)]
@@ -181,5 +201,8 @@ def _with_rows(clip: MotionClip, found: MotionClip) -> MotionClip:
         return before.index_copy(0, rows, after.to(before))
 
     return MotionClip(
-        clip.times, put(clip.poses, found.poses), put(clip.trans, found.trans), put(clip.scale, found.scale)
+        clip.times,
+        put(clip.poses, found.poses),
+        put(clip.trans, found.trans),
+        put(clip.scale, found.scale),
     )

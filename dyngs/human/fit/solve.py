@@ -1,7 +1,8 @@
-"""The fit of a body to silhouettes and key points: few numbers for the full clip first, then every frame's pose.
+"""The fit of a body to silhouettes and key points: few numbers for the full clip first, then every
+frame's pose.
 
-Rasterized silhouettes are differentiable, so that everything is found by Adam. Local letters: F frames, J joints, B
-shape parameters, P discs, V views, K key points.
+Rasterized silhouettes are differentiable, so that everything is found by Adam. Local letters: F
+frames, J joints, B shape parameters, P discs, V views, K key points.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ _DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]
     "elbow": ((-7, -40, 16), (5, 29, 13)),
     "wrist": ((-4, -2, 10), (3, 11, 6)),
 }
-"""Axis-angle vectors of the left side, and their standard deviations; the right side is the mirror image."""
+"""Axis-angle vectors of the left side, and their standard deviations; the right side is the mirror
+image."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +54,25 @@ class PosePrior:
 
     centre: Tensor  # (F, 22, 3) mean
     spread: Tensor  # (22, 3) standard deviation
-    limit: float = math.inf  # of these from the centre, beyond which nobody is expected to turn a joint
+    # of these from the centre, beyond which nobody is expected to turn a joint
+    limit: float = math.inf
 
 
 def near_given(clip: MotionClip) -> PosePrior:
     """Return the prior that poses are about those given."""
-    return PosePrior(torch.zeros_like(clip.poses[:, :NUM_TURNED]), torch.full_like(clip.poses[0, :NUM_TURNED], _GIVEN))
+    return PosePrior(
+        torch.zeros_like(clip.poses[:, :NUM_TURNED]),
+        torch.full_like(clip.poses[0, :NUM_TURNED], _GIVEN),
+    )
 
 
 def usual(clip: MotionClip) -> PosePrior:
-    """Return the prior that corrected poses are usual ones; rotations add as vectors, which holds for small ones."""
+    """Return the prior that corrected poses are usual ones; rotations add as vectors, which holds
+    for small ones."""
     spread = usual_spread(NUM_TURNED).to(clip.poses)
-    return PosePrior(usual_pose(NUM_TURNED).to(clip.poses) - clip.poses[:, :NUM_TURNED], spread, _LIMIT)
+    return PosePrior(
+        usual_pose(NUM_TURNED).to(clip.poses) - clip.poses[:, :NUM_TURNED], spread, _LIMIT
+    )
 
 
 def usual_pose(joints: int) -> Tensor:
@@ -83,42 +92,60 @@ def _table(which: int, joints: int) -> Tensor:
         degrees = _DEGREES.get(rest if side in ("left", "right") else name)
         if degrees is not None:
             mirrored = (1.0, -1.0, -1.0) if side == "right" else (1.0, 1.0, 1.0)
-            found[row] = torch.tensor([x * m for x, m in zip(degrees[which], mirrored, strict=True)], device="cpu")
+            found[row] = torch.tensor(
+                [x * m for x, m in zip(degrees[which], mirrored, strict=True)], device="cpu"
+            )
     return torch.deg2rad(found)
 
 
-LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
+LR = {
+    "log_scale": 3e-3,
+    "betas": 0.1,
+    "turns": 1e-2,
+    "poses": 1e-2,
+    "trans": 6e-3,
+    "padding": 1e-3,
+} | {
     "offset": 3e-3,
     "shift": 3e-3,
     "log_focal": 3e-2,
 }
 """Learning rates at the first step; those of positions per metre of the person's unit."""
 LR_DECAY = 0.1
-BETAS_WEIGHT = 1e-3  # of the mean squared shape parameter, of bones as well, whose unit is the spread among adults
+# of the mean squared shape parameter, of bones as well, whose unit is the spread among adults
+BETAS_WEIGHT = 1e-3
 TURN, STEP = 0.25, 0.1
-"""Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the next."""
+"""Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the
+next."""
 TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
-"""Of their mean squares. What silhouettes do not show, such as a limb turned about itself, follows the noise of Adam's
-steps where these are much smaller: renders of new poses then lose 1 to 3 dB, while the silhouettes look as good."""
-LIMIT_WEIGHT = 2e-2  # of the mean square of what lies beyond the limit of a joint, in standard deviations
+"""Of their mean squares. What silhouettes do not show, such as a limb turned about itself, follows
+the noise of Adam's steps where these are much smaller: renders of new poses then lose 1 to 3 dB,
+while the silhouettes look as good."""
+# of the mean square of what lies beyond the limit of a joint, in standard deviations
+LIMIT_WEIGHT = 2e-2
 KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
-"""Expected error of a key point, as a fraction of the square's side, and the weight of their robust mean."""
+"""Expected error of a key point, as a fraction of the square's side, and the weight of their robust
+mean."""
 PLACE, PLACE_WEIGHT = 0.03, 0.1
-"""Expected error of a joint given in 3D, metres of the person, and the weight of their robust mean."""
+"""Expected error of a joint given in 3D, metres of the person, and the weight of their robust
+mean."""
 FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
 """Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
-"""Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
+"""Metres between skin and silhouette that cost as much as one unit of shape, and the weight of
+their mean square."""
 MISTAKEN = 1.0
-"""Squared difference of coverages, over the person's area, from which on a silhouette is rather a mistake. Good masks
-have 0.05 to 0.2; at 0.3 bodies found in masks of a detector were no better, at infinity twice as far off."""
+"""Squared difference of coverages, over the person's area, from which on a silhouette is rather a
+mistake. Good masks have 0.05 to 0.2; at 0.3 bodies found in masks of a detector were no better, at
+infinity twice as far off."""
 FRAMES = 3  # frames drawn in each step
 VIEWS = 3  # views of a frame, other ones each time, that are drawn where not all are (``InTurn``)
 Observations = Callable[[int], ObservedFrame | None]  # returns what is seen in a row of the clip
 
 
 class InTurn:
-    """Observations of a few views of each frame, other ones each time; ``frames`` are all views, by row of the clip."""
+    """Observations of a few views of each frame, other ones each time; ``frames`` are all views, by
+    row of the clip."""
 
     def __init__(self, frames: Mapping[int, ObservedFrame | None]) -> None:
         self._frames, self._turns = frames, Counter[int]()
@@ -132,10 +159,10 @@ class InTurn:
 def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
     """Return what is learned, all zero.
 
-    ``betas`` (B,) shape; ``log_scale`` (1,) of the factor on the scale; ``turns`` (22, 3) axis-angle, rad, applied
-    before the given rotations, in all frames; ``poses`` (F, 22, 3) the same per frame; ``shift`` (3,) added to the
-    translations, ``offset`` (3,) m in the frame of the pelvis; ``trans`` (F, 3) per frame; ``padding`` (P,) m between
-    skin and silhouette.
+    ``betas`` (B,) shape; ``log_scale`` (1,) of the factor on the scale; ``turns`` (22, 3)
+    axis-angle, rad, applied before the given rotations, in all frames; ``poses`` (F, 22, 3) the
+    same per frame; ``shift`` (3,) added to the translations, ``offset`` (3,) m in the frame of the
+    pelvis; ``trans`` (F, 3) per frame; ``padding`` (P,) m between skin and silhouette.
     """
     joints = surface.body.joints
     zeros = {
@@ -153,10 +180,12 @@ def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
 
 
 def with_lens(learned: Parameters, distance: float) -> Parameters:
-    """Return the same with a focal length to be learned: of one camera that stands at the origin of the world.
+    """Return the same with a focal length to be learned: of one camera that stands at the origin of
+    the world.
 
-    Adds ``log_focal`` (1,), the natural logarithm of the factor on the given focal length, and ``distance`` (1,), which
-    is never learned: the camera steps back as its focal length grows, so that what is at this distance stays as large.
+    Adds ``log_focal`` (1,), the natural logarithm of the factor on the given focal length, and
+    ``distance`` (1,), which is never learned: the camera steps back as its focal length grows, so
+    that what is at this distance stays as large.
     """
     blank = learned["log_scale"].detach()
     values = {"log_focal": torch.zeros_like(blank), "distance": torch.full_like(blank, distance)}
@@ -189,10 +218,11 @@ def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
 
 
 def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
-    """Return a mean over the V views of e / (1 + e / ``MISTAKEN``); e is the squared difference over what is seen.
+    """Return a mean over the V views of e / (1 + e / ``MISTAKEN``); e is the squared difference
+    over what is seen.
 
-    So a mask that shows half the person, or something else, counts little beside those of the other views (Geman and
-    McClure 1987).
+    So a mask that shows half the person, or something else, counts little beside those of the other
+    views (Geman and McClure 1987).
     """
     wrong = ((drawn - seen.alpha) * seen.known).square().sum((1, 2))
     error = wrong / (seen.alpha * seen.known).sum((1, 2)).clamp_min(1.0)
@@ -200,14 +230,18 @@ def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
 
 
 def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
-    """Return the mean robust distance of joints (J, 3) in the world from key points (V, 55, 3), see ``ObservedFrame``.
+    """Return the mean robust distance of joints (J, 3) in the world from key points (V, 55, 3), see
+    ``ObservedFrame``.
 
     J is 24, 52 or 55; joints of the same name are compared.
     sqrt(1 + (d / ``KEYPOINT``)^2) - 1, weighted by the confidences: large errors count linearly.
     """
     rows = SMPLX_ROWS[len(joints)]
     marked = marked[:, list(rows)]
-    local = joints[: len(rows)] @ cameras.cam_from_world[:, :3, :3].mT + cameras.cam_from_world[:, None, :3, 3]
+    local = (
+        joints[: len(rows)] @ cameras.cam_from_world[:, :3, :3].mT
+        + cameras.cam_from_world[:, None, :3, 3]
+    )
     pixels = local @ cameras.intrinsics.mT
     positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
     away = (positions - marked[..., :2]).square().sum(-1) / KEYPOINT**2
@@ -236,7 +270,9 @@ def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     total = total + TURN_WEIGHT * (learned["turns"][1:] / TURN).square().mean()
     away = (learned["poses"] - expected.centre) / expected.spread
     total = total + POSE_WEIGHT * away[:, 1:].square().mean()
-    total = total + LIMIT_WEIGHT * (away[:, 1:].abs() - expected.limit).clamp_min(0.0).square().mean()
+    total = (
+        total + LIMIT_WEIGHT * (away[:, 1:].abs() - expected.limit).clamp_min(0.0).square().mean()
+    )
     if len(learned["poses"]) > 1:
         jumps = learned["poses"][1:] - learned["poses"][:-1]
         total = total + STEP_WEIGHT * (jumps / STEP).square().mean()
@@ -262,13 +298,17 @@ class Fitting:
         tick: Callable[[], None] = lambda: None,
         fallen: float = 0.0,
     ) -> Parameters:
-        """Return the fit ``start`` after ``steps`` of Adam on what is named; ``tick`` is called after each.
+        """Return the fit ``start`` after ``steps`` of Adam on what is named; ``tick`` is called
+        after each.
 
-        Frames are taken in a fixed order that covers the clip evenly. Rates begin where they are after the fraction
-        ``fallen`` of a run; higher where it is negative.
+        Frames are taken in a fixed order that covers the clip evenly. Rates begin where they are
+        after the fraction ``fallen`` of a run; higher where it is negative.
         """
-        # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
-        found = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
+        # Copies, as updates are in place and ``start`` may be what is taken in the end; without
+        # moments.
+        found = Parameters(
+            {name: x.clone() for name, x in start.values().items()}, start.rates, start.decay
+        )
         for name in found.values():
             found[name].requires_grad_(name in learned)
         order = spread_order(len(self.clip))
@@ -277,7 +317,9 @@ class Fitting:
             seen = {row: frame for row in sorted(rows) if (frame := observed(row)) is not None}
             loss = prior(found, self.expected)
             if seen:
-                loss = loss + mean_error(found, self.clip, self.surface, seen) * (len(seen) / len(rows))
+                loss = loss + mean_error(found, self.clip, self.surface, seen) * (
+                    len(seen) / len(rows)
+                )
             if loss.requires_grad:  # else nothing is to be learned
                 loss.backward()
             found.step(step, fallen + (1 - fallen) * step / steps)
@@ -285,11 +327,16 @@ class Fitting:
         return found
 
 
-def mean_error(learned: Parameters, clip: MotionClip, surface: Surface, seen: Mapping[int, ObservedFrame]) -> Tensor:
-    """Return the error of the frames ``seen``, by row: of silhouettes, and of joints where they are marked."""
-    body, errors = shaped(learned, surface), []
+def mean_error(
+    learned: Parameters, clip: MotionClip, surface: Surface, seen: Mapping[int, ObservedFrame]
+) -> Tensor:
+    """Return the error of the frames ``seen``, by row: of silhouettes, and of joints where they are
+    marked."""
+    body = shaped(learned, surface)
+    errors = []
     for row, frame in seen.items():
-        pose, cameras = frame_pose_of(learned, clip, row), refined(frame.cameras, learned)
+        pose = frame_pose_of(learned, clip, row)
+        cameras = refined(frame.cameras, learned)
         error = silhouette_error(drawn_silhouettes(body.in_pose(pose), cameras), frame)
         if frame.joints is not None:
             joints = posed_joints(body.skeleton, pose)
@@ -306,7 +353,9 @@ def shaped(learned: Parameters, surface: Surface) -> ShapedSurface:
     return surface.in_shape(learned["betas"], learned["padding"])
 
 
-def drawn_frame(learned: Parameters, clip: MotionClip, surface: Surface, row: int, cameras: Cameras) -> Tensor:
+def drawn_frame(
+    learned: Parameters, clip: MotionClip, surface: Surface, row: int, cameras: Cameras
+) -> Tensor:
     """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
     discs = shaped(learned, surface).in_pose(frame_pose_of(learned, clip, row))
     return drawn_silhouettes(discs, refined(cameras, learned))
@@ -326,7 +375,8 @@ class BodyFit:
 
     betas: Tensor  # (B,) shape parameters of the template
     shared: SharedCorrection  # turns of the joints and factor on the size, the same in all frames
-    offset: Tensor  # (3,) m, correction of the translation in the frame of the pelvis, the same in all frames
+    # (3,) m, correction of the translation in the frame of the pelvis, the same in all frames
+    offset: Tensor
     shift: Tensor  # (3,) the same in the frame of the world, in its unit
     poses: Tensor  # (F, J, 3) axis-angle, rad, added to the turns per frame
     trans: Tensor  # (F, 3) added to the given translations
@@ -336,7 +386,8 @@ class BodyFit:
         return self._moved(corrected_clip(self.shared, clip, self.poses, self.trans))
 
     def applied(self, clip: MotionClip) -> MotionClip:
-        """Return another clip whose poses were given by the same means, with what holds for all frames."""
+        """Return another clip whose poses were given by the same means, with what holds for all
+        frames."""
         return self._moved(corrected_clip(self.shared, clip))
 
     def _moved(self, turned: MotionClip) -> MotionClip:
@@ -359,7 +410,8 @@ def body_fit(learned: Parameters, joints: int) -> BodyFit:
 
 
 EVERY = 4  # each so many-th frame is left out: of those only poses are fitted
-GAIN = 0.01  # fraction by which the error on frames left out must fall for a refined focal length to be taken
+# fraction by which the error on frames left out must fall for a refined focal length to be taken
+GAIN = 0.01
 
 
 @dataclass(frozen=True)
@@ -367,8 +419,10 @@ class LensFit:
     """A focal length that was tried."""
 
     factor: float  # on the guessed focal length
-    distance: float  # from the camera at which the size in the images is kept, in units of the world
-    error: tuple[float, float]  # on the frames left out, with the focal length as guessed and as refined
+    # from the camera at which the size in the images is kept, in units of the world
+    distance: float
+    # on the frames left out, with the focal length as guessed and as refined
+    error: tuple[float, float]
     taken: bool  # the refined one is better
 
     def summary(self) -> str:
@@ -388,11 +442,12 @@ def fit_lens(
     steps: int,
     tick: Callable[[], None] = lambda: None,
 ) -> tuple[Parameters, LensFit]:
-    """Return the fit of shape, poses and focal length to the frames of one camera at the origin; ``start`` if it stays.
+    """Return the fit of shape, poses and focal length to the frames of one camera at the origin;
+    ``start`` if it stays.
 
-    Both lenses are fitted to three of four frames; then poses of the other frames: where these agree better, the
-    refined one is taken. ``start`` was found with the guessed focal length; ``shape`` names what is the same in all
-    frames.
+    Both lenses are fitted to three of four frames; then poses of the other frames: where these
+    agree better, the refined one is taken. ``start`` was found with the guessed focal length;
+    ``shape`` names what is the same in all frames.
     """
     rows = list(range(len(fitting.clip)))
     apart = rows[EVERY // 2 :: EVERY] or rows
@@ -400,13 +455,18 @@ def fit_lens(
     own = ("poses", "trans")
 
     def run(start: Parameters, learned: Sequence[str], seen: Sequence[int]) -> Parameters:
-        return fitting.run(start, learned, steps, lambda row: observed(row) if row in seen else None, tick)
+        return fitting.run(
+            start, learned, steps, lambda row: observed(row) if row in seen else None, tick
+        )
 
     distance = float(-fitting.clip.trans[:, 2].mean())
     guessed = run(start, (*shape, *own), rest)
     refined = run(with_lens(start, distance), (*shape, *own, "log_focal"), rest)
     both = [run(found, own, apart) for found in (guessed, refined)]
-    errors = (_mean_error(fitting, both[0], observed, apart), _mean_error(fitting, both[1], observed, apart))
+    errors = (
+        _mean_error(fitting, both[0], observed, apart),
+        _mean_error(fitting, both[1], observed, apart),
+    )
     taken = errors[1] < (1 - GAIN) * errors[0]
     found = run(both[1], (*shape, *own, "log_focal"), rows) if taken else start
     last = found if taken else refined
@@ -414,6 +474,8 @@ def fit_lens(
 
 
 @torch.no_grad()
-def _mean_error(fitting: Fitting, learned: Parameters, observed: Observations, rows: Sequence[int]) -> float:
+def _mean_error(
+    fitting: Fitting, learned: Parameters, observed: Observations, rows: Sequence[int]
+) -> float:
     seen = {row: frame for row in rows if (frame := observed(row)) is not None}
     return float(mean_error(learned, fitting.clip, fitting.surface, seen)) if seen else 0.0

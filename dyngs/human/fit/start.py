@@ -1,4 +1,5 @@
-"""First poses of a person of whom only silhouettes are known: where they stand, how they face, frame after frame."""
+"""First poses of a person of whom only silhouettes are known: where they stand, how they face,
+frame after frame."""
 
 from __future__ import annotations
 
@@ -36,11 +37,13 @@ NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in
 LIKELY = 3  # of these, nearest to the key points, that are tried where there are some
 MOST_ANCHORS = 20  # frames in which headings are tried
 CHANGE_WEIGHT = 0.01
-"""Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the square."""
+"""Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the
+square."""
 
 
 def likely_path(errors: Sequence[Sequence[float]], weight: float = CHANGE_WEIGHT) -> list[int]:
-    """Return the heading (A,) of each anchor for which errors (A, H) and changes of heading cost least in all.
+    """Return the heading (A,) of each anchor for which errors (A, H) and changes of heading cost
+    least in all.
 
     Source: the algorithm of Viterbi, 1967.
     """
@@ -48,7 +51,8 @@ def likely_path(errors: Sequence[Sequence[float]], weight: float = CHANGE_WEIGHT
     count = costs.shape[1]
     apart = np.abs(np.arange(count)[:, None] - np.arange(count))
     change = weight * (np.minimum(apart, count - apart) * (8 / count)) ** 2
-    total, came_from = costs[0], []
+    total = costs[0]
+    came_from = []
     for own in costs[1:]:
         ways = total[:, None] + change
         came_from.append(ways.argmin(0))
@@ -60,7 +64,8 @@ def likely_path(errors: Sequence[Sequence[float]], weight: float = CHANGE_WEIGHT
 
 
 def roots_between(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
-    """Return rotations (count, 3) of the root, axis-angle, rad: those (A, 3) of the anchors, turned on between them.
+    """Return rotations (count, 3) of the root, axis-angle, rad: those (A, 3) of the anchors, turned
+    on between them.
 
     Before the first anchor and after the last one they stay.
     """
@@ -73,7 +78,9 @@ def roots_between(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
 
 def angle_between(a: Tensor, b: Tensor) -> float:
     """Return the angle, rad, of the rotation from ``a`` (3,) to ``b`` (3,), both axis-angle."""
-    return float((Rotation.from_rotvec(a.numpy()).inv() * Rotation.from_rotvec(b.numpy())).magnitude())
+    return float(
+        (Rotation.from_rotvec(a.numpy()).inv() * Rotation.from_rotvec(b.numpy())).magnitude()
+    )
 
 
 def heading(index: int) -> float:
@@ -82,14 +89,19 @@ def heading(index: int) -> float:
 
 
 STEPS = 40
-"""Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of the one before."""
+"""Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of
+the one before."""
 OFF_COURSE = math.radians(30)
-"""Rotation of the root away from the path of headings from which a frame is begun on that path instead."""
+"""Rotation of the root away from the path of headings from which a frame is begun on that path
+instead."""
 ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
-"""Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent forward."""
-_WITHOUT_PATH = 2  # headings of the first frame from which clips without key points are followed without the path, too
+"""Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent
+forward."""
+# headings of the first frame from which clips without key points are followed without the path, too
+_WITHOUT_PATH = 2
 MOMENTUM = 0.8
-"""Fraction of the last rotation that is expected again, so that legs which pass each other are not exchanged."""
+"""Fraction of the last rotation that is expected again, so that legs which pass each other are not
+exchanged."""
 STATURE = 1.70  # height of a person in a usual pose, m, where a single camera leaves it open
 PELVIS_FRACTION = 0.53  # height of the pelvis, of that of the person
 
@@ -97,18 +109,26 @@ PELVIS_FRACTION = 0.53  # height of the pelvis, of that of the person
 def first_poses(
     times: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None] = lambda: None
 ) -> MotionClip:
-    """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row) alone.
+    """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row)
+    alone.
 
-    In some frames, the anchors, every heading is tried; a likely path through them says which way the person faces.
-    Each frame starts from the pose of the one before, and where that has left the path from the path's heading. Without
-    key points clips that never look at the path are compared with it. Raises ValueError: nobody in the first frame.
+    In some frames, the anchors, every heading is tried; a likely path through them says which way
+    the person faces. Each frame starts from the pose of the one before, and where that has left the
+    path from the path's heading. Without key points clips that never look at the path are compared
+    with it. Raises ValueError: nobody in the first frame.
     """
     seen = observed(0)
     if seen is None:
         raise ValueError("nobody is seen in the first frame")
-    standing, up = standing_clip(times, surface, observed), up_of(seen)
-    shown = {row: frame for row in evenly_spaced(len(times), MOST_ANCHORS) if (frame := observed(row)) is not None}
-    anchors, tried = list(shown), [_all_headings(standing, row, up, surface, shown[row], tick) for row in shown]
+    standing = standing_clip(times, surface, observed)
+    up = up_of(seen)
+    shown = {
+        row: frame
+        for row in evenly_spaced(len(times), MOST_ANCHORS)
+        if (frame := observed(row)) is not None
+    }
+    anchors = list(shown)
+    tried = [_all_headings(standing, row, up, surface, shown[row], tick) for row in shown]
     path = likely_path([[error for _, _, error in own] for own in tried])
     roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
     ways: list[tuple[int, Tensor | None]] = [(path[0], roots_between(anchors, roots, len(times)))]
@@ -124,21 +144,30 @@ def first_poses(
 
 
 def num_ticks(frames: int, *, marked: bool) -> int:
-    """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without key points."""
+    """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without
+    key points."""
     headings, ways = (LIKELY, 1) if marked else (NUM_HEADINGS, 1 + _WITHOUT_PATH)
     return headings * len(evenly_spaced(frames, MOST_ANCHORS)) + (frames - 1) * ways
 
 
 def _all_headings(
-    clip: MotionClip, row: int, up: Tensor, surface: Surface, seen: ObservedFrame, tick: Callable[[], None]
+    clip: MotionClip,
+    row: int,
+    up: Tensor,
+    surface: Surface,
+    seen: ObservedFrame,
+    tick: Callable[[], None],
 ) -> list[tuple[Tensor, Tensor, float]]:
-    """Return pose, translation and error of a frame as found from each heading; after the first at half the size.
+    """Return pose, translation and error of a frame as found from each heading; after the first at
+    half the size.
 
     With key points only the ``LIKELY`` headings are tried, and the error of others is infinite.
     """
     starts = [turned(clip, heading(index), up) for index in range(NUM_HEADINGS)]
     errors = [_marked_error(start, row, surface, seen) for start in starts]
-    likely = sorted(range(NUM_HEADINGS), key=errors.__getitem__)[: NUM_HEADINGS if seen.joints is None else LIKELY]
+    likely = sorted(range(NUM_HEADINGS), key=errors.__getitem__)[
+        : NUM_HEADINGS if seen.joints is None else LIKELY
+    ]
     found = [(start.poses[row], start.trans[row], math.inf) for start in starts]
     for index in likely:
         levels = (2, 1) if row == 0 else (2,)
@@ -158,17 +187,22 @@ def _marked_error(clip: MotionClip, row: int, surface: Surface, seen: ObservedFr
 
 
 def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
-    poses, positions = clip.poses.clone(), clip.trans.clone()
+    poses = clip.poses.clone()
+    positions = clip.trans.clone()
     poses[row], positions[row] = pose, trans
     return replace(clip, poses=poses, trans=positions)
 
 
 def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
-    """Return the usual pose, upright, at the place and in the size of the silhouettes of each frame.
+    """Return the usual pose, upright, at the place and in the size of the silhouettes of each
+    frame.
 
     Where nobody is seen, the place is that of the frame before.
     """
-    joints, up, positions, heights = surface.body.joints, torch.zeros(3, device="cpu"), [], []
+    joints = surface.body.joints
+    up = torch.zeros(3, device="cpu")
+    positions = []
+    heights = []
     for row in range(len(times)):
         seen = observed(row)
         if seen is None:
@@ -193,7 +227,8 @@ def up_of(seen: ObservedFrame) -> Tensor:
 
 
 def place_and_height(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | None]:
-    """Return the place (3,) of the pelvis in the world and the height of the person, None if one camera sees them."""
+    """Return the place (3,) of the pelvis in the world and the height of the person, None if one
+    camera sees them."""
     rays = [_ray(seen.cameras.select(i), seen.alpha[i]) for i in range(len(seen))]
     rays = [ray for ray in rays if ray is not None]
     if not rays:
@@ -204,7 +239,9 @@ def place_and_height(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | N
         height = None
     else:
         across = torch.eye(3, device="cpu") - directions[:, :, None] * directions[:, None]
-        middle = torch.linalg.lstsq(across.sum(0), (across @ starts[..., None]).sum(0)).solution[:, 0]
+        middle = torch.linalg.lstsq(across.sum(0), (across @ starts[..., None]).sum(0)).solution[
+            :, 0
+        ]
         height = float((angles * (middle - starts).norm(dim=1)).median())
     return middle + up * (PELVIS_FRACTION - 0.5) * (height or STATURE), height
 
@@ -218,29 +255,43 @@ def turned(clip: MotionClip, angle: float, up: Tensor) -> MotionClip:
 
 
 def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Return start and unit direction (3,) of the ray through the middle of a silhouette, and its height as an angle.
+    """Return start and unit direction (3,) of the ray through the middle of a silhouette, and its
+    height as an angle.
 
-    The angle is the height over the distance, for a person who stands upright in the image. None if nobody is seen.
+    The angle is the height over the distance, for a person who stands upright in the image. None if
+    nobody is seen.
     """
     box = silhouette_box(alpha, 0.5)
     if box is None:
         return None
     (top, bottom), (left, right) = ((part.start, part.stop) for part in box)
     middle = torch.tensor([(left + right) / 2, (top + bottom) / 2, 1.0], device="cpu")
-    intrinsics, pose = camera.intrinsics[0], camera.cam_from_world[0]
+    intrinsics = camera.intrinsics[0]
+    pose = camera.cam_from_world[0]
     local = torch.linalg.solve(intrinsics, middle)
     direction = pose[:3, :3].T @ local
-    return camera.centers[0], direction / direction.norm(), (bottom - top) / (intrinsics[1, 1] * local.norm())
+    return (
+        camera.centers[0],
+        direction / direction.norm(),
+        (bottom - top) / (intrinsics[1, 1] * local.norm()),
+    )
 
 
 def _followed(
-    clip: MotionClip, roots: Tensor | None, surface: Surface, observed: Observations, tick: Callable[[], None]
+    clip: MotionClip,
+    roots: Tensor | None,
+    surface: Surface,
+    observed: Observations,
+    tick: Callable[[], None],
 ) -> tuple[MotionClip, float]:
-    """Return the clip with the poses after the first frame found one by one, and the mean error of what is seen.
+    """Return the clip with the poses after the first frame found one by one, and the mean error of
+    what is seen.
 
     ``roots`` (F, 3) is a path of headings to stay near; None: there is none.
     """
-    poses, trans, errors = clip.poses.clone(), clip.trans.clone(), []
+    poses = clip.poses.clone()
+    trans = clip.trans.clone()
+    errors = []
     for row in range(1, len(poses)):
         seen = observed(row)
         poses[row] = _extrapolated(poses, row)
@@ -248,7 +299,10 @@ def _followed(
         if seen is not None:
             starts = [poses[row]]
             if roots is not None and angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
-                starts = [torch.cat([roots[row : row + 1], others[1:]]) for others in (poses[row], clip.poses[row])]
+                starts = [
+                    torch.cat([roots[row : row + 1], others[1:]])
+                    for others in (poses[row], clip.poses[row])
+                ]
             found = [_found_from(clip, start, trans[row], row, surface, seen) for start in starts]
             poses[row], trans[row], error = min(found, key=lambda x: x[2])
             errors.append(error)
@@ -256,8 +310,11 @@ def _followed(
     return replace(clip, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
 
 
-def _with_better_arms(clip: MotionClip, error: float, surface: Surface, seen: ObservedFrame) -> MotionClip:
-    """Return the clip whose first frame has the arms that fit best, of those found from other positions as well.
+def _with_better_arms(
+    clip: MotionClip, error: float, surface: Surface, seen: ObservedFrame
+) -> MotionClip:
+    """Return the clip whose first frame has the arms that fit best, of those found from other
+    positions as well.
 
     A forearm that starts in front of the trunk does not find its way out of it.
     """
@@ -269,7 +326,8 @@ def _with_better_arms(clip: MotionClip, error: float, surface: Surface, seen: Ob
                 pose[JOINT_NAMES.index(f"{side}_{name}")] = torch.deg2rad(turn)
             pose, trans, found = _found_from(clip, pose, clip.trans[0], 0, surface, seen)
             if found < error:
-                error, clip = found, _with_row(clip, 0, pose, trans)
+                error = found
+                clip = _with_row(clip, 0, pose, trans)
     return clip
 
 
@@ -282,16 +340,20 @@ def _found_from(
     seen: ObservedFrame,
     levels: tuple[int, ...] = (2, 1),
 ) -> tuple[Tensor, Tensor, float]:
-    """Return pose (J, 3), translation and error of one frame, found from a start; unusual poses add to the error.
+    """Return pose (J, 3), translation and error of one frame, found from a start; unusual poses add
+    to the error.
 
     ``levels`` are the factors by which what is seen is made smaller, one after the other.
     """
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
-    learned, fitting = new_fit(one, surface), Fitting(one, surface, usual(one))
+    learned = new_fit(one, surface)
+    fitting = Fitting(one, surface, usual(one))
     for level in levels:
         learned = fitting.run(learned, ("poses", "trans"), STEPS, InTurn({0: seen.shrunk(level)}))
     with torch.no_grad():
-        error = float(mean_error(learned, one, surface, {0: seen}) + prior(learned, fitting.expected))
+        error = float(
+            mean_error(learned, one, surface, {0: seen}) + prior(learned, fitting.expected)
+        )
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
     given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
     found = pose.clone()
@@ -300,7 +362,8 @@ def _found_from(
 
 
 def _extrapolated(poses: Tensor, row: int) -> Tensor:
-    """Return the pose (J, 3) expected in frame ``row``: that before it, turned on as it turned before.
+    """Return the pose (J, 3) expected in frame ``row``: that before it, turned on as it turned
+    before.
 
     What was put on the path of headings was no motion.
     """

@@ -1,4 +1,5 @@
-"""Reader and writer of AMASS motion files, and of other ``.npz`` with the parameters of SMPL, SMPL-H and SMPL-X.
+"""Reader and writer of AMASS motion files, and of other ``.npz`` with the parameters of SMPL,
+SMPL-H and SMPL-X.
 
 Local letter: B shape parameters.
 """
@@ -33,37 +34,44 @@ _NAMED = {"global_orient": 1, "body_pose": 21, "jaw_pose": 1, "leye_pose": 1, "r
 _ALIASES = {"smpl_thetas": "poses", "smpl_betas": "betas", "transl": "trans", "cam_trans": "trans"}
 """Names of the package smplx, and of ROMP, by those of AMASS."""
 _RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate")
-_ANY_AXES = "any axes"  # marks arrays of a file with the names of smplx or ROMP: nobody says which way is up
+# marks arrays of a file with the names of smplx or ROMP: nobody says which way is up
+_ANY_AXES = "any axes"
 _MAX_ANGLE = 4 * np.pi  # rad; no program writes a joint that is rotated by more than two turns
 _MAX_SPEED = 20.0  # m/s, of the root; a sprinter reaches 12
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto", fps: float | None = None) -> Motion:
+def read_amass(
+    path: Path, body: BodyTemplate, up: UpAxis = "auto", fps: float | None = None
+) -> Motion:
     """Read a motion of 55 joints, y up; joints that the file lacks do not rotate.
 
-    Tensors are float32, but ``trans`` of a fit, a file with ``scale``, is float64 where the file has it so.
+    Tensors are float32, but ``trans`` of a fit, a file with ``scale``, is float64 where the file
+    has it so.
 
-    Keys: ``poses``, or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3); ``mocap_framerate`` or
-    ``mocap_frame_rate``, else ``fps`` frames per second; ``betas`` (B,) or (F, B); ``scale`` (one or F) and
-    ``up_axis`` in files of dyngs or a fit. Or the names of the package smplx: ``global_orient``, ``body_pose`` and the
-    like, ``transl``, ``fps``; or those of ROMP. Poses are axis-angles or rotation matrices of 22, 24, 52 or 55 joints.
+    Keys: ``poses``, or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
+    ``mocap_framerate`` or ``mocap_frame_rate``, else ``fps`` frames per second; ``betas`` (B,) or
+    (F, B); ``scale`` (one or F) and ``up_axis`` in files of dyngs or a fit. Or the names of the
+    package smplx: ``global_orient``, ``body_pose`` and the like, ``transl``, ``fps``; or those of
+    ROMP. Poses are axis-angles or rotation matrices of 22, 24, 52 or 55 joints.
 
-    AMASS files are z up: unless ``up`` or ``up_axis`` says otherwise, a file is z up if it has no ``scale``; with the
-    names of smplx the axis nearest to the mean up direction of the pelvis is up. The rotation T to y up moves every
-    vertex v to T v: R_0' = T R_0 about the pelvis J_0 of the shaped body, trans' = T (trans + s J_0) - s J_0. If
-    ``body`` is of another family than a file without ``scale`` and ``up_axis``, shape parameters are set to zero and
-    the lowest vertex to y = 0. Raises DyngsError: names the file and what is missing or wrong.
+    AMASS files are z up: unless ``up`` or ``up_axis`` says otherwise, a file is z up if it has no
+    ``scale``; with the names of smplx the axis nearest to the mean up direction of the pelvis is
+    up. The rotation T to y up moves every vertex v to T v: R_0' = T R_0 about the pelvis J_0 of the
+    shaped body, trans' = T (trans + s J_0) - s J_0. If ``body`` is of another family than a file
+    without ``scale`` and ``up_axis``, shape parameters are set to zero and the lowest vertex to y =
+    0. Raises DyngsError: names the file and what is missing or wrong.
     """
     with reading(path):
         return _motion(path, _arrays(path), body, up, fps)
 
 
 def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") -> None:
-    """Write the motion of 55 joints as an AMASS file of SMPL-X with ``up_axis`` y; reading it gives the same motion.
+    """Write the motion of 55 joints as an AMASS file of SMPL-X with ``up_axis`` y; reading it gives
+    the same motion.
 
-    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as its model. Raises
-    DyngsError: the suffix is not ``.npz``, or the file cannot be written.
+    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as
+    its model. Raises DyngsError: the suffix is not ``.npz``, or the file cannot be written.
     """
     if path.suffix.lower() != ".npz":
         raise DyngsError(f"cannot write {path}: a motion is written as .npz")
@@ -83,12 +91,16 @@ def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") ->
         )
 
 
-def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis, fps: float | None) -> Motion:
+def _motion(
+    path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis, fps: float | None
+) -> Motion:
     poses, model = _poses(path, arrays)
     frames = len(poses)
     trans = _numbers(path, arrays, "trans")
     if trans.shape[-1:] != (3,) or _without_ones(trans.shape[:-1]) != _without_ones((frames,)):
-        raise DyngsError(f"{path}: 'trans' must be {frames} x 3 numbers as 'poses' has {frames} frames, {_got(trans)}")
+        raise DyngsError(
+            f"{path}: 'trans' must be {frames} x 3 numbers as 'poses' has {frames} frames, {_got(trans)}"
+        )
     trans = trans.reshape(frames, 3)
     scale = _scale(path, arrays, frames)
     is_own = "scale" in arrays or "up_axis" in arrays
@@ -109,7 +121,9 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: U
     is_fine = "scale" in arrays and arrays["trans"].dtype == np.float64
     place = torch.from_numpy(trans if is_fine else trans.astype(np.float32))
     notes += [*assumed, *([] if "scale" in arrays else _about_speed(trans, rate))]
-    motion = Motion(tensors[0], place, tensors[1], rate, tensors[2], tuple(f"{path}: {note}" for note in notes))
+    motion = Motion(
+        tensors[0], place, tensors[1], rate, tensors[2], tuple(f"{path}: {note}" for note in notes)
+    )
     return place_on_floor(motion, body) if is_other_model else motion
 
 
@@ -119,11 +133,14 @@ def _about_speed(trans: np.ndarray, fps: float) -> list[str]:
     speed = float(np.quantile(speeds, 0.9)) if len(speeds) else 0.0
     if speed <= _MAX_SPEED:
         return []
-    return [f"the root moves at {speed:.0f} m/s; 'trans' must be metres: divide it by 1000 if it is millimetres"]
+    return [
+        f"the root moves at {speed:.0f} m/s; 'trans' must be metres: divide it by 1000 if it is millimetres"
+    ]
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays that are needed by AMASS's names; others, which may hold objects, are not read."""
+    """Return the arrays that are needed by AMASS's names; others, which may hold objects, are not
+    read."""
     keys = ("poses", *_PARTS, *_NAMED, "trans", "betas", *_ALIASES, "scale", "up_axis", *_RATES)
     if not path.is_file():
         raise DyngsError(f"{path}: no such file")
@@ -131,7 +148,9 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     renamed = [alias for alias, key in _ALIASES.items() if alias in found and key not in found]
     for alias in renamed:
         found[_ALIASES[alias]] = found.pop(alias)
-    if renamed or ("poses" not in found and "root_orient" not in found and "global_orient" in found):
+    if renamed or (
+        "poses" not in found and "root_orient" not in found and "global_orient" in found
+    ):
         found[_ANY_AXES] = np.ones(1)
     return found
 
@@ -151,12 +170,15 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
     poses[:, rows] = given[:, : len(rows)]
     largest = np.linalg.norm(poses, axis=-1).max()
     if largest > _MAX_ANGLE:
-        raise DyngsError(f"{path}: a joint is rotated by {largest:.0f} rad, more than two turns; convert degrees first")
+        raise DyngsError(
+            f"{path}: a joint is rotated by {largest:.0f} rad, more than two turns; convert degrees first"
+        )
     return poses, model
 
 
 def _joined(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
-    """Return axis-angles (F, 55, 3) of parts, zero for those that lack but for root and body; and the model's name."""
+    """Return axis-angles (F, 55, 3) of parts, zero for those that lack but for root and body; and
+    the model's name."""
     parts = _NAMED if "root_orient" not in arrays and "global_orient" in arrays else _PARTS
     root, body, *others = parts
     if parts is _PARTS and not (root in arrays and body in arrays):
@@ -170,16 +192,23 @@ def _joined(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]
     frames = len(found[0])
     for key in others:
         found.append(
-            _axis_angles(path, arrays, key, (parts[key],)) if key in arrays else np.zeros((frames, parts[key], 3))
+            _axis_angles(path, arrays, key, (parts[key],))
+            if key in arrays
+            else np.zeros((frames, parts[key], 3))
         )
     for key, part in zip(parts, found, strict=True):
         if len(part) != frames:
-            raise DyngsError(f"{path}: '{key}' must have {frames} frames as '{root}' has, {_got(arrays[key])}")
+            raise DyngsError(
+                f"{path}: '{key}' must have {frames} frames as '{root}' has, {_got(arrays[key])}"
+            )
     return np.concatenate(found, axis=1), model
 
 
-def _axis_angles(path: Path, arrays: dict[str, np.ndarray], key: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Return the axis-angles (F, J, 3) of a key, J one of ``counts``, with or without a batch dimension of 1."""
+def _axis_angles(
+    path: Path, arrays: dict[str, np.ndarray], key: str, counts: tuple[int, ...]
+) -> np.ndarray:
+    """Return the axis-angles (F, J, 3) of a key, J one of ``counts``, with or without a batch
+    dimension of 1."""
     value = _numbers(path, arrays, key)
     is_batch = value.ndim > 2 and len(value) == 1
     for clip in (value, value[0]) if is_batch else (value,):
@@ -195,7 +224,8 @@ def _axis_angles(path: Path, arrays: dict[str, np.ndarray], key: str, counts: tu
 
 
 def _rotations(clip: np.ndarray, count: int) -> np.ndarray | None:
-    """Return the axis-angles (F, J, 3) of J = ``count`` joints or of their rotation matrices, None of others."""
+    """Return the axis-angles (F, J, 3) of J = ``count`` joints or of their rotation matrices, None
+    of others."""
     rest = _without_ones(clip.shape[1:])
     if rest in ((3 * count,), (count, 3)):
         return clip.reshape(len(clip), count, 3)
@@ -214,16 +244,21 @@ def _without_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _betas(path: Path, arrays: dict[str, np.ndarray], frames: int) -> tuple[np.ndarray, list[str]]:
-    """Return the shape parameters (B,), the mean if each frame has its own; and a note that says so."""
+    """Return the shape parameters (B,), the mean if each frame has its own; and a note that says
+    so."""
     if "betas" not in arrays:
         return np.zeros(10), []
     betas = np.atleast_2d(_numbers(path, arrays, "betas").squeeze())
     if betas.ndim != 2 or len(betas) not in (1, frames):
-        raise DyngsError(f"{path}: 'betas' must be one row of numbers or one for each frame, {_got(arrays['betas'])}")
+        raise DyngsError(
+            f"{path}: 'betas' must be one row of numbers or one for each frame, {_got(arrays['betas'])}"
+        )
     span = np.ptp(betas, axis=0).max(initial=0)
     if not span:
         return betas[0], []
-    return betas.mean(axis=0), [f"'betas' differ between frames by up to {span:.2g}: the mean is taken"]
+    return betas.mean(axis=0), [
+        f"'betas' differ between frames by up to {span:.2g}: the mean is taken"
+    ]
 
 
 def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
@@ -260,23 +295,28 @@ def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray
     """Return the scale (F,) of the template; 1 where the file has none."""
     scale = _numbers(path, arrays, "scale") if "scale" in arrays else np.ones(())
     if scale.shape not in ((), (1,), (frames,)) or not (scale > 0).all():
-        raise DyngsError(f"{path}: 'scale' must be one positive number, or one for each of {frames} frames")
+        raise DyngsError(
+            f"{path}: 'scale' must be one positive number, or one for each of {frames} frames"
+        )
     return np.broadcast_to(scale, frames).copy()
 
 
 def _y_up_from_file(
     path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray
 ) -> tuple[np.ndarray | None, list[str]]:
-    """Return the rotation (3, 3) to y up, None if there is nothing to turn; and a note if up had to be assumed.
+    """Return the rotation (3, 3) to y up, None if there is nothing to turn; and a note if up had to
+    be assumed.
 
-    By ``up``, the key ``up_axis``, as AMASS files are, or by rotations (F, 3) of the root: the signed axis nearest to
-    the mean up direction becomes y, by half a turn about x for -y.
+    By ``up``, the key ``up_axis``, as AMASS files are, or by rotations (F, 3) of the root: the
+    signed axis nearest to the mean up direction becomes y, by half a turn about x for -y.
     """
     notes = []
     if up == "auto" and "up_axis" in arrays:
         up = "z" if str(arrays["up_axis"]) == "z" else "y"
         if str(arrays["up_axis"]) not in ("y", "z"):
-            raise DyngsError(f"{path}: 'up_axis' must be 'y' or 'z', not {str(arrays['up_axis'])!r:.20}")
+            raise DyngsError(
+                f"{path}: 'up_axis' must be 'y' or 'z', not {str(arrays['up_axis'])!r:.20}"
+            )
     elif up == "auto" and _ANY_AXES in arrays:
         mean = Rotation.from_rotvec(roots).as_matrix()[:, :, 1].mean(axis=0)
         axis = int(np.abs(mean).argmax())
@@ -291,7 +331,9 @@ def _y_up_from_file(
     elif up == "auto" and "scale" not in arrays:
         up = "z"
         if not any(key in arrays for key in _RATES):
-            notes = ["the file does not say what is up; z is taken, as in files of AMASS; --up y takes y"]
+            notes = [
+                "the file does not say what is up; z is taken, as in files of AMASS; --up y takes y"
+            ]
     return (_Y_UP_FROM_Z_UP if up == "z" else None), notes
 
 

@@ -16,7 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.limits import read_limited, require_at_most
-from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, require_frame_rate
+from dyngs.human.motion.motion import (
+    SkeletonMotion,
+    frame_chunks,
+    require_frame_count,
+    require_frame_rate,
+)
 
 _END_SITE = -1
 _MOST_JOINTS = 4096
@@ -32,15 +37,18 @@ class _Joint:
     name: str
     parent: int  # -1 for the root
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    channels: list[str] = field(default_factory=list)  # "zrotation" and the like, in the order of the file
+    # "zrotation" and the like, in the order of the file
+    channels: list[str] = field(default_factory=list)
 
 
 def read_bvh(path: Path) -> SkeletonMotion:
-    """Read the motion of the file's joints, in its own units and axes; in the rest pose all rotations are zero.
+    """Read the motion of the file's joints, in its own units and axes; in the rest pose all
+    rotations are zero.
 
-    The transform of a joint relative to its parent is T R: T from its position channels, or from OFFSET along axes
-    without one, and R = R_1 R_2 R_3 from its rotations about single axes, in degrees, in the order of its channels.
-    Raises DyngsError: names the file and what is wrong with it.
+    The transform of a joint relative to its parent is T R: T from its position channels, or from
+    OFFSET along axes without one, and R = R_1 R_2 R_3 from its rotations about single axes, in
+    degrees, in the order of its channels. Raises DyngsError: names the file and what is wrong with
+    it.
     """
     with reading(path):
         hierarchy, rows = _halves(path)
@@ -58,7 +66,8 @@ def read_bvh(path: Path) -> SkeletonMotion:
 def _forward_kinematics(
     joints: Sequence[_Joint], values: np.ndarray, rotations: np.ndarray, positions: np.ndarray
 ) -> np.ndarray:
-    """Fill world rotations (F, S, 3, 3) and positions (F, S, 3) from channels (F, C); return joints (S, 3) at rest."""
+    """Fill world rotations (F, S, 3, 3) and positions (F, S, 3) from channels (F, C); return joints
+    (S, 3) at rest."""
     rest = np.zeros((len(joints), 3))
     column = 0
     for i, joint in enumerate(joints):
@@ -99,19 +108,24 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
         words = line.split()
         if not words:
             continue
-        word, inside = words[0].upper(), blocks[-1] if blocks else None
+        word = words[0].upper()
+        inside = blocks[-1] if blocks else None
         starts_root = word == "ROOT" and inside is None and not joints
         starts_joint = word == "JOINT" and inside is not None and inside >= 0
         if announced is not None:
             if word != "{":
-                raise DyngsError(f"{path}: HIERARCHY: expected a brace before '{line.strip():.60}'; export it again")
+                raise DyngsError(
+                    f"{path}: HIERARCHY: expected a brace before '{line.strip():.60}'; export it again"
+                )
             blocks.append(announced)
             announced = None
         elif (starts_root or starts_joint) and len(words) > 1:
             announced = len(joints)
             require_at_most(path, announced + 1, _MOST_JOINTS, "joints")
             without_offset.add(announced)
-            joints.append(_Joint(" ".join(words[1:])[:_LONGEST_NAME], -1 if inside is None else inside))
+            joints.append(
+                _Joint(" ".join(words[1:])[:_LONGEST_NAME], -1 if inside is None else inside)
+            )
         elif word == "END" and inside is not None and inside >= 0:
             announced = _END_SITE
         elif word == "}" and blocks:
@@ -132,35 +146,45 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
                 what = "a count and so many of Xposition ... Zrotation"
                 raise DyngsError(f"{path}: the CHANNELS of '{joints[inside].name}' must be {what}")
         else:
-            raise DyngsError(f"{path}: HIERARCHY: did not expect '{line.strip():.60}'; export it again")
+            raise DyngsError(
+                f"{path}: HIERARCHY: did not expect '{line.strip():.60}'; export it again"
+            )
     if not joints or blocks or announced is not None:
         raise DyngsError(f"{path}: HIERARCHY is cut off or has no ROOT; export it again")
     if without_offset:
-        raise DyngsError(f"{path}: the joint '{joints[min(without_offset)].name}' has no OFFSET; export it again")
+        raise DyngsError(
+            f"{path}: the joint '{joints[min(without_offset)].name}' has no OFFSET; export it again"
+        )
     return joints
 
 
 def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray, float]:
     header = re.match(r"\s*Frames\s*:\s*(\d{1,9})\s+Frame\s+Time\s*:\s*(\S+)", rows, re.IGNORECASE)
     if header is None:
-        raise DyngsError(f"{path}: MOTION must begin with 'Frames: ' and 'Frame Time: '; export it again")
-    frames, channels = int(header[1]), sum(len(joint.channels) for joint in joints)
+        raise DyngsError(
+            f"{path}: MOTION must begin with 'Frames: ' and 'Frame Time: '; export it again"
+        )
+    frames = int(header[1])
+    channels = sum(len(joint.channels) for joint in joints)
     seconds = _numbers(path, [header[2]]).item()
     if not frames or not channels or not seconds > 0:
         raise DyngsError(f"{path}: needs at least one frame, one channel and a positive Frame Time")
     fps = require_frame_rate(path, 1.0 / seconds if seconds > 1e-300 else math.inf)
-    if frames * channels > (len(rows) - header.end() + 1) // 2:  # each number takes a digit and a gap
+    if frames * channels > (len(rows) - header.end() + 1) // 2:
+        # each number takes a digit and a gap
         count = sum(1 for _ in re.finditer(r"\S+", rows[header.end() :]))
         raise _cut_off(path, frames, channels, count)
     require_frame_count(path, frames, len(joints))
     values = np.empty(frames * channels)
-    count, start = 0, header.end()
+    count = 0
+    start = header.end()
     while start < len(rows):
         gap = _GAP.search(rows, start + _CHARACTERS)
         end = len(rows) if gap is None else gap.start()
         part = _numbers(path, rows[start:end].split())
         values[count : count + len(part)] = part[: max(len(values) - count, 0)]
-        count, start = count + len(part), end
+        count = count + len(part)
+        start = end
     if count != len(values):
         raise _cut_off(path, frames, channels, count)
     return values.reshape(frames, channels), fps
@@ -182,7 +206,9 @@ def _numbers(path: Path, words: list[str]) -> np.ndarray:
     return values
 
 
-def _local_motion(offset: np.ndarray, channels: list[str], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _local_motion(
+    offset: np.ndarray, channels: list[str], values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return position (F, 3) and rotation (F, 3, 3) relative to the parent."""
     position = np.tile(offset, (len(values), 1))
     rotation = Rotation.identity(len(values))

@@ -1,4 +1,5 @@
-"""Reader of skeletal animations in glTF 2.0 files (``.glb``, ``.gltf``), and of VRM animations (``.vrma``).
+"""Reader of skeletal animations in glTF 2.0 files (``.glb``, ``.gltf``), and of VRM animations
+(``.vrma``).
 
 Local letters: S joints, K keys of a channel.
 """
@@ -14,7 +15,12 @@ from scipy.spatial.transform import Rotation
 from dyngs.errors import reading
 from dyngs.files.gltf import MOST_JOINTS, Animation, GltfFile
 from dyngs.files.limits import require_at_most
-from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, sample_times
+from dyngs.human.motion.motion import (
+    SkeletonMotion,
+    frame_chunks,
+    require_frame_count,
+    sample_times,
+)
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 _VRM_THUMBS = {
@@ -22,12 +28,14 @@ _VRM_THUMBS = {
     for side in ("left", "right")
     for new, old in (("Metacarpal", "Proximal"), ("Proximal", "Intermediate"))
 }
-"""Names of the thumb's first two bones in VRM 1, and what VRM 0, and all other fingers, call these."""
+"""Names of the thumb's first two bones in VRM 1, and what VRM 0, and all other fingers, call
+these."""
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """Animation curve of one property of a node: K ascending times, s, and K values, or 3 K for a cubic spline."""
+    """Animation curve of one property of a node: K ascending times, s, and K values, or 3 K for a
+    cubic spline."""
 
     times: np.ndarray
     values: np.ndarray
@@ -45,7 +53,8 @@ class _Transforms:
 
 @dataclass(frozen=True)
 class _Rig:
-    """The joints of a file: nodes, names, and inverse bind matrices (an accessor); None: the nodes stand at rest."""
+    """The joints of a file: nodes, names, and inverse bind matrices (an accessor); None: the nodes
+    stand at rest."""
 
     joints: tuple[int, ...]
     names: tuple[str, ...]
@@ -53,12 +62,14 @@ class _Rig:
 
 
 def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
-    """Read the motion of a file's joints at ``fps`` frames per second, from first to last key; the world is y up.
+    """Read the motion of a file's joints at ``fps`` frames per second, from first to last key; the
+    world is y up.
 
-    The joints are those of the largest skin, at rest in the bind pose, or without inverse bind matrices as the nodes
-    stand. Without a skin all animated nodes are joints, and must show a T-pose or an A-pose without animation. ``clip``
-    names the animation, where several move the joints. Raises DyngsError: no such animation, anything broken or not
-    supported (sparse accessors, meshopt compression, mirrored nodes); names the file.
+    The joints are those of the largest skin, at rest in the bind pose, or without inverse bind
+    matrices as the nodes stand. Without a skin all animated nodes are joints, and must show a
+    T-pose or an A-pose without animation. ``clip`` names the animation, where several move the
+    joints. Raises DyngsError: no such animation, anything broken or not supported (sparse
+    accessors, meshopt compression, mirrored nodes); names the file.
     """
     with reading(path):
         file = GltfFile(path)
@@ -67,10 +78,12 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
 
 
 def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
-    """Read a VRM animation (``.vrma``, extension VRMC_vrm_animation 1.0): the bones have the names of VRM's humanoid.
+    """Read a VRM animation (``.vrma``, extension VRMC_vrm_animation 1.0): the bones have the names
+    of VRM's humanoid.
 
-    Without animation the nodes stand in a T-pose. The first animation counts unless ``clip`` names another. Expressions
-    and the gaze are left out. Raises DyngsError: as ``read_gltf``, or the extension is missing.
+    Without animation the nodes stand in a T-pose. The first animation counts unless ``clip`` names
+    another. Expressions and the gaze are left out. Raises DyngsError: as ``read_gltf``, or the
+    extension is missing.
     """
     with reading(path):
         file = GltfFile(path)
@@ -78,7 +91,10 @@ def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -
         if extension is None:
             raise file.error("has no VRMC_vrm_animation; a plain glTF animation ends in .glb")
         bones = extension.humanoid.humanBones
-        rig = _Rig(tuple(bone.node for bone in bones.values()), tuple(_VRM_THUMBS.get(name, name) for name in bones))
+        rig = _Rig(
+            tuple(bone.node for bone in bones.values()),
+            tuple(_VRM_THUMBS.get(name, name) for name in bones),
+        )
         if not bones:
             raise file.error("its humanoid has no bones; export it again")
         chain = _with_ancestors(file, rig.joints)
@@ -99,7 +115,9 @@ def _skin(file: GltfFile) -> _Rig | None:
 def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
     nodes = file.document.nodes
     channels = _chosen(file, dict.fromkeys(range(len(nodes))), clip).channels
-    moved = {c.target.node for c in channels if c.target.path in _KINDS and c.target.node is not None}
+    moved = {
+        c.target.node for c in channels if c.target.path in _KINDS and c.target.node is not None
+    }
     waiting = [node for node in moved if node < len(nodes)]
     found: set[int] = set()
     while waiting:
@@ -118,7 +136,8 @@ def _motion(file: GltfFile, rig: _Rig, fps: float, animation: Animation) -> Skel
     joints = rig.joints
     chain = _with_ancestors(file, joints)
     curves = _curves(file, animation, chain)
-    start, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
+    start = min(c.times[0] for c in curves.values())
+    end = max(c.times[-1] for c in curves.values())
     require_frame_count(file.path, float((end - start) * fps), len(chain))
     times = start + sample_times(end - start, 1.0, fps)
     rotations = np.empty((len(times), len(joints), 3, 3))
@@ -126,7 +145,8 @@ def _motion(file: GltfFile, rig: _Rig, fps: float, animation: Animation) -> Skel
     for part in frame_chunks(len(times)):
         moving = _world_transforms(file, chain, curves, times[part])
         for i, node in enumerate(joints):
-            rotations[part, i], positions[part, i] = moving[node].rotations, moving[node].positions
+            rotations[part, i] = moving[node].rotations
+            positions[part, i] = moving[node].positions
     if not (np.abs(positions) < 1e9).all():
         raise file.error("its joints move beyond all bounds; export it again")
     if rig.bind is None:
@@ -182,20 +202,28 @@ def _moving(file: GltfFile, chain: dict[int, int | None]) -> list[Animation]:
     return [a for a in file.document.animations if any(c.target.node in chain for c in a.channels)]
 
 
-def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) -> dict[tuple[int, str], _Curve]:
+def _curves(
+    file: GltfFile, animation: Animation, chain: dict[int, int | None]
+) -> dict[tuple[int, str], _Curve]:
     curves: dict[tuple[int, str], _Curve] = {}
     for channel in animation.channels:
-        node, kind = channel.target.node, channel.target.path
+        node = channel.target.node
+        kind = channel.target.path
         if node is None or node not in chain or kind not in _KINDS:
             continue
         if channel.sampler >= len(animation.samplers):
-            raise file.error(f"the animation {animation.name[:30]!r} lacks a sampler; export it again")
+            raise file.error(
+                f"the animation {animation.name[:30]!r} lacks a sampler; export it again"
+            )
         if file.document.nodes[node].matrix is not None:
             raise file.error(f"node {node} is animated but has a matrix; export it again")
         sampler = animation.samplers[channel.sampler]
-        times, values = _finite(file, sampler.input, "SCALAR")[:, 0], _finite(file, sampler.output, _KINDS[kind])
+        times = _finite(file, sampler.input, "SCALAR")[:, 0]
+        values = _finite(file, sampler.output, _KINDS[kind])
         if len(values) != len(times) * (3 if sampler.interpolation == "CUBICSPLINE" else 1):
-            raise file.error(f"a {kind} of node {node} has {len(times)} times but {len(values)} values")
+            raise file.error(
+                f"a {kind} of node {node} has {len(times)} times but {len(values)} values"
+            )
         if (np.diff(times) < 0).any():
             raise file.error(f"the times of a {kind} of node {node} do not ascend; export it again")
         curves[node, kind] = _Curve(times, values, sampler.interpolation)
@@ -212,7 +240,10 @@ def _finite(file: GltfFile, index: int, kind: str) -> np.ndarray:
 
 
 def _world_transforms(
-    file: GltfFile, chain: dict[int, int | None], curves: dict[tuple[int, str], _Curve], times: np.ndarray
+    file: GltfFile,
+    chain: dict[int, int | None],
+    curves: dict[tuple[int, str], _Curve],
+    times: np.ndarray,
 ) -> dict[int, _Transforms]:
     """Return the transforms of the nodes of the chain in the world at ``times`` (F,)."""
     placed: dict[int, _Transforms] = {}
@@ -223,13 +254,18 @@ def _world_transforms(
             continue
         above = placed[parent]
         position = above.positions + (above.linear @ local.positions[..., None])[..., 0]
-        placed[index] = _Transforms(above.linear @ local.linear, above.rotations @ local.rotations, position)
+        placed[index] = _Transforms(
+            above.linear @ local.linear, above.rotations @ local.rotations, position
+        )
     return placed
 
 
-def _local(file: GltfFile, index: int, curves: dict[tuple[int, str], _Curve], times: np.ndarray) -> _Transforms:
+def _local(
+    file: GltfFile, index: int, curves: dict[tuple[int, str], _Curve], times: np.ndarray
+) -> _Transforms:
     """Return the transforms of a node relative to its parent: T R S, or its matrix."""
-    node, frames = file.document.nodes[index], len(times)
+    node = file.document.nodes[index]
+    frames = len(times)
     if node.matrix is not None:
         matrix = np.array(node.matrix).reshape(4, 4).T
         rotation = _rotation_of(file, matrix[None, :3, :3])
@@ -248,25 +284,33 @@ def _local(file: GltfFile, index: int, curves: dict[tuple[int, str], _Curve], ti
 
 def _sampled(file: GltfFile, curve: _Curve, times: np.ndarray) -> np.ndarray:
     """Return values (F, 3) or (F, 4) at ``times`` (F,), clamped to the first and the last key."""
-    slack = 1e-4 if curve.interpolation == "STEP" else 0.0  # keys are float32: rounding must not miss a step
+    # keys are float32: rounding must not miss a step
+    slack = 1e-4 if curve.interpolation == "STEP" else 0.0
     after = np.searchsorted(curve.times, times + slack, side="right")
-    before, after = np.maximum(after - 1, 0), np.minimum(after, len(curve.times) - 1)
+    before = np.maximum(after - 1, 0)
+    after = np.minimum(after, len(curve.times) - 1)
     span = curve.times[after] - curve.times[before]
     fraction = ((times - curve.times[before]) / np.where(span > 0, span, 1.0))[:, None]
     if curve.interpolation == "CUBICSPLINE":
         arriving, keys, leaving = curve.values.reshape(len(curve.times), 3, -1).transpose(1, 0, 2)
         ease = fraction * fraction * (3 - 2 * fraction)
         bend = (
-            span[:, None] * fraction * (1 - fraction) * ((1 - fraction) * leaving[before] - fraction * arriving[after])
+            span[:, None]
+            * fraction
+            * (1 - fraction)
+            * ((1 - fraction) * leaving[before] - fraction * arriving[after])
         )
         return keys[before] + ease * (keys[after] - keys[before]) + bend
     if curve.interpolation == "STEP":
         return curve.values[before]
-    start, end = curve.values[before], curve.values[after]
+    start = curve.values[before]
+    end = curve.values[after]
     if start.shape[1] == 3:
         return start + fraction * (end - start)
     turned = _rotations(file, start)
-    return (turned * Rotation.from_rotvec(fraction * (turned.inv() * _rotations(file, end)).as_rotvec())).as_quat()
+    return (
+        turned * Rotation.from_rotvec(fraction * (turned.inv() * _rotations(file, end)).as_rotvec())
+    ).as_quat()
 
 
 def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
@@ -280,7 +324,9 @@ def _bind_pose(file: GltfFile, index: int, joints: int) -> tuple[np.ndarray, np.
     """Return joints (S, 3) and rotations rest_from_joint (S, 3, 3) of the bind pose."""
     matrices = _finite(file, index, "MAT4").reshape(-1, 4, 4).swapaxes(1, 2)[:joints]
     if len(matrices) < joints:
-        raise file.error(f"has {len(matrices)} inverse bind matrices for {joints} joints; export it again")
+        raise file.error(
+            f"has {len(matrices)} inverse bind matrices for {joints} joints; export it again"
+        )
     joint_from_rest = _rotation_of(file, matrices[:, :3, :3])
     rest = -np.linalg.solve(matrices[:, :3, :3], matrices[:, :3, 3:])[..., 0]
     return rest, joint_from_rest.swapaxes(1, 2)

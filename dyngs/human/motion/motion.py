@@ -1,4 +1,5 @@
-"""The motion of a body, pose parameters per frame; and a clip in the world of the cameras, at any time between.
+"""The motion of a body, pose parameters per frame; and a clip in the world of the cameras, at any
+time between.
 
 Local letter: B shape parameters.
 """
@@ -26,9 +27,11 @@ from dyngs.state import fields_moved_to
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
-"""Limit on joints (at least 55) times frames of a motion: 90,909 frames, or 50 minutes at 30 frames per second."""
+"""Limit on joints (at least 55) times frames of a motion: 90,909 frames, or 50 minutes at 30 frames
+per second."""
 _RATES = (1e-3, 1e5)  # frames per second that a file may have
-_CHUNK = 1024  # frames per block, so that temporary memory does not grow with the length of a motion
+# frames per block, so that temporary memory does not grow with the length of a motion
+_CHUNK = 1024
 
 
 @dataclass(frozen=True)
@@ -50,14 +53,17 @@ class Motion:
         return fields_moved_to(self, device)
 
     def for_joints(self, count: int) -> Motion:
-        """Return the motion for a body of 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints, see ``poses_for_joints``."""
+        """Return the motion for a body of 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints, see
+        ``poses_for_joints``."""
         return replace(self, poses=poses_for_joints(self.poses, count))
 
     def resampled(self, fps: float) -> Motion:
-        """Return the motion at ``fps`` frames per second, from the first frame to at most the last one.
+        """Return the motion at ``fps`` frames per second, from the first frame to at most the last
+        one.
 
-        Rotations are interpolated spherically the shorter way, all else linearly. Nothing is smoothed. Raises
-        DyngsError: ``fps`` is not a positive number, or gives more frames than ``MAX_JOINT_POSES`` allows.
+        Rotations are interpolated spherically the shorter way, all else linearly. Nothing is
+        smoothed. Raises DyngsError: ``fps`` is not a positive number, or gives more frames than
+        ``MAX_JOINT_POSES`` allows.
         """
         most = allowed(MAX_JOINT_POSES) / len(JOINT_NAMES)
         if not len(self) * fps <= most * self.fps:
@@ -69,7 +75,10 @@ class Motion:
         if fps == self.fps:
             return self
         parts = [self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))]
-        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
+        tensors = {
+            name: torch.cat([getattr(part, name) for part in parts])
+            for name in ("poses", "trans", "scale")
+        }
         return replace(parts[0], **tensors, notes=self.notes)
 
     def _interpolated(self, times: np.ndarray, fps: float) -> Motion:
@@ -95,7 +104,8 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
 
     Raises DyngsError: it exceeds ``MAX_JOINT_POSES``.
     """
-    amount, most = frames * max(joints, len(JOINT_NAMES)), allowed(MAX_JOINT_POSES)
+    amount = frames * max(joints, len(JOINT_NAMES))
+    most = allowed(MAX_JOINT_POSES)
     if not amount <= most:
         factor = f"{math.ceil(amount / MAX_JOINT_POSES)}" if amount < 1e15 else "N"
         raise DyngsError(
@@ -115,10 +125,11 @@ def require_frame_rate(path: Path, fps: float) -> float:
 
 
 def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
-    """Return times (F,) in [0, last], in frames of ``from_fps``, that are 1 / ``fps`` seconds apart.
+    """Return times (F,) in [0, last], in frames of ``from_fps``, that are 1 / ``fps`` seconds
+    apart.
 
-    The last frame is included if it is missed by at most a thousandth of a frame. Raises DyngsError: ``fps`` is not a
-    positive number.
+    The last frame is included if it is missed by at most a thousandth of a frame. Raises
+    DyngsError: ``fps`` is not a positive number.
     """
     if not 0 < fps < math.inf:
         raise DyngsError(f"{fps:g} frames per second is not a frame rate; ask for 30 or the like")
@@ -127,13 +138,16 @@ def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
 
 
 def poses_for_joints(poses: Tensor, count: int) -> Tensor:
-    """Return axis-angle poses (F, count, 3) for a body of ``count`` joints from those (F, J, 3) of a body of J.
+    """Return axis-angle poses (F, count, 3) for a body of ``count`` joints from those (F, J, 3) of
+    a body of J.
 
-    Both have 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints. Joints that one of them lacks do not rotate.
+    Both have 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints. Joints that one of them lacks do not
+    rotate.
     """
     if poses.shape[1] == count:
         return poses
-    theirs, ours = SMPLX_ROWS[poses.shape[1]], SMPLX_ROWS[count]
+    theirs = SMPLX_ROWS[poses.shape[1]]
+    ours = SMPLX_ROWS[count]
     smplx = poses.new_zeros(len(poses), len(JOINT_NAMES), 3)
     smplx[:, list(theirs)] = poses[:, : len(theirs)]
     wanted = poses.new_zeros(len(poses), count, 3)
@@ -142,7 +156,8 @@ def poses_for_joints(poses: Tensor, count: int) -> Tensor:
 
 
 def interpolate_rotations(before: Tensor, after: Tensor, fraction: np.ndarray) -> Tensor:
-    """Return axis-angle vectors (F, J, 3) at ``fraction`` (F,) of the way between two: R_a exp(s log(R_a^T R_b))."""
+    """Return axis-angle vectors (F, J, 3) at ``fraction`` (F,) of the way between two: R_a exp(s
+    log(R_a^T R_b))."""
     from scipy.spatial.transform import Rotation
 
     start = Rotation.from_rotvec(before.reshape(-1, 3).double().cpu().numpy())
@@ -161,7 +176,8 @@ class SkeletonMotion:
     rotations: np.ndarray  # (F, S, 3, 3) world_from_rest of each joint
     positions: np.ndarray  # (F, S, 3) of the joints in the world
     fps: float  # frames per second
-    world_is_y_up: bool  # whether the world is known to be y up; otherwise it has the axes of the rest pose
+    # whether the world is known to be y up; otherwise it has the axes of the rest pose
+    world_is_y_up: bool
 
 
 _SAME_TIME = 1e-9
@@ -171,7 +187,8 @@ _SAME_TIME = 1e-9
 class MotionClip:
     """Body parameters at F >= 1 times."""
 
-    times: Tensor  # (F,) float64 in [0, 1], strictly ascending; always on the CPU, as they are read one by one
+    # (F,) float64 in [0, 1], strictly ascending; always on the CPU, as they are read one by one
+    times: Tensor
     poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
     trans: Tensor  # (F, 3) world units, added last
     scale: Tensor  # (F,) world units per metre of the template
@@ -198,7 +215,9 @@ class MotionClip:
         Between frames rotations are interpolated spherically the shorter way, all else linearly.
         """
         times = self.times
-        moment = float(times[0]) if time is None else min(max(time, float(times[0])), float(times[-1]))
+        moment = (
+            float(times[0]) if time is None else min(max(time, float(times[0])), float(times[-1]))
+        )
         after = int(torch.searchsorted(times, moment - _SAME_TIME).clamp_max(len(self) - 1))
         if abs(float(times[after]) - moment) <= _SAME_TIME:
             return self.select(torch.tensor([after], device="cpu"))
@@ -206,17 +225,22 @@ class MotionClip:
         fraction = (moment - float(times[before])) / float(times[after] - times[before])
         return MotionClip(
             times=torch.tensor([moment], dtype=times.dtype, device=times.device),
-            poses=interpolate_rotations(self.poses[before:after], self.poses[after : after + 1], np.array([fraction])),
+            poses=interpolate_rotations(
+                self.poses[before:after], self.poses[after : after + 1], np.array([fraction])
+            ),
             trans=torch.lerp(self.trans[before], self.trans[after], fraction)[None],
             scale=torch.lerp(self.scale[before], self.scale[after], fraction)[None],
         )
 
 
 def motion_clip(motion: Motion) -> MotionClip:
-    """Return the motion as a clip, its frames spread evenly over [0, 1]; place and size stay as given."""
+    """Return the motion as a clip, its frames spread evenly over [0, 1]; place and size stay as
+    given."""
     count = len(motion)
     times = (
-        torch.from_numpy(np.linspace(0, 1, count)) if count > 1 else torch.zeros(1, dtype=torch.float64, device="cpu")
+        torch.from_numpy(np.linspace(0, 1, count))
+        if count > 1
+        else torch.zeros(1, dtype=torch.float64, device="cpu")
     )
     return MotionClip(times, motion.poses.float(), motion.trans.float(), motion.scale.float())
 
@@ -225,7 +249,8 @@ def motion_clip(motion: Motion) -> MotionClip:
 class CapturedMotion:
     """A clip of the frames that have images."""
 
-    clip: MotionClip  # of F frames, or of one where the person keeps one pose in one place: nothing moves
+    # of F frames, or of one where the person keeps one pose in one place: nothing moves
+    clip: MotionClip
     frames: tuple[int, ...]  # (F,) frame numbers, as views name them
 
     @property
@@ -238,17 +263,21 @@ class CapturedMotion:
         return CapturedMotion(self.clip.to(device=device), self.frames)
 
 
-def captured_motion(where: Path, given: BodyFrames, views: Sequence[View], joints: Tensor) -> CapturedMotion:
-    """Return the frames of ``given`` that ``views`` show, for a body with ``joints`` (J, 3) at rest.
+def captured_motion(
+    where: Path, given: BodyFrames, views: Sequence[View], joints: Tensor
+) -> CapturedMotion:
+    """Return the frames of ``given`` that ``views`` show, for a body with ``joints`` (J, 3) at
+    rest.
 
-    Joints that the body of ``given`` lacks do not rotate. Views without times are spread over [0, 1] by frame number.
-    Raises DyngsError: a view without parameters.
+    Joints that the body of ``given`` lacks do not rotate. Views without times are spread over [0,
+    1] by frame number. Raises DyngsError: a view without parameters.
     """
     found = about_pelvis(given, joints[0].double().cpu().numpy())
     rows = rows_of(where, found, views)
     last = max(len(found.frames) - 1, 1)
     times = {
-        row: row / last if view.time is None else view.time for view, row in zip(views, rows.tolist(), strict=True)
+        row: row / last if view.time is None else view.time
+        for view, row in zip(views, rows.tolist(), strict=True)
     }
     order = sorted(times, key=lambda row: (times[row], row))
     kept = [row for i, row in enumerate(order) if i == 0 or times[row] > times[order[i - 1]]]
@@ -260,7 +289,9 @@ def captured_motion(where: Path, given: BodyFrames, views: Sequence[View], joint
     )
     keeps_still = all(bool((x == x[:1]).all()) for x in (clip.poses, clip.trans, clip.scale))
     frames = tuple(found.frames[row] for row in kept)
-    return CapturedMotion(clip.select(torch.tensor([0], device="cpu")) if keeps_still else clip, frames)
+    return CapturedMotion(
+        clip.select(torch.tensor([0], device="cpu")) if keeps_still else clip, frames
+    )
 
 
 def same_bodies(a: BodyFrames, b: BodyFrames) -> bool:

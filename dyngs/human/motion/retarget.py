@@ -1,4 +1,5 @@
-"""Reader of motion files, and retargeting: another skeleton's motion carried over to a body, by world rotations.
+"""Reader of motion files, and retargeting: another skeleton's motion carried over to a body, by
+world rotations.
 
 Local letter: S joints of the other skeleton.
 """
@@ -67,17 +68,19 @@ Anny | l r | 1 2 3
     root spine04 spine03 spine02 neck01 head clavicle* upperarm01* lowerarm01* wrist* upperleg01* lowerleg01* foot*
     toe11* finger2#* finger3#* finger5#* finger4#* finger1#*
 """
-"""Joint names of each kind of skeleton, in lower case and without punctuation: the program or data set, what stands for
-``*`` (left and right) and for ``#`` (``_``: nothing), and a name for each word of ``_OURS``: ``a|b`` is a or b, ``-``
-none; words at the end may be missing. Rocketbox avatars use Biped, VALID avatars Mixamo, the cgspeed conversions of CMU
-either CMU or DAZ."""
+"""Joint names of each kind of skeleton, in lower case and without punctuation: the program or data
+set, what stands for ``*`` (left and right) and for ``#`` (``_``: nothing), and a name for each word
+of ``_OURS``: ``a|b`` is a or b, ``-`` none; words at the end may be missing. Rocketbox avatars use
+Biped, VALID avatars Mixamo, the cgspeed conversions of CMU either CMU or DAZ."""
 
 
 def _joints_of_rig(sides: str, segments: str, words: str) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield each joint of SMPL-X with the names that it may have in a row of ``_RIGS``."""
     marks = segments.replace("_", "").split(" ")
     for ours, theirs in zip(_OURS.split(), words.split(), strict=False):
-        for our_side, side in zip(("left", "right"), sides.split(), strict=True) if "*" in ours else [("", "")]:
+        for our_side, side in (
+            zip(("left", "right"), sides.split(), strict=True) if "*" in ours else [("", "")]
+        ):
             for i, segment in enumerate(marks, 1) if "#" in ours else [("", "")]:
                 names = theirs.replace("*", side).replace("#", segment).split("|")
                 yield ours.replace("*", our_side).replace("#", str(i)), tuple(names)
@@ -85,29 +88,42 @@ def _joints_of_rig(sides: str, segments: str, words: str) -> Iterator[tuple[str,
 
 RIGS = {
     name: dict(_joints_of_rig(sides, segments, words))
-    for name, sides, segments, words in re.findall(r"^(\S+) \| (.+) \| (.+)\n((?: .*\n)+)", _RIGS, re.MULTILINE)
+    for name, sides, segments, words in re.findall(
+        r"^(\S+) \| (.+) \| (.+)\n((?: .*\n)+)", _RIGS, re.MULTILINE
+    )
 }
 """The joints of SMPL-X, with the names that they may have, by the name of the rig."""
 _NEEDED = (
     "pelvis",
-    *(f"{side}_{x}" for x in ("hip", "knee", "ankle", "shoulder", "elbow") for side in ("left", "right")),
+    *(
+        f"{side}_{x}"
+        for x in ("hip", "knee", "ankle", "shoulder", "elbow")
+        for side in ("left", "right")
+    ),
 )
 
 
 def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
-    """Return the joints of SMPL-X that a skeleton with these joint names has, with their indices in ``names``.
+    """Return the joints of SMPL-X that a skeleton with these joint names has, with their indices in
+    ``names``.
 
-    Case, punctuation and a prefix before the name of the pelvis (``mixamorig:``, ``Bip01``) do not matter. The rig that
-    matches most joints of the body is chosen. Raises DyngsError: the pelvis, a leg or an arm is missing; names the
-    joint and the file ``path``.
+    Case, punctuation and a prefix before the name of the pelvis (``mixamorig:``, ``Bip01``) do not
+    matter. The rig that matches most joints of the body is chosen. Raises DyngsError: the pelvis, a
+    leg or an arm is missing; names the joint and the file ``path``.
     """
     plain = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     best: dict[str, int] = {}
-    best_rig, best_rank = "", (-1, -1)
+    best_rig = ""
+    best_rank = (-1, -1)
     for rig, wanted in RIGS.items():
         for prefix in _prefixes(plain, wanted["pelvis"]):
-            found = _found(wanted, {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])})
-            rank = (sum(name in found for name in _NEEDED), sum(name in found for name in JOINT_NAMES[:22]))
+            found = _found(
+                wanted, {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])}
+            )
+            rank = (
+                sum(name in found for name in _NEEDED),
+                sum(name in found for name in JOINT_NAMES[:22]),
+            )
             if rank > best_rank:
                 best, best_rig, best_rank = found, rig, rank
     wanted = RIGS[best_rig]
@@ -129,7 +145,9 @@ def _prefixes(names: list[str], pelvis: tuple[str, ...]) -> list[str]:
 
 def _found(wanted: dict[str, tuple[str, ...]], there: dict[str, int]) -> dict[str, int]:
     """Return the index of the first name that is present, for each joint that has one."""
-    hits = {ours: [there[name] for name in names if name in there] for ours, names in wanted.items()}
+    hits = {
+        ours: [there[name] for name in names if name in there] for ours, names in wanted.items()
+    }
     return {ours: indices[0] for ours, indices in hits.items() if indices}
 
 
@@ -143,28 +161,38 @@ _BONE_ENDS = {f"{finger}{i}": f"{finger}{i + 1}" for finger in _FINGERS for i in
     "wrist": "middle1",
 }
 """The joints of limbs whose bones are aligned, and the joint at the end of each bone."""
-_FOLLOWS = {f"{finger}{i}": f"{finger}{i - 1}" if i > 1 else "wrist" for finger in _FINGERS for i in (1, 2, 3)} | {
+_FOLLOWS = {
+    f"{finger}{i}": f"{finger}{i - 1}" if i > 1 else "wrist"
+    for finger in _FINGERS
+    for i in (1, 2, 3)
+} | {
     "foot": "ankle",
     "elbow": "shoulder",
     "wrist": "elbow",
 }
 """The joint whose alignment a joint of a limb takes if the end of its own bone is unknown."""
-_SNAP_COS = np.cos(np.radians(15.0))  # how near to an axis the left direction of a rest pose must be to be that axis
+# how near to an axis the left direction of a rest pose must be to be that axis
+_SNAP_COS = np.cos(np.radians(15.0))
 
 
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
-    """Return the motion of ``source`` on ``body``: 55 joints, y up, float32, the rest pose facing +z.
+    """Return the motion of ``source`` on ``body``: 55 joints, y up, float32, the rest pose facing
+    +z.
 
-    World rotations of joint b and of joint s of the source: G_b = N G_s M^T align(d_b, M d_s). ``align`` is the
-    smallest rotation between bone directions d at rest (of limbs; else the identity), M maps the axes of the source's
-    rest pose to ours (by hips, shoulders and ankles) and N those of its world: the identity if that is y up, else M.
-    The pelvis follows the source's path times the ratio of leg lengths; the lowest vertex is put to y = 0. Raises
-    DyngsError: unknown joint names, or a rest pose that does not stand upright.
+    World rotations of joint b and of joint s of the source: G_b = N G_s M^T align(d_b, M d_s).
+    ``align`` is the smallest rotation between bone directions d at rest (of limbs; else the
+    identity), M maps the axes of the source's rest pose to ours (by hips, shoulders and ankles) and
+    N those of its world: the identity if that is y up, else M. The pelvis follows the source's path
+    times the ratio of leg lengths; the lowest vertex is put to y = 0. Raises DyngsError: unknown
+    joint names, or a rest pose that does not stand upright.
     """
     found = match_joints(source.path, source.names)
     target_from_rest = _target_from_rest(source, found)
     target_from_world = np.eye(3) if source.world_is_y_up else target_from_rest
-    ours = {JOINT_NAMES[row]: body.joints[i].double().numpy() for i, row in enumerate(SMPLX_ROWS[len(body.joints)])}
+    ours = {
+        JOINT_NAMES[row]: body.joints[i].double().numpy()
+        for i, row in enumerate(SMPLX_ROWS[len(body.joints)])
+    }
     theirs = {name: target_from_rest @ source.rest[i] for name, i in found.items()}
     alignments = _alignments(ours, theirs)
     to_target = {name: (i, target_from_rest.T @ alignments[name]) for name, i in found.items()}
@@ -188,11 +216,14 @@ def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
 
 
 def _world_rotations(
-    source_rotations: np.ndarray, target_from_world: np.ndarray, to_target: dict[str, tuple[int, np.ndarray]]
+    source_rotations: np.ndarray,
+    target_from_world: np.ndarray,
+    to_target: dict[str, tuple[int, np.ndarray]],
 ) -> np.ndarray:
     """Return the world rotations (F, 55, 3, 3) of our joints from those of the source (F, S, 3, 3).
 
-    ``to_target`` maps our joints that the source has to its index and the rotation that aligns it at rest.
+    ``to_target`` maps our joints that the source has to its index and the rotation that aligns it
+    at rest.
     """
     world = np.empty((len(source_rotations), 55, 3, 3))
     for i, name in enumerate(JOINT_NAMES):
@@ -205,22 +236,34 @@ def _world_rotations(
 
 
 def _axis_angles(world: np.ndarray) -> Tensor:
-    """Return axis-angle vectors (F, 55, 3), float32, relative to the parents, of world rotations (F, 55, 3, 3)."""
-    local = np.concatenate([world[:, :1], world[:, JOINT_PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]], axis=1)
-    return torch.from_numpy(Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec()).float().reshape(-1, 55, 3)
+    """Return axis-angle vectors (F, 55, 3), float32, relative to the parents, of world rotations
+    (F, 55, 3, 3)."""
+    local = np.concatenate(
+        [world[:, :1], world[:, JOINT_PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]], axis=1
+    )
+    return (
+        torch.from_numpy(Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec())
+        .float()
+        .reshape(-1, 55, 3)
+    )
 
 
 def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarray:
     """Return the rotation (3, 3) from the axes of the rest pose to x left, y up, z forward.
 
-    Up is the axis nearest to the direction from the ankles to the shoulders. Left is the direction from right to left
-    hip and shoulder, made perpendicular to up, or the axis within 15 degrees of it.
+    Up is the axis nearest to the direction from the ankles to the shoulders. Left is the direction
+    from right to left hip and shoulder, made perpendicular to up, or the axis within 15 degrees of
+    it.
     """
     at = {name: source.rest[i] for name, i in found.items()}
-    middle = {part: (at[f"left_{part}"] + at[f"right_{part}"]) / 2 for part in ("ankle", "shoulder")}
+    middle = {
+        part: (at[f"left_{part}"] + at[f"right_{part}"]) / 2 for part in ("ankle", "shoulder")
+    }
     up = _nearest_axis(middle["shoulder"] - middle["ankle"])
     if not up @ middle["ankle"] < up @ at["pelvis"] < up @ middle["shoulder"]:
-        raise DyngsError(f"{source.path}: its rest pose does not stand upright; export it with a T-pose as rest pose")
+        raise DyngsError(
+            f"{source.path}: its rest pose does not stand upright; export it with a T-pose as rest pose"
+        )
     across = [at[f"left_{part}"] - at[f"right_{part}"] for part in ("hip", "shoulder")]
     left = sum(x / max(float(np.linalg.norm(x)), 1e-12) for x in across)
     left = left - up * (up @ left)
@@ -242,13 +285,18 @@ def _nearest_axis(direction: np.ndarray) -> np.ndarray:
     return axis
 
 
-def _alignments(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return align(d_b, M d_s) (3, 3) of each joint; the identity for joints that belong to no limb."""
+def _alignments(
+    ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Return align(d_b, M d_s) (3, 3) of each joint; the identity for joints that belong to no
+    limb."""
     turns: dict[str, np.ndarray] = {}
     for name in JOINT_NAMES:
         side, _, joint = name.partition("_")
         end = f"{side}_{_BONE_ENDS.get(joint, '')}"
-        bones = [at[end] - at[name] if name in at and end in at else np.zeros(3) for at in (ours, theirs)]
+        bones = [
+            at[end] - at[name] if name in at and end in at else np.zeros(3) for at in (ours, theirs)
+        ]
         lengths = [float(np.linalg.norm(bone)) for bone in bones]
         if min(lengths) > 1e-9:
             turns[name] = least_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
@@ -258,46 +306,68 @@ def _alignments(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> d
 
 
 def least_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation (3, 3) from one unit vector to another; half a turn about any axis for opposites."""
+    """Return the smallest rotation (3, 3) from one unit vector to another; half a turn about any
+    axis for opposites."""
     axis = np.cross(start, end)
-    angle = np.arctan2(np.linalg.norm(axis), start @ end)  # accurate near half a turn, unlike the cosine
+    # accurate near half a turn, unlike the cosine
+    angle = np.arctan2(np.linalg.norm(axis), start @ end)
     if not axis.any():
         axis = np.cross(start, np.eye(3)[np.abs(start).argmin()])
     axis = axis / np.abs(axis).max()  # first, as squares of 1e-200 underflow
     axis = axis / np.linalg.norm(axis)
-    axis = axis - start * (start @ axis)  # the product of nearly opposite vectors is not quite perpendicular
+    # the product of nearly opposite vectors is not quite perpendicular
+    axis = axis - start * (start @ axis)
     return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
 
 
 def _leg_length(at: dict[str, np.ndarray]) -> float:
     bones = (("hip", "knee"), ("knee", "ankle"))
     return sum(
-        float(np.linalg.norm(at[f"{side}_{a}"] - at[f"{side}_{b}"])) for side in ("left", "right") for a, b in bones
+        float(np.linalg.norm(at[f"{side}_{a}"] - at[f"{side}_{b}"]))
+        for side in ("left", "right")
+        for a, b in bones
     )
 
 
-_KINDS = {".npz": "an AMASS or SMPL-X .npz", ".bvh": "a .bvh", ".glb": "a .glb", ".gltf": "a .gltf", ".vrma": "a .vrma"}
+_KINDS = {
+    ".npz": "an AMASS or SMPL-X .npz",
+    ".bvh": "a .bvh",
+    ".glb": "a .glb",
+    ".gltf": "a .gltf",
+    ".vrma": "a .vrma",
+}
 """Names of the formats by suffix."""
-_GLTF_FPS = 30.0  # frames per second at which glTF's curves are sampled unless another rate is requested
+# frames per second at which glTF's curves are sampled unless another rate is requested
+_GLTF_FPS = 30.0
 
 
 def read_motion(
-    path: Path, body: BodyTemplate | None = None, fps: float | None = None, up: UpAxis = "auto", clip: str | None = None
+    path: Path,
+    body: BodyTemplate | None = None,
+    fps: float | None = None,
+    up: UpAxis = "auto",
+    clip: str | None = None,
 ) -> Motion:
-    """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``, ``.gltf`` or ``.vrma``.
+    """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``,
+    ``.gltf`` or ``.vrma``.
 
-    Other skeletons are retargeted to ``body`` (None: the default template), with the lowest vertex at y = 0. Without
-    ``fps`` it has the frame rate of the file, 30 for glTF; an ``.npz`` without a rate needs ``fps``. ``up``: see
-    ``read_amass``; ``clip`` names the animation of a glTF file. Raises DyngsError: names the file and what is wrong.
+    Other skeletons are retargeted to ``body`` (None: the default template), with the lowest vertex
+    at y = 0. Without ``fps`` it has the frame rate of the file, 30 for glTF; an ``.npz`` without a
+    rate needs ``fps``. ``up``: see ``read_amass``; ``clip`` names the animation of a glTF file.
+    Raises DyngsError: names the file and what is wrong.
     """
     path, suffix = Path(path), Path(path).suffix.lower()
     if suffix not in _KINDS:
         *others, last = _KINDS.values()
         raise DyngsError(f"{path}: unknown kind of motion; give {', '.join(others)} or {last}")
     if up != "auto" and suffix != ".npz":
-        raise DyngsError(f"{path}: the up axis can only be chosen for an .npz; that of a {suffix} is known")
+        raise DyngsError(
+            f"{path}: the up axis can only be chosen for an .npz; that of a {suffix} is known"
+        )
     if clip is not None and suffix in (".npz", ".bvh"):
-        raise DyngsError(f"{path}: a {suffix} holds one motion without a name; do not ask for '{clip}'")
+        raise DyngsError(
+            f"{path}: a {suffix} holds one motion without a name; do not ask for '{clip}'"
+        )
     body = default_template() if body is None else body
     with reading(path):
         if suffix == ".npz":

@@ -1,4 +1,5 @@
-"""Training of the network over the atlas on captures of several people, and what it predicts of one (GHG)."""
+"""Training of the network over the atlas on captures of several people, and what it predicts of one
+(GHG)."""
 
 from __future__ import annotations
 
@@ -22,13 +23,26 @@ from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.fit.fitted_capture import with_fitted_body
-from dyngs.human.prediction.network import AtlasNetwork, PredictedAvatar, num_input_channels, predict_gaussians
+from dyngs.human.prediction.network import (
+    AtlasNetwork,
+    PredictedAvatar,
+    num_input_channels,
+    predict_gaussians,
+)
 from dyngs.human.prediction.person import CapturedPerson, captured_person, spread_views
 from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atlas
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
-from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, random_index, updated
+from dyngs.models.prediction import (
+    Example,
+    Learner,
+    Predictor,
+    image_loss,
+    load_weights,
+    random_index,
+    updated,
+)
 from dyngs.models.renderable import Renderable, Rendering
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
@@ -39,14 +53,16 @@ SQUARED_WEIGHT = 1.0  # Weight of the mean squared error in the loss, which coun
 MEAN_VIEWS = 8  # Images of each person that the mean colours are taken from
 ADAPTING_STEPS = 10  # Steps of training on the images of one person before a prediction
 ADAPTING_RATE = 1e-4
-"""Highest learning rate of Adam per image of one person, which falls linearly: a single one says little about the other
-sides."""
-_FAINT = 0.02  # Opacity below which a predicted Gaussian is left out, as the preset for one person has it
+"""Highest learning rate of Adam per image of one person, which falls linearly: a single one says
+little about the other sides."""
+# Opacity below which a predicted Gaussian is left out, as the preset for one person has it
+_FAINT = 0.02
 
 
 @dataclass
 class Filmed:
-    """A person to train on: images, and the choices of those that are predicted from, with their maps once known."""
+    """A person to train on: images, and the choices of those that are predicted from, with their
+    maps once known."""
 
     sitter: CapturedPerson
     images: ImageLoader
@@ -66,7 +82,10 @@ class Filmed:
         return self._there
 
     def look(self, views: Sequence[int]) -> TexelMaps:
-        return observe_texels(self.sitter, ((self.images[i], self.sitter.pose_in(self.sitter.views[i])) for i in views))
+        return observe_texels(
+            self.sitter,
+            ((self.images[i], self.sitter.pose_in(self.sitter.views[i])) for i in views),
+        )
 
 
 @dataclass
@@ -96,20 +115,32 @@ class PersonPredictor:
         scene = self._scene(self.person.look(views))
         return scene.select(scene.gaussians.opacities >= _FAINT)
 
-    def adapt(self, views: Sequence[int], steps: int | None = None, report: ReportProgress = report_nothing) -> int:
-        """Train the network until its prediction shows the images better that it is predicted from."""
+    def adapt(
+        self,
+        views: Sequence[int],
+        steps: int | None = None,
+        report: ReportProgress = report_nothing,
+    ) -> int:
+        """Train the network until its prediction shows the images better that it is predicted
+        from."""
         steps = ADAPTING_STEPS if steps is None else steps
         options = replace(render_options(self.model), nonfinite="trust")
         background = evaluation_background(self.config.data.background, True)[1]
-        images, maps = [self.person.images[i] for i in views], self.person.look(views)
+        images = [self.person.images[i] for i in views]
+        maps = self.person.look(views)
         rate = ADAPTING_RATE * len(views)
         optimizer = torch.optim.Adam(self.network.parameters(), lr=rate)
         for step in range(steps):
-            scene, total = self._scene(maps), torch.zeros((), device=self.mean.device)
+            scene = self._scene(maps)
+            total = torch.zeros((), device=self.mean.device)
             for image in images:
                 moment = scene.time_step(image.time)
-                rendering = scene.render(image.cameras, moment, options=options, background=background)
-                total = total + _error(rendering, image, image.composite(background), self.config) / len(images)
+                rendering = scene.render(
+                    image.cameras, moment, options=options, background=background
+                )
+                total = total + _error(
+                    rendering, image, image.composite(background), self.config
+                ) / len(images)
             if not updated(optimizer, self.network, total, rate * (1.0 - step / steps)):
                 break
             report("training on the images", step + 1, steps)
@@ -131,12 +162,24 @@ class PersonPredictor:
 
 
 class AtlasLearner(Learner[AtlasNetwork]):
-    """See ``Learner``: predicted from one choice of images, compared with others of one time step."""
+    """See ``Learner``: predicted from one choice of images, compared with others of one time
+    step."""
 
     def __init__(
-        self, config: Config, network: AtlasNetwork, people: list[Filmed], mean: Tensor, device: torch.device = CPU
+        self,
+        config: Config,
+        network: AtlasNetwork,
+        people: list[Filmed],
+        mean: Tensor,
+        device: torch.device = CPU,
     ) -> None:
-        self.config, self.network, self.people, self.mean, self.device = config, network, people, mean, device
+        self.config, self.network, self.people, self.mean, self.device = (
+            config,
+            network,
+            people,
+            mean,
+            device,
+        )
         self.model = _section(config)
         self.names = [person.sitter.name for person in people]
         chosen = config.data.background
@@ -148,8 +191,11 @@ class AtlasLearner(Learner[AtlasNetwork]):
         targets = self._targets(filmed, filmed.choices[choice], generator)
         background = sent(background_colour(self.background, generator), self.device)
         drawing = replace(render_options(self.model), nonfinite="trust")
-        sitter, maps = filmed.sitter_on(self.device), filmed.maps(choice, self.device)
-        avatar = predict_gaussians(sitter, maps, self.mean, self.network, self.model.min_silhouette_fraction)
+        sitter = filmed.sitter_on(self.device)
+        maps = filmed.maps(choice, self.device)
+        avatar = predict_gaussians(
+            sitter, maps, self.mean, self.network, self.model.min_silhouette_fraction
+        )
         scene, training = scene_of(human_options(self.model), avatar, Rates(1))
         moment = training.time_step(scene, targets[0], step)
         total = torch.zeros((), device=self.mean.device)
@@ -165,7 +211,9 @@ class AtlasLearner(Learner[AtlasNetwork]):
     def load(self, checkpoint: Checkpoint) -> None:
         self.mean = load_network(self.network, checkpoint, self.model.resolution).to(self.device)
 
-    def _targets(self, person: Filmed, inputs: list[int], generator: torch.Generator) -> list[Image]:
+    def _targets(
+        self, person: Filmed, inputs: list[int], generator: torch.Generator
+    ) -> list[Image]:
         """Return images of one time step that were not predicted from, where there are any."""
         views = person.sitter.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
@@ -176,18 +224,23 @@ class AtlasLearner(Learner[AtlasNetwork]):
 
 
 def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
-    """Return the network of ``model.kind: human_predictor`` before the first step: captures read, nothing trained."""
-    device, model = device_for(config.run.device), _section(config)
+    """Return the network of ``model.kind: human_predictor`` before the first step: captures read,
+    nothing trained."""
+    device = device_for(config.run.device)
+    model = _section(config)
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
     people = [filmed(data, model, body) for data in captures_in(config.data)]
     for person in people:
         person.choices = _choices(person.sitter, model, generator)
-    return AtlasLearner(config, network, people, mean_colours(people, model.resolution).to(device), device)
+    return AtlasLearner(
+        config, network, people, mean_colours(people, model.resolution).to(device), device
+    )
 
 
 def predictor(config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any) -> Predictor:
-    """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a body is fitted.
+    """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
+    body is fitted.
 
     ``told``: ``say`` and ``report`` of that fit.
     """
@@ -211,7 +264,8 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
-    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``."""
+    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the
+    ``resolution``."""
     mean = checkpoint.tensors.get("model.mean")
     load_weights(network, checkpoint)
     if mean is None:
@@ -221,15 +275,19 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
 
 
 def human_options(model: HumanPredictorModel) -> HumanModel:
-    """Return the section of one person with the same template and texels; nothing of it is learned."""
+    """Return the section of one person with the same template and texels; nothing of it is
+    learned."""
     shared = ("body", "uv", "resolution")
     drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
-    return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn})
+    return HumanModel.model_validate(
+        {"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn}
+    )
 
 
 def person_config(data: DataConfig, model: HumanPredictorModel) -> Config:
-    """Return the preset for one person, for a scene that a network of ``model`` predicts of the capture ``data``."""
+    """Return the preset for one person, for a scene that a network of ``model`` predicts of the
+    capture ``data``."""
     preset = load_config(packaged_preset("human"), ["data.root=."])
     same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
     given = human_options(model)
@@ -240,18 +298,19 @@ def person_config(data: DataConfig, model: HumanPredictorModel) -> Config:
 def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> Filmed:
     """Return the person of one capture, without choices of images."""
     capture = read_capture(data)
-    return Filmed(captured_person(capture, model, body), ImageLoader(capture.splits["train"], data), [])
+    return Filmed(
+        captured_person(capture, model, body), ImageLoader(capture.splits["train"], data), []
+    )
 
 
 def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
-    """Return (3, S, S) mean over people of the colours that their images show of the lowest scaffold.
+    """Return (3, S, S) mean over people of the colours that their images show of the lowest
+    scaffold.
 
     Where nobody is seen: the mean of all that is.
     """
-    total, count = (
-        torch.zeros(3, resolution, resolution, device="cpu"),
-        torch.zeros(1, resolution, resolution, device="cpu"),
-    )
+    total = torch.zeros(3, resolution, resolution, device="cpu")
+    count = torch.zeros(1, resolution, resolution, device="cpu")
     for person in people:
         sitter = person.sitter
         maps = person.look(spread_views(sitter, MEAN_VIEWS))
@@ -262,25 +321,35 @@ def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
     return torch.where(count > 0, total / count.clamp_min(1), overall[:, None, None])
 
 
-def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
-    """Return views to predict from, of a random time step each: one at random, the others chosen to see much.
+def _choices(
+    sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator
+) -> list[list[int]]:
+    """Return views to predict from, of a random time step each: one at random, the others chosen to
+    see much.
 
     Every other choice has fewer than ``model.source_views``, in turn each number from 1.
     """
-    firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator, device="cpu").tolist()
+    firsts = torch.randint(
+        len(sitter.views), (model.source_sets,), generator=generator, device="cpu"
+    ).tolist()
     fewer = list(range(1, model.source_views)) or [model.source_views]
-    counts = [fewer[i // 2 % len(fewer)] if i % 2 else model.source_views for i in range(len(firsts))]
+    counts = [
+        fewer[i // 2 % len(fewer)] if i % 2 else model.source_views for i in range(len(firsts))
+    ]
     return [spread_views(sitter, count, first) for count, first in zip(counts, firsts, strict=True)]
 
 
-def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[HumanScene, HumanTraining]:
+def scene_of(
+    model: HumanModel, avatar: PredictedAvatar, rates: Rates
+) -> tuple[HumanScene, HumanTraining]:
     """Return a predicted avatar as a scene, and how it is trained on."""
     training = HumanTraining(model, avatar.subject.motion.frames, rates)
     return training.first_scene(avatar.gaussians, avatar.subject), training
 
 
 def _error(rendering: Rendering, image: Image, truth: Tensor, config: Config) -> Tensor:
-    """Return the loss of a rendering of one view against ``truth`` (H, W, 3), the image on the same background."""
+    """Return the loss of a rendering of one view against ``truth`` (H, W, 3), the image on the same
+    background."""
     difference = rendering.rgb[0] - truth
     known = difference if image.mask is None else difference * image.mask[..., None]
     squared = SQUARED_WEIGHT * known.square().mean()

@@ -1,4 +1,5 @@
-"""A captured person to predict: the template in the person's shape, its texels, and the choice of views.
+"""A captured person to predict: the template in the person's shape, its texels, and the choice of
+views.
 
 Local letters: P texels, K scaffolds.
 """
@@ -46,28 +47,41 @@ class CapturedPerson:
         return frame_pose(motion.clip, motion.rows[-1 if view.frame is None else view.frame])
 
 
-def captured_person(capture: Capture, model: HumanPredictorModel, body: BodyTemplate) -> CapturedPerson:
+def captured_person(
+    capture: Capture, model: HumanPredictorModel, body: BodyTemplate
+) -> CapturedPerson:
     """Return the person of a capture, on the template ``body``.
 
-    Raises DyngsError: a capture without body parameters, without silhouettes, or a view without parameters.
+    Raises DyngsError: a capture without body parameters, without silhouettes, or a view without
+    parameters.
     """
     if capture.body is None:
-        raise DyngsError(f"{capture.root}: has no body parameters, which a prediction needs; see docs/human.md")
+        raise DyngsError(
+            f"{capture.root}: has no body parameters, which a prediction needs; see docs/human.md"
+        )
     if not capture.has_alpha:
-        raise DyngsError(f"{capture.root}: the images have no silhouettes; give them alpha, see docs/human.md")
-    given, views = capture.body["train"], capture.splits["train"]
+        raise DyngsError(
+            f"{capture.root}: the images have no silhouettes; give them alpha, see docs/human.md"
+        )
+    given = capture.body["train"]
+    views = capture.splits["train"]
     vertices, joints = rest_shape(body, given)
     texels = atlas_texels(body, model.resolution, vertices)
     heights = tuple(sorted(set(model.scaffold_heights)))
     gaussians, anchors = texel_gaussians(texels, heights, 0)
     captured = captured_motion(capture.root, given, views, joints)
-    shape = {"shape_dirs": None, "joint_shape_dirs": None, "expression_dirs": None, "joint_expression_dirs": None}
+    shape = {
+        "shape_dirs": None,
+        "joint_shape_dirs": None,
+        "expression_dirs": None,
+        "joint_expression_dirs": None,
+    }
     return CapturedPerson(
         name=capture.root.name,
         body=replace(body, vertices=vertices, joints=joints, **shape),
-        normals=torch.from_numpy(vertex_normals(vertices.double().cpu().numpy(), body.faces.cpu().numpy())).to(
-            vertices
-        ),
+        normals=torch.from_numpy(
+            vertex_normals(vertices.double().cpu().numpy(), body.faces.cpu().numpy())
+        ).to(vertices),
         texels=texels,
         mirror=mirror_texels(texels),
         heights=heights,
@@ -80,10 +94,11 @@ def captured_person(capture: Capture, model: HumanPredictorModel, body: BodyTemp
 def spread_views(person: CapturedPerson, count: int, first: int | None = None) -> list[int]:
     """Return the indices, ascending, of ``count`` views that see as much of the person as possible.
 
-    The views are of one frame, the first with the most views, if it has enough; else of all frames. They maximize the
-    mean over texels of the best view's cosine between normal and view direction, in the rest pose and without
-    occlusion; found greedily, then by exchanging one view after the other. All views if there are fewer than ``count``;
-    the view ``first`` must be among them, and its frame is chosen.
+    The views are of one frame, the first with the most views, if it has enough; else of all frames.
+    They maximize the mean over texels of the best view's cosine between normal and view direction,
+    in the rest pose and without occlusion; found greedily, then by exchanging one view after the
+    other. All views if there are fewer than ``count``; the view ``first`` must be among them, and
+    its frame is chosen.
     """
     views = person.views
     frames = [view.frame for view in views]
@@ -111,7 +126,9 @@ def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
     chosen: list[int] = []
     for _ in range(count):
         taken = others + chosen
-        seen = cosines[:, taken].amax(1, keepdim=True) if taken else cosines.new_zeros(len(cosines), 1)
+        seen = (
+            cosines[:, taken].amax(1, keepdim=True) if taken else cosines.new_zeros(len(cosines), 1)
+        )
         gain = torch.maximum(cosines, seen).clamp_min(0).mean(0)
         gain[taken] = -1
         chosen.append(int(gain.argmax()))
@@ -119,7 +136,8 @@ def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
 
 
 def _direction(person: CapturedPerson, view: View) -> Tensor:
-    """Return the unit vector (3,) from the pelvis to the camera, in the axes of the body at rest."""
+    """Return the unit vector (3,) from the pelvis to the camera, in the axes of the body at
+    rest."""
     pose = person.pose_in(view)
     cam_from_world = torch.from_numpy(view.cam_from_world).to(pose.trans)
     center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
@@ -141,24 +159,29 @@ def mirror_texels(texels: Texels) -> Tensor:
 
 
 def colours_nearby(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
-    """Return ``rgb`` (P, 3) where ``seen`` (P,) is positive, elsewhere the mean of seen texels that are near at rest.
+    """Return ``rgb`` (P, 3) where ``seen`` (P,) is positive, elsewhere the mean of seen texels that
+    are near at rest.
 
-    Weights fall with the squared distance, and grow with the cosine at which a texel is seen; normals count, too, so
-    that the sole is not coloured like the instep. 0.5 if nothing is seen.
+    Weights fall with the squared distance, and grow with the cosine at which a texel is seen;
+    normals count, too, so that the sole is not coloured like the instep. 0.5 if nothing is seen.
     """
     is_seen = (seen > 0).cpu().numpy()
     if not is_seen.any():
         return torch.full_like(rgb, _UNKNOWN)
     if is_seen.all():
         return rgb
-    positions, known = _positions(texels), np.flatnonzero(is_seen)
+    positions = _positions(texels)
+    known = np.flatnonzero(is_seen)
     count = min(_NEAREST, len(known))
     found = KDTree(positions[known]).query(positions[~is_seen], k=count)
-    distance, near = (np.asarray(x).reshape(-1, count) for x in found)  # one neighbour comes without its axis
+    # one neighbour comes without its axis
+    distance, near = (np.asarray(x).reshape(-1, count) for x in found)
     rows = torch.from_numpy(known[near.astype(np.int64)]).to(rgb.device)
     weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT).square()
     filled = rgb.clone()
-    filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(1) / weight.sum(1)[:, None]
+    filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(
+        1
+    ) / weight.sum(1)[:, None]
     return filled
 
 

@@ -1,7 +1,9 @@
-"""Observations of a posed template in a few images, per texel: colours, visibility, silhouettes, directions.
+"""Observations of a posed template in a few images, per texel: colours, visibility, silhouettes,
+directions.
 
-The images of a person become maps over the atlas (GHG, Kwon et al. 2024): each scaffold is rasterized as a mesh into
-each view, and a texel counts as seen where no part of that mesh is in front of it.
+The images of a person become maps over the atlas (GHG, Kwon et al. 2024): each scaffold is
+rasterized as a mesh into each view, and a texel counts as seen where no part of that mesh is in
+front of it.
 
 Local letters: P texels, K scaffolds.
 """
@@ -27,36 +29,46 @@ from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 
 _GRAZING = 0.15  # cosine below which a texel does not count as seen
 HULL_LIMIT = 0.06  # largest distance from the edge of a silhouette that is told apart, m
-_TOLERANCE, _TOLERANCE_PX = 0.01, 1.5  # depth tolerance of the visibility test: in m, and in pixels along the surface
+# depth tolerance of the visibility test: in m, and in pixels along the surface
+_TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
 
 
 @dataclass(frozen=True)
 class TexelMaps:
     """Observations in a few images, per texel."""
 
-    rgb: Tensor  # (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel
-    seen: Tensor  # (K, P) largest cosine between normal and view direction, 0 where a texel is hidden
-    inside: Tensor  # (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the frame
-    # (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m in the body's size,
-    # at most ``HULL_LIMIT`` and at least its negative
+    # (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel
+    rgb: Tensor
+    # (K, P) largest cosine between normal and view direction, 0 where a texel is hidden
+    seen: Tensor
+    # (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the
+    # frame
+    inside: Tensor
+    # (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m
+    # in the body's size, at most ``HULL_LIMIT`` and at least its negative
     hull: Tensor
-    # (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the pelvis
+    # (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the
+    # pelvis
     offsets: Tensor
-    nearby: Tensor  # (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby
+    # (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby
+    nearby: Tensor
     count: int  # of the views
 
 
 @torch.no_grad()
 def observe_texels(person: CapturedPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
-    """Return the maps of at least one image, each with its body pose. Raises ValueError: no image."""
-    shape, device = (len(person.heights), len(person.texels)), person.texels.points.device
+    """Return the maps of at least one image, each with its body pose. Raises ValueError: no
+    image."""
+    shape = (len(person.heights), len(person.texels))
+    device = person.texels.points.device
     colour = torch.zeros(*shape, 3, device=device)
     weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))
     hull = torch.full(shape, HULL_LIMIT, device=device)
     offsets: Tensor | None = None
     count = 0
     for image, pose in images:
-        distances, count = _edge_distances(image), count + 1
+        distances = _edge_distances(image)
+        count = count + 1
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
         normals = _at_texels(person, vertex_normals(scaffolds[0], person.body.faces.cpu().numpy()))
         normals = torch.nn.functional.normalize(normals, dim=1)
@@ -70,7 +82,9 @@ def observe_texels(person: CapturedPerson, images: Iterable[tuple[Image, BodyPos
             seen[level] = torch.maximum(seen[level], cosine)
             inside[level] += (view.alpha > 0.5).float()
             in_frames[level] += view.in_frame
-            hull[level] = torch.minimum(hull[level], torch.where(view.in_frame > 0, view.to_edge, HULL_LIMIT))
+            hull[level] = torch.minimum(
+                hull[level], torch.where(view.in_frame > 0, view.to_edge, HULL_LIMIT)
+            )
     if offsets is None:
         raise ValueError("there must be an image")
     rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
@@ -93,8 +107,8 @@ def from_atlas(atlas: Tensor, texels: Texels) -> Tensor:
 
 @dataclass(frozen=True)
 class _ScaffoldView:
-    """One scaffold in one view: premultiplied colour (P, 3); alpha, signed distance to the silhouette's edge in m of
-    the body, cosine (0 where hidden), in the frame (P,)."""
+    """One scaffold in one view: premultiplied colour (P, 3); alpha, signed distance to the
+    silhouette's edge in m of the body, cosine (0 where hidden), in the frame (P,)."""
 
     rgb: Tensor
     alpha: Tensor
@@ -104,11 +118,17 @@ class _ScaffoldView:
 
 
 def _scaffold_view(
-    person: CapturedPerson, image: Image, distances: Tensor, vertices: np.ndarray, normals: Tensor, scale: float
+    person: CapturedPerson,
+    image: Image,
+    distances: Tensor,
+    vertices: np.ndarray,
+    normals: Tensor,
+    scale: float,
 ) -> _ScaffoldView:
     """Return one image's view of the scaffold with ``vertices`` (M, 3) and ``normals`` (P, 3).
 
-    ``distances`` are those of ``_edge_distances``, ``scale`` is the length of a metre in world units.
+    ``distances`` are those of ``_edge_distances``, ``scale`` is the length of a metre in world
+    units.
     """
     camera = image.cameras
     world = _at_texels(person, vertices)
@@ -117,9 +137,14 @@ def _scaffold_view(
     alpha = torch.ones_like(image.rgb_premultiplied[..., 0]) if image.alpha is None else image.alpha
     planes = torch.cat([image.rgb_premultiplied, alpha[..., None], distances[..., None]], dim=-1)
     found = _sampled(planes, at) * in_frame[:, None]
-    # On a slanted surface the pixels around a texel see nearer points, by their width over the cosine.
-    slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / camera.intrinsics[0, 0, 0] / cosine.clamp_min(_GRAZING)
-    is_clear = depth <= _nearest_depth(vertices, person.body.faces.cpu().numpy(), camera, at) + slack
+    # On a slanted surface the pixels around a texel see nearer points, by their width over the
+    # cosine.
+    slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / camera.intrinsics[
+        0, 0, 0
+    ] / cosine.clamp_min(_GRAZING)
+    is_clear = (
+        depth <= _nearest_depth(vertices, person.body.faces.cpu().numpy(), camera, at) + slack
+    )
     return _ScaffoldView(
         rgb=found[:, :3],
         alpha=found[:, 3],
@@ -130,12 +155,15 @@ def _scaffold_view(
 
 
 def _edge_distances(image: Image) -> Tensor:
-    """Return the signed distances (H, W) of pixels to the edge of the silhouette, positive inside, in pixels.
+    """Return the signed distances (H, W) of pixels to the edge of the silhouette, positive inside,
+    in pixels.
 
     Next to the edge they are the alpha less a half, which is exact for an upright edge.
     """
     if image.alpha is None:
-        return torch.full_like(image.rgb_premultiplied[..., 0], float(max(image.rgb_premultiplied.shape)))
+        return torch.full_like(
+            image.rgb_premultiplied[..., 0], float(max(image.rgb_premultiplied.shape))
+        )
     alpha = image.alpha.double().cpu().numpy()
     is_inside = np.pad(alpha > 0.5, 1)
     within = np.asarray(distance_transform_edt(is_inside))[1:-1, 1:-1] - 0.5
@@ -146,11 +174,14 @@ def _edge_distances(image: Image) -> Tensor:
 
 
 def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:
-    """Return the least depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite off the mesh."""
+    """Return the least depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite off
+    the mesh."""
     projected, distance, _ = project_points(torch.from_numpy(vertices), camera)
-    pixels, depth = projected.double().numpy(), distance.double().numpy()
+    pixels = projected.double().numpy()
+    depth = distance.double().numpy()
     corners = np.concatenate([pixels - 0.5, 1.0 / depth[:, None]], axis=1)[faces]
-    corners[(depth[faces] <= 0).any(axis=1)] = 0.0  # behind the camera: zero area, which covers nothing
+    # behind the camera: zero area, which covers nothing
+    corners[(depth[faces] <= 0).any(axis=1)] = 0.0
     fragments = rasterize(corners, camera.width, camera.height)
     buffer = np.full((camera.height + 2, camera.width + 2), np.inf)
     buffer[fragments.index // camera.width + 1, fragments.index % camera.width + 1] = interpolate(
@@ -165,17 +196,24 @@ def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at:
 
 
 def _sampled(image: Tensor, at: Tensor) -> Tensor:
-    """Return values (P, D) of an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear between pixel centres."""
+    """Return values (P, D) of an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear
+    between pixel centres."""
     size = at.new_tensor([image.shape[1], image.shape[0]])
     grid = (2 * at / size - 1).nan_to_num().clamp(-2, 2)[None, None]
     planes = image.permute(2, 0, 1)[None]
-    found = torch.nn.functional.grid_sample(planes, grid, padding_mode="border", align_corners=False)
+    found = torch.nn.functional.grid_sample(
+        planes, grid, padding_mode="border", align_corners=False
+    )
     return found[0, :, 0].T
 
 
 def _at_texels(person: CapturedPerson, values: np.ndarray) -> Tensor:
     """Return values (P, 3) at the texels, interpolated between those (M, 3) at the vertices."""
-    around = torch.from_numpy(values).float().to(person.texels.points.device)[person.body.faces[person.texels.faces]]
+    around = (
+        torch.from_numpy(values)
+        .float()
+        .to(person.texels.points.device)[person.body.faces[person.texels.faces]]
+    )
     return (person.texels.barycentric[..., None] * around).sum(1)
 
 
@@ -186,5 +224,7 @@ def _posed_vertices(person: CapturedPerson, pose: BodyPose, height: float) -> np
     if body.pose_dirs is not None:
         features = (pose.rotations[1:] - torch.eye(3, device=vertices.device)).flatten()
         vertices = vertices + (features @ body.pose_dirs).unflatten(0, (-1, 3))
-    transforms = blend_transforms(body.weights, joint_transforms(body.joints, body.parents, pose.rotations))
+    transforms = blend_transforms(
+        body.weights, joint_transforms(body.joints, body.parents, pose.rotations)
+    )
     return (pose.scale * apply_transforms(transforms, vertices) + pose.trans).cpu().numpy()

@@ -29,16 +29,24 @@ class PeopleOptions:
     seed: int = 0  # people of different seeds have no body, outfit, clip, light or ring in common
 
 
-def write_people(out: Path, options: PeopleOptions = PeopleOptions(), report: ReportProgress = report_nothing) -> Path:
-    """Write people as ``out/SHARD/PERSON``, captures of ``write_human_capture`` with depth maps and key points.
+def write_people(
+    out: Path, options: PeopleOptions = PeopleOptions(), report: ReportProgress = report_nothing
+) -> Path:
+    """Write people as ``out/SHARD/PERSON``, captures of ``write_human_capture`` with depth maps and
+    key points.
 
-    Every person has a body, an outfit, a clip, a light and a ring of cameras of their own; every other one wears usual
-    clothes. The same options give the same bytes. One person is in memory at a time. Where ``out`` holds people of the
-    same options already, the missing ones are added: a set may be written in parts, and trained on meanwhile. Raises
-    DyngsError: options out of range, or a folder that holds something else.
+    Every person has a body, an outfit, a clip, a light and a ring of cameras of their own; every
+    other one wears usual clothes. The same options give the same bytes. One person is in memory at
+    a time. Where ``out`` holds people of the same options already, the missing ones are added: a
+    set may be written in parts, and trained on meanwhile. Raises DyngsError: options out of range,
+    or a folder that holds something else.
     """
-    if not (1 <= options.people <= _MOST and min(options.size, options.cameras, options.frames) >= 1):
-        raise DyngsError(f"people need size, cameras and frames of at least 1, and be 1 to {_MOST:,}")
+    if not (
+        1 <= options.people <= _MOST and min(options.size, options.cameras, options.frames) >= 1
+    ):
+        raise DyngsError(
+            f"people need size, cameras and frames of at least 1, and be 1 to {_MOST:,}"
+        )
     if options.seed < 0:
         raise DyngsError("people need a seed of at least 0")
     _begin(out, {name: value for name, value in asdict(options).items() if name != "people"})
@@ -52,12 +60,15 @@ def write_people(out: Path, options: PeopleOptions = PeopleOptions(), report: Re
 
 def _begin(out: Path, made_with: dict[str, int]) -> None:
     """Write that people in ``out`` are made with these options, or check that they were."""
-    mark, text = out / PEOPLE_FILE, json.dumps(made_with) + "\n"
+    mark = out / PEOPLE_FILE
+    text = json.dumps(made_with) + "\n"
     if not mark.is_file():
         require_new_folder(out)
         write_text(mark, text)
     elif mark.read_text(encoding="utf-8", errors="replace") != text:
-        raise DyngsError(f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same")
+        raise DyngsError(
+            f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same"
+        )
 
 
 def person_options(options: PeopleOptions, number: int) -> HumanOptions:

@@ -1,4 +1,5 @@
-"""Body templates of the SMPL family: rest mesh, shape space, joints, skinning weights, and posed vertices.
+"""Body templates of the SMPL family: rest mesh, shape space, joints, skinning weights, and posed
+vertices.
 
 Local letters: T triangles, U UV vertices, B shape and E expression parameters.
 """
@@ -24,7 +25,8 @@ from dyngs.human.pose.skinning import (
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.state import fields_moved_to
 
-NUM_FITTED = 10  # shape parameters of a file of SMPL's family that are fitted: as many as every such file has
+# shape parameters of a file of SMPL's family that are fitted: as many as every such file has
+NUM_FITTED = 10
 
 
 @dataclass(frozen=True)
@@ -37,25 +39,39 @@ class BodyTemplate:
     name: str  # the family of the joints: "anny", "smpl", "smplh" or "smplx"
     vertices: Tensor  # (M, 3) at rest
     faces: Tensor  # (T, 3) long, counter-clockwise from outside
-    uv: Tensor | None  # (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None
-    # (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with ``uv``
+    # (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None
+    uv: Tensor | None
+    # (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with
+    # ``uv``
     uv_faces: Tensor | None
     weights: Tensor  # (M, J) skinning weights, rows sum to 1
-    parents: tuple[int, ...]  # (J,) parent of each joint, -1 for the root; parents come before their children
+    # (J,) parent of each joint, -1 for the root; parents come before their children
+    parents: tuple[int, ...]
     joints: Tensor  # (J, 3) at rest, mean shape
     shape_dirs: Tensor | None = None  # (M, 3, B) metres per unit of the shape parameters, or None
-    expression_dirs: Tensor | None = None  # (M, 3, E) metres per unit of the expression parameters, or None
-    joint_shape_dirs: Tensor | None = None  # (J, 3, B) the same for the joints; None with ``shape_dirs``
-    joint_expression_dirs: Tensor | None = None  # (J, 3, E) the same for the joints; None with ``expression_dirs``
-    # (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or None
+    # (M, 3, E) metres per unit of the expression parameters, or None
+    expression_dirs: Tensor | None = None
+    # (J, 3, B) the same for the joints; None with ``shape_dirs``
+    joint_shape_dirs: Tensor | None = None
+    # (J, 3, E) the same for the joints; None with ``expression_dirs``
+    joint_expression_dirs: Tensor | None = None
+    # (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or
+    # None
     pose_dirs: Tensor | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError for shapes that contradict each other, or a parent that does not come before its child."""
+        """Raises ValueError for shapes that contradict each other, or a parent that does not come
+        before its child."""
         check_tree(self.parents)
-        m, j = len(self.vertices), len(self.parents)
-        b, e = self.num_shapes, self.num_expressions
-        wanted = {"vertices": (m, 3), "faces": (len(self.faces), 3), "uv_faces": (len(self.faces), 3)}
+        m = len(self.vertices)
+        j = len(self.parents)
+        b = self.num_shapes
+        e = self.num_expressions
+        wanted = {
+            "vertices": (m, 3),
+            "faces": (len(self.faces), 3),
+            "uv_faces": (len(self.faces), 3),
+        }
         wanted |= {"weights": (m, j), "joints": (j, 3), "pose_dirs": (9 * (j - 1), 3 * m)}
         wanted |= {"shape_dirs": (m, 3, b), "joint_shape_dirs": (j, 3, b)}
         wanted |= {"expression_dirs": (m, 3, e), "joint_expression_dirs": (j, 3, e)}
@@ -63,7 +79,11 @@ class BodyTemplate:
             value = getattr(self, name)
             if value is not None and tuple(value.shape) != shape:
                 raise ValueError(f"{name} must be {shape}, got {tuple(value.shape)}")
-        pairs = (("uv", "uv_faces"), ("shape_dirs", "joint_shape_dirs"), ("expression_dirs", "joint_expression_dirs"))
+        pairs = (
+            ("uv", "uv_faces"),
+            ("shape_dirs", "joint_shape_dirs"),
+            ("expression_dirs", "joint_expression_dirs"),
+        )
         for first, second in pairs:
             if (getattr(self, first) is None) != (getattr(self, second) is None):
                 raise ValueError(f"{first} and {second} must be given together")
@@ -80,25 +100,37 @@ class BodyTemplate:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Return 16 hexadecimal digits that tell its mesh and shape space from those of other files."""
+        """Return 16 hexadecimal digits that tell its mesh and shape space from those of other
+        files."""
         digest = hashlib.sha256(self.name.encode())
         for values in (self.vertices, self.faces, self.shape_dirs):
-            digest.update(b"" if values is None else values[..., :NUM_FITTED].contiguous().cpu().numpy().tobytes())
+            digest.update(
+                b""
+                if values is None
+                else values[..., :NUM_FITTED].contiguous().cpu().numpy().tobytes()
+            )
         return digest.hexdigest()[:16]
 
-    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> BodyTemplate:
-        """Return the template on ``device``, its floating-point tensors in ``dtype``; None leaves either as it is."""
+    def to(
+        self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> BodyTemplate:
+        """Return the template on ``device``, its floating-point tensors in ``dtype``; None leaves
+        either as it is."""
         return fields_moved_to(self, device, dtype)
 
 
-def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape and expression parameters; differentiable.
+def apply_shape(
+    body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape and expression
+    parameters; differentiable.
 
-    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula. Of ``betas`` (...,
-    B) and ``expression`` (..., E) missing ones are 0; None: the mean. Raises DyngsError: a non-zero parameter that the
-    template does not have.
+    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula.
+    Of ``betas`` (..., B) and ``expression`` (..., E) missing ones are 0; None: the mean. Raises
+    DyngsError: a non-zero parameter that the template does not have.
     """
-    vertices, joints = body.vertices, body.joints
+    vertices = body.vertices
+    joints = body.joints
     for name, given, dirs, joint_dirs in (
         ("betas", betas, body.shape_dirs, body.joint_shape_dirs),
         ("expression", expression, body.expression_dirs, body.joint_expression_dirs),
@@ -126,11 +158,13 @@ def posed_vertices(
     expression: Tensor | None = None,
     scale: Tensor | None = None,
 ) -> Tensor:
-    """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et al. 2015).
+    """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et
+    al. 2015).
 
-    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. ``poses`` (F, J, 3) are axis-angle relative to
-    the parent joint, rad; ``trans`` (F, 3) m; ``betas`` (B,) or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,).
-    Raises DyngsError: poses for another number of joints, or parameters that the template does not have.
+    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. ``poses`` (F, J, 3) are
+    axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m; ``betas`` (B,) or (F, B);
+    ``expression`` (E,) or (F, E); ``scale`` (F,). Raises DyngsError: poses for another number of
+    joints, or parameters that the template does not have.
     """
     if poses.ndim != 3 or tuple(poses.shape[1:]) != tuple(body.joints.shape):
         raise DyngsError(
@@ -139,7 +173,9 @@ def posed_vertices(
     vertices, joints = apply_shape(body, betas, expression)
     rotations = axis_angle_to_matrix(poses)
     if body.pose_dirs is not None:
-        features = (rotations[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)).flatten(1)
+        features = (
+            rotations[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)
+        ).flatten(1)
         vertices = vertices + (features @ body.pose_dirs).unflatten(-1, (-1, 3))
     posed = apply_transforms(
         blend_transforms(body.weights, joint_transforms(joints, body.parents, rotations)), vertices
@@ -150,14 +186,17 @@ def posed_vertices(
 
 
 def _blend_shape_offsets(directions: Tensor, parameters: Tensor) -> Tensor:
-    """Return offsets (..., X, 3): the first n ``directions`` (X, 3, B), weighted by ``parameters`` (..., n)."""
+    """Return offsets (..., X, 3): the first n ``directions`` (X, 3, B), weighted by ``parameters``
+    (..., n)."""
     used = directions[..., : parameters.shape[-1]].flatten(0, 1)
     return (parameters @ used.T).unflatten(-1, (-1, 3))
 
 
 BONE_UNIT = 0.015
-"""Change of a bone vector by one unit of a direction, m: about the spread among adults of the same height."""
-SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")  # joints that exist on both sides
+"""Change of a bone vector by one unit of a direction, m: about the spread among adults of the same
+height."""
+# joints that exist on both sides
+SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
 MIDDLE = ("spine1", "spine2", "spine3", "neck", "head")  # joints in the plane of symmetry
 NUM_BONE_SHAPES = 3 * len(SIDED) + 2 * len(MIDDLE)
 """B: a bone vector has three coordinates, in the plane of symmetry two."""
@@ -167,10 +206,12 @@ _NEAREST = 0.02  # distance added to all distances when a vertex lies between se
 def bone_shapes(
     vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions of the vertices (M, 3, B) and of the joints (J, 3, B), m per unit of a shape parameter.
+    """Return directions of the vertices (M, 3, B) and of the joints (J, 3, B), m per unit of a
+    shape parameter.
 
-    Each moves one joint, or the same joint of both sides, together with everything below it; vertices between two
-    joints are stretched evenly. ``joints`` (J, 3) are the 55 of SMPL-X at rest, +x to the left; ``weights`` are (M, J).
+    Each moves one joint, or the same joint of both sides, together with everything below it;
+    vertices between two joints are stretched evenly. ``joints`` (J, 3) are the 55 of SMPL-X at
+    rest, +x to the left; ``weights`` are (M, J).
     """
     joint_dirs = _joint_directions(parents)
     follow = _following(vertices, joints, parents, weights)
@@ -193,19 +234,26 @@ def _joint_directions(parents: tuple[int, ...]) -> np.ndarray:
     return BONE_UNIT * np.stack(moves, axis=-1)
 
 
-def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray) -> np.ndarray:
-    """Return fractions (M, J), rows sum to 1: by how much a vertex moves when a joint at rest does."""
+def _following(
+    vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray
+) -> np.ndarray:
+    """Return fractions (M, J), rows sum to 1: by how much a vertex moves when a joint at rest
+    does."""
     follow = np.zeros_like(weights)
     for joint in range(len(parents)):
         rows = np.flatnonzero(weights[:, joint])
         ends = [joint, *(child for child, parent in enumerate(parents) if parent == joint)]
-        bones = [child for child in ends[1:] if np.linalg.norm(joints[child] - joints[joint]) > 1e-6]
-        if len(bones) == 1:  # the position along the bone: 0 at its start or before, 1 at its end or beyond
+        bones = [
+            child for child in ends[1:] if np.linalg.norm(joints[child] - joints[joint]) > 1e-6
+        ]
+        if len(bones) == 1:
+            # the position along the bone: 0 at its start or before, 1 at its end or beyond
             bone = joints[bones[0]] - joints[joint]
             fraction = np.clip((vertices[rows] - joints[joint]) @ bone / (bone @ bone), 0.0, 1.0)
             follow[rows, joint] += weights[rows, joint] * (1 - fraction)
             follow[rows, bones[0]] += weights[rows, joint] * fraction
-        elif len(bones) > 1 and len(bones) <= 3:  # pelvis, chest; the wrist has five fingers and moves as a whole
+        elif len(bones) > 1 and len(bones) <= 3:
+            # pelvis, chest; the wrist has five fingers and moves as a whole
             ends = [joint, *bones]
             away = np.linalg.norm(vertices[rows, None] - joints[ends], axis=-1) + _NEAREST
             parts = away**-2 / (away**-2).sum(1, keepdims=True)

@@ -2,29 +2,64 @@
 
 from __future__ import annotations
 
-_FINGERS = tuple(f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3))
+_FINGERS = tuple(
+    f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3)
+)
 JOINT_NAMES = (
-    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle"),
-    *("spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder"),
-    *("right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "jaw", "left_eye", "right_eye"),
+    *(
+        "pelvis",
+        "left_hip",
+        "right_hip",
+        "spine1",
+        "left_knee",
+        "right_knee",
+        "spine2",
+        "left_ankle",
+        "right_ankle",
+    ),
+    *(
+        "spine3",
+        "left_foot",
+        "right_foot",
+        "neck",
+        "left_collar",
+        "right_collar",
+        "head",
+        "left_shoulder",
+    ),
+    *(
+        "right_shoulder",
+        "left_elbow",
+        "right_elbow",
+        "left_wrist",
+        "right_wrist",
+        "jaw",
+        "left_eye",
+        "right_eye",
+    ),
     *(f"left_{name}" for name in _FINGERS),
     *(f"right_{name}" for name in _FINGERS),
 )
 """The 55 joints of SMPL-X, in its order."""
 SMPLX_ROWS = {55: tuple(range(55)), 52: (*range(22), *range(25, 55)), 24: tuple(range(22))}
-"""By number of joints of a body (SMPL-X, SMPL-H, SMPL): the rows of ``JOINT_NAMES`` of its first joints.
+"""By number of joints of a body (SMPL-X, SMPL-H, SMPL): the rows of ``JOINT_NAMES`` of its first
+joints.
 
 SMPL's last two joints, the hands, have no counterpart.
 """
 
 
 def mirrored_joints(count: int) -> tuple[int, ...]:
-    """Return the row of the same joint on the other side, for each joint of a body with so many of them."""
+    """Return the row of the same joint on the other side, for each joint of a body with so many of
+    them."""
     names = [JOINT_NAMES[row] for row in SMPLX_ROWS[count]]
     names += ["left_hand", "right_hand"][: count - len(names)]
     swapped = {"left": "right", "right": "left"}
     parts = (name.partition("_") for name in names)
-    other = [f"{swapped[side]}_{rest}" if side in swapped else side + bar + rest for side, bar, rest in parts]
+    other = [
+        f"{swapped[side]}_{rest}" if side in swapped else side + bar + rest
+        for side, bar, rest in parts
+    ]
     return tuple(names.index(name) for name in other)
 
 

@@ -1,8 +1,10 @@
-"""Refinement of the training cameras while the scene is trained: poses, focal lengths and principal points.
+"""Refinement of the training cameras while the scene is trained: poses, focal lengths and principal
+points.
 
-Poses found from images are wrong by some pixels now and then, which blurs the scene. The rasterizer's gradients say
-how each camera should move (as in BARF, Lin et al. 2021). Scene and cameras together could move, turn and grow without
-any change of the images; corrections never contain such a common motion, so that test cameras stay where they are.
+Poses found from images are wrong by some pixels now and then, which blurs the scene. The
+rasterizer's gradients say how each camera should move (as in BARF, Lin et al. 2021). Scene and
+cameras together could move, turn and grow without any change of the images; corrections never
+contain such a common motion, so that test cameras stay where they are.
 """
 
 from __future__ import annotations
@@ -27,12 +29,16 @@ from dyngs.ops.quaternions import rotation_matrices
 from dyngs.tensor_checks import require_tensor
 
 STARTS = 0.05
-"""Fraction of the run in which cameras stay as they are: a scene that is not there yet says nothing about them."""
+"""Fraction of the run in which cameras stay as they are: a scene that is not there yet says nothing
+about them."""
 FIRST_RATE, LAST_RATE = 3e-3, 1e-5
-"""Learning rates after ``STARTS`` and at the end, rad, and as a fraction of the scene's size; log-linear between."""
+"""Learning rates after ``STARTS`` and at the end, rad, and as a fraction of the scene's size;
+log-linear between."""
 LENS_RATE = 0.01
-"""Rate of focal lengths and principal points, as a fraction of that of poses: a lens is updated in every step."""
-LENS_STARTS = 0.3  # Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share
+"""Rate of focal lengths and principal points, as a fraction of that of poses: a lens is updated in
+every step."""
+# Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share
+LENS_STARTS = 0.3
 MIN_POSES = 8  # Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is
 POSES, LENSES = "poses", "lenses"
 
@@ -40,50 +46,71 @@ POSES, LENSES = "poses", "lenses"
 class CameraCorrections:
     """Small corrections of the cameras of V views, at first none.
 
-    A camera that stands still has one correction for all its views, and so has a lens that several views share.
+    A camera that stands still has one correction for all its views, and so has a lens that several
+    views share.
 
     Attributes:
-        poses: (P, 6) rotation vectors, rad, and translations in units of ``size``, both in the camera's frame.
-        lenses: (L, 3) logarithms of the factors of the focal lengths, and shifts of the principal points as fractions
-            of the focal lengths.
+        poses: (P, 6) rotation vectors, rad, and translations in units of ``size``, both in the
+            camera's frame.
+        lenses: (L, 3) logarithms of the factors of the focal lengths, and shifts of the principal
+            points as fractions of the focal lengths.
     """
 
     def __init__(self, views: Sequence[View], size: float) -> None:
         self.size = size
         self._pose_of, self._pose_rows = _numbered([_pose_key(view) for view in views])
         self._lens_of, self._lens_rows = _numbered([_lens_key(view) for view in views])
-        poses_of_lens = Counter(lens for lens, _ in set(zip(self._lens_of, self._pose_of, strict=True)))
+        poses_of_lens = Counter(
+            lens for lens, _ in set(zip(self._lens_of, self._pose_of, strict=True))
+        )
         self._refines_lens = [poses_of_lens[i] >= MIN_POSES for i in range(len(poses_of_lens))]
         self.poses = torch.zeros(max(self._pose_of) + 1, 6, device="cpu")
         self.lenses = torch.zeros(len(poses_of_lens), 3, device="cpu")
-        self._common = common_motions([views[self._pose_of.index(i)] for i in range(len(self.poses))], size)
+        self._common = common_motions(
+            [views[self._pose_of.index(i)] for i in range(len(self.poses))], size
+        )
 
     def rows(self, index: int) -> tuple[int, int | None]:
-        """Return the rows of the pose and of the lens of view ``index``; None where a lens is not refined."""
+        """Return the rows of the pose and of the lens of view ``index``; None where a lens is not
+        refined."""
         lens = self._lens_of[index]
         return self._pose_of[index], lens if self._refines_lens[lens] else None
 
     def applied(self, index: int, cameras: Cameras) -> Cameras:
         """Return ``cameras``, that of an image of view ``index`` at any scale, corrected."""
         pose, lens = self.rows(index)
-        return corrected(cameras, self.poses[pose], None if lens is None else self.lenses[lens], self.size)
+        return corrected(
+            cameras, self.poses[pose], None if lens is None else self.lenses[lens], self.size
+        )
 
     def applied_to(self, view: View, cameras: Cameras) -> Cameras:
-        """Return ``cameras``, that of an image of any view of the capture, with what is known of it.
+        """Return ``cameras``, that of an image of any view of the capture, with what is known of
+        it.
 
-        A view that was not trained on has the pose of a camera that stands still, or a lens, as training found it.
+        A view that was not trained on has the pose of a camera that stands still, or a lens, as
+        training found it.
         """
-        pose, lens = self._pose_rows.get(_pose_key(view)), self._lens_rows.get(_lens_key(view))
+        pose = self._pose_rows.get(_pose_key(view))
+        lens = self._lens_rows.get(_lens_key(view))
         own = torch.zeros(6, device="cpu") if pose is None else self.poses[pose]
         return corrected(
-            cameras, own, None if lens is None or not self._refines_lens[lens] else self.lenses[lens], self.size
+            cameras,
+            own,
+            None if lens is None or not self._refines_lens[lens] else self.lenses[lens],
+            self.size,
         )
 
     def corrected_view(self, view: View) -> View:
         """Return ``view`` with its camera as ``applied_to`` has it, in float64."""
-        pose, lens = (torch.from_numpy(x).double()[None] for x in (view.cam_from_world, view.intrinsics))
+        pose, lens = (
+            torch.from_numpy(x).double()[None] for x in (view.cam_from_world, view.intrinsics)
+        )
         camera = self.applied_to(view, Cameras(pose, lens, view.width, view.height))
-        return replace(view, cam_from_world=camera.cam_from_world[0].numpy(), intrinsics=camera.intrinsics[0].numpy())
+        return replace(
+            view,
+            cam_from_world=camera.cam_from_world[0].numpy(),
+            intrinsics=camera.intrinsics[0].numpy(),
+        )
 
     def remove_common_motion(self) -> None:
         flat = self.poses.view(-1)
@@ -91,15 +118,18 @@ class CameraCorrections:
 
 
 def corrected(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) -> Cameras:
-    """Return the camera ``cameras`` (V = 1) with the corrections ``pose`` (6,) and ``lens`` (3,); differentiable."""
+    """Return the camera ``cameras`` (V = 1) with the corrections ``pose`` (6,) and ``lens`` (3,);
+    differentiable."""
     pose = pose.to(cameras.cam_from_world)
-    rotation = rotation_matrices(torch.cat([pose.new_ones(1), pose[:3] / 2]))  # by |pose| up to its cube
+    # by |pose| up to its cube
+    rotation = rotation_matrices(torch.cat([pose.new_ones(1), pose[:3] / 2]))
     last = pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])
     motion = torch.cat([torch.cat([rotation, size * pose[3:, None]], 1), last])
     intrinsics = cameras.intrinsics
     if lens is not None:
         lens = lens.to(intrinsics)
-        factor, zero = lens[0].exp(), torch.zeros_like(lens[0])
+        factor = lens[0].exp()
+        zero = torch.zeros_like(lens[0])
         rows = [factor, zero, lens[1], zero, factor, lens[2], zero, zero, torch.ones_like(zero)]
         intrinsics = intrinsics @ torch.stack(rows).view(3, 3)
     return Cameras(motion @ cameras.cam_from_world, intrinsics, cameras.width, cameras.height)
@@ -107,13 +137,19 @@ def corrected(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) 
 
 def watched(cameras: Cameras) -> Cameras:
     """Return ``cameras`` as leaf tensors that collect gradients."""
-    pose, intrinsics = (x.detach().clone().requires_grad_() for x in (cameras.cam_from_world, cameras.intrinsics))
+    pose, intrinsics = (
+        x.detach().clone().requires_grad_() for x in (cameras.cam_from_world, cameras.intrinsics)
+    )
     return Cameras(pose, intrinsics, cameras.width, cameras.height)
 
 
-def slopes(cameras: Cameras, by_pose: Tensor, by_intrinsics: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return the gradients (6,) and (3,) by a further small correction of the pose and of the lens."""
-    columns, forces = cameras.cam_from_world.detach()[0, :3], by_pose[0, :3]  # both (3, 4)
+def slopes(
+    cameras: Cameras, by_pose: Tensor, by_intrinsics: Tensor, size: float
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients (6,) and (3,) by a further small correction of the pose and of the
+    lens."""
+    columns = cameras.cam_from_world.detach()[0, :3]
+    forces = by_pose[0, :3]  # both (3, 4)
     turn = torch.linalg.cross(columns, forces, dim=0).sum(1)
     pull = by_intrinsics[0] * cameras.intrinsics.detach()[0]
     focal = cameras.intrinsics.detach()[0].diagonal()[:2]
@@ -122,12 +158,14 @@ def slopes(cameras: Cameras, by_pose: Tensor, by_intrinsics: Tensor, size: float
 
 
 def common_motions(views: Sequence[View], size: float) -> Tensor:
-    """Return an orthonormal basis (6 P, C), C at most 7, of those corrections of all poses that change no image.
+    """Return an orthonormal basis (6 P, C), C at most 7, of those corrections of all poses that
+    change no image.
 
     They turn, shift and scale the scene with all its cameras; to first order.
     """
     poses = np.stack([view.cam_from_world for view in views])
-    rotations, centers = poses[:, :3, :3], np.linalg.inv(poses)[:, :3, 3]
+    rotations = poses[:, :3, :3]
+    centers = np.linalg.inv(poses)[:, :3, 3]
     centers = (centers - centers.mean(0)) / size
     columns = np.zeros((len(views), 6, 7))
     columns[:, :3, :3] = -rotations
@@ -139,7 +177,8 @@ def common_motions(views: Sequence[View], size: float) -> Tensor:
 
 
 def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Return the matrices (V, 3, 3) that multiply a vector from the left by ``vectors`` (V, 3): cross products."""
+    """Return the matrices (V, 3, 3) that multiply a vector from the left by ``vectors`` (V, 3):
+    cross products."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
@@ -154,7 +193,8 @@ def _lens_key(view: View) -> Hashable:
 
 
 def _numbered(keys: Sequence[Hashable]) -> tuple[list[int], dict[Hashable, int]]:
-    """Return for each key the number of those equal to it, in order of their first appearance; and by key."""
+    """Return for each key the number of those equal to it, in order of their first appearance; and
+    by key."""
     numbers: dict[Hashable, int] = {}
     return [numbers.setdefault(key, len(numbers)) for key in keys], numbers
 
@@ -167,28 +207,40 @@ class CameraRefinement:
         self._steps = steps
         self._adam = AdamState.zero(self._values())
         self._updates = {
-            name: torch.zeros(len(x), dtype=torch.int64, device="cpu") for name, x in self._values().items()
+            name: torch.zeros(len(x), dtype=torch.int64, device="cpu")
+            for name, x in self._values().items()
         }
 
     @torch.no_grad()
     def optimize(self, step: int, index: int, cameras: Cameras) -> Count:
-        """Update the corrections of view ``index``; return how many had gradients that are not finite.
+        """Update the corrections of view ``index``; return how many had gradients that are not
+        finite.
 
-        A gradient is that by a further correction of the corrected camera; both are so small that they add.
+        A gradient is that by a further correction of the corrected camera; both are so small that
+        they add.
         """
-        rate, left_out = self.rate(step), torch.zeros((), dtype=torch.int64, device="cpu")
-        by_pose, by_intrinsics = cameras.cam_from_world.grad, cameras.intrinsics.grad
+        rate = self.rate(step)
+        left_out = torch.zeros((), dtype=torch.int64, device="cpu")
+        by_pose = cameras.cam_from_world.grad
+        by_intrinsics = cameras.intrinsics.grad
         if rate == 0 or by_pose is None or by_intrinsics is None:
             return 0
         gradients = slopes(cameras, by_pose, by_intrinsics, self.corrections.size)
         rates = (rate, LENS_RATE * rate if step >= LENS_STARTS * self._steps else 0.0)
-        for name, row, gradient, lr in zip(self._values(), self.corrections.rows(index), gradients, rates, strict=True):
+        for name, row, gradient, lr in zip(
+            self._values(), self.corrections.rows(index), gradients, rates, strict=True
+        ):
             if row is not None and lr > 0:
                 arrays = self._values()[name], self._adam.exp_avg[name], self._adam.exp_avg_sq[name]
                 x, first, second = (a[row : row + 1] for a in arrays)
                 self._updates[name][row] += 1
                 left_out += adam_step_(
-                    x, gradient[None].to(x), first, second, lr=lr, step=int(self._updates[name][row])
+                    x,
+                    gradient[None].to(x),
+                    first,
+                    second,
+                    lr=lr,
+                    step=int(self._updates[name][row]),
                 )
         self.corrections.remove_common_motion()
         return left_out
@@ -204,15 +256,21 @@ class CameraRefinement:
         state = dict(self._values())
         for name, updates in self._updates.items():
             state |= {f"updates.{name}": updates}
-            state |= {f"exp_avg.{name}": self._adam.exp_avg[name], f"exp_avg_sq.{name}": self._adam.exp_avg_sq[name]}
+            state |= {
+                f"exp_avg.{name}": self._adam.exp_avg[name],
+                f"exp_avg_sq.{name}": self._adam.exp_avg_sq[name],
+            }
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore what ``state()`` returned. Raises KeyError, or ValueError for that of other views."""
+        """Restore what ``state()`` returned. Raises KeyError, or ValueError for that of other
+        views."""
         for name, x in self._values().items():
             x.copy_(require_tensor(name, state[name], tuple(x.shape), x.dtype))
             stored = state[f"updates.{name}"]
-            self._updates[name] = require_tensor(f"updates.{name}", stored, (len(x),), torch.int64).clone()
+            self._updates[name] = require_tensor(
+                f"updates.{name}", stored, (len(x),), torch.int64
+            ).clone()
         self._adam = AdamState.restored(state, self._values())
 
     def _values(self) -> dict[str, Tensor]:
@@ -236,26 +294,40 @@ def fitted_to_image(
     options: RenderOptions | None = None,
     weights: Tensor | None = None,
 ) -> Image:
-    """Return ``image`` with its camera moved to where the scene looks most like it (iNeRF, Yen-Chen et al. 2021).
+    """Return ``image`` with its camera moved to where the scene looks most like it (iNeRF, Yen-Chen
+    et al. 2021).
 
     The lens stays.
     """
-    options, truth = options or scene.options, image.composite(background)
+    options = options or scene.options
+    truth = image.composite(background)
     counts = image.mask if weights is None or image.mask is None else weights * image.mask
     counts = weights if counts is None else counts
     correction = torch.zeros(1, 6, device=image.cameras.cam_from_world.device)
-    first, second = torch.zeros_like(correction), torch.zeros_like(correction)
-    best, least = correction.clone(), float("inf")
+    first = torch.zeros_like(correction)
+    second = torch.zeros_like(correction)
+    best = correction.clone()
+    least = float("inf")
     for update in range(1, FIT_UPDATES + 1):
         camera = watched(corrected(image.cameras, correction[0], None, size))
         with torch.enable_grad():
-            rendered = scene.render(camera, image.time, options=options, background=background).rgb[0]
+            rendered = scene.render(camera, image.time, options=options, background=background).rgb[
+                0
+            ]
             loss = l1_ssim_loss(rendered, truth, FIT_SSIM_WEIGHT, counts)
-            by_pose, by_intrinsics = torch.autograd.grad(loss, [camera.cam_from_world, camera.intrinsics])
+            by_pose, by_intrinsics = torch.autograd.grad(
+                loss, [camera.cam_from_world, camera.intrinsics]
+            )
         if float(loss.detach()) < least:
-            best, least = correction.clone(), float(loss.detach())
+            best = correction.clone()
+            least = float(loss.detach())
         rate = FIRST_FIT_RATE * (LAST_FIT_RATE / FIRST_FIT_RATE) ** (update / FIT_UPDATES)
         adam_step_(
-            correction, slopes(camera, by_pose, by_intrinsics, size)[0][None], first, second, lr=rate, step=update
+            correction,
+            slopes(camera, by_pose, by_intrinsics, size)[0][None],
+            first,
+            second,
+            lr=rate,
+            step=update,
         )
     return replace(image, cameras=corrected(image.cameras, best[0], None, size))

@@ -1,11 +1,13 @@
 """Exposure and white balance of each training image, learned next to the scene.
 
-A camera that chooses its exposure by itself shows the same place brighter in one image than in the next. So each
-image has an affine colour, 3 x 4, that its rendering goes through before the loss, as 3DGS has since its second
-release. The mean over all images is the identity, so that the scene has the colours of the mean image and not any.
+A camera that chooses its exposure by itself shows the same place brighter in one image than in the
+next. So each image has an affine colour, 3 x 4, that its rendering goes through before the loss, as
+3DGS has since its second release. The mean over all images is the identity, so that the scene has
+the colours of the mean image and not any.
 
-Gains of all images are found at once, by the places that they share, as soon as the scene has a depth; then Adam
-refines them. Adam alone is too slow for a short run, and leaves a scene bright where bright images were taken.
+Gains of all images are found at once, by the places that they share, as soon as the scene has a
+depth; then Adam refines them. Adam alone is too slow for a short run, and leaves a scene bright
+where bright images were taken.
 
 Local letters: V views, M (V, 3, 4) deviations from the identity, matrix next to offset.
 """
@@ -32,8 +34,11 @@ from dyngs.tensor_checks import require_tensor
 from dyngs.training.other_views import Draw, log_gains
 
 WARM_UP = 0.25
-"""Fraction of the run in which images are taken as they are: before, the rendering shows too little to compare with."""
-TRAVEL = 0.5  # How far a gain may move after it was found, at most: rates follow from how often an image is trained on
+"""Fraction of the run in which images are taken as they are: before, the rendering shows too little
+to compare with."""
+# How far a gain may move after it was found, at most: rates follow from how often an image is
+# trained on
+TRAVEL = 0.5
 LAST_RATE = 0.02  # Rate at the end over that at the beginning, log-linear between
 MAX_RATE = 0.01
 MIXING_RATE = 0.05  # Rate of what mixes channels, and of offsets, over that of gains
@@ -41,10 +46,13 @@ GAIN_WEIGHT, MIXING_WEIGHT = 0.3, 1.0
 """Weights of the mean squared deviation from the identity: gains differ, channels hardly mix."""
 CELLS, FEWEST_CELLS = 16, 8
 """The ratio is a median over so many cells a side; with fewer that say something there is none."""
-DARK, COVERED = 0.02, 0.1  # Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing
-ENOUGH = 100  # Pixels along the longer side from which only every second one is looked at, and so on
+# Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing
+DARK, COVERED = 0.02, 0.1
+# Pixels along the longer side from which only every second one is looked at, and so on
+ENOUGH = 100
 MAX_GAIN = 8.0
-SMOOTH_WEIGHT = 1.0  # Weight of the mean square of its difference from the images before and after, in a video
+# Weight of the mean square of its difference from the images before and after, in a video
+SMOOTH_WEIGHT = 1.0
 
 
 def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | None:
@@ -62,9 +70,15 @@ def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | N
 class ViewExposures(Loss):
     """An affine colour per training image, and their Adam."""
 
-    def __init__(self, neighbours: Sequence[Sequence[int]], steps: int, images: ImageLoader | None = None) -> None:
+    def __init__(
+        self, neighbours: Sequence[Sequence[int]], steps: int, images: ImageLoader | None = None
+    ) -> None:
         count = len(neighbours)
-        self._neighbours, self._steps, self._begins = [list(x) for x in neighbours], steps, round(WARM_UP * steps)
+        self._neighbours, self._steps, self._begins = (
+            [list(x) for x in neighbours],
+            steps,
+            round(WARM_UP * steps),
+        )
         self._images = images
         self._visits = torch.zeros(count, dtype=torch.int64, device="cpu")
         self._values = torch.zeros(count, 12, device="cpu", requires_grad=True)
@@ -83,16 +97,22 @@ class ViewExposures(Loss):
         gains = log_gains(self._images, looked_at, draw).exp()
         self._visits[looked_at] = 1
         with torch.no_grad():
-            self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2).copy_(gains - gains[looked_at].mean(0))
+            self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2).copy_(
+                gains - gains[looked_at].mean(0)
+            )
             self._values[self._visits == 0] = 0
 
     def affine(self, index: int) -> Tensor:
-        """Return (3, 4) the affine colour of an image: what the camera made of the scene's colours."""
+        """Return (3, 4) the affine colour of an image: what the camera made of the scene's
+        colours."""
         deviation = self._values[index].reshape(3, 4)
         return deviation + torch.eye(3, 4, dtype=deviation.dtype, device=deviation.device)
 
-    def applied(self, view: tuple[int, int], image: Image, rendering: Rendering, background: Tensor) -> Tensor:
-        """Return (H, W, 3) the rendering of a view as its camera would have made it, for the loss."""
+    def applied(
+        self, view: tuple[int, int], image: Image, rendering: Rendering, background: Tensor
+    ) -> Tensor:
+        """Return (H, W, 3) the rendering of a view as its camera would have made it, for the
+        loss."""
         index, step = view
         if step <= self._begins:
             return rendering.rgb[0]
@@ -110,7 +130,10 @@ class ViewExposures(Loss):
         total = (self._weights * value.square()).mean()
         beside = self._beside(index)
         if beside:
-            total = total + SMOOTH_WEIGHT * (value - self._values[beside].detach().mean(0)).square().mean()
+            total = (
+                total
+                + SMOOTH_WEIGHT * (value - self._values[beside].detach().mean(0)).square().mean()
+            )
         return {"exposure": total}
 
     def _beside(self, index: int) -> list[int]:
@@ -118,17 +141,21 @@ class ViewExposures(Loss):
         return [i for i in self._neighbours[index] if int(self._visits[i])]
 
     def optimize(self, index: int, step: int) -> Count:
-        """Update the affine of the image that was trained on; return the number of rows left out, 0 or 1."""
+        """Update the affine of the image that was trained on; return the number of rows left out, 0
+        or 1."""
         if step <= self._begins:
             return 0
         self._visits[index] += 1
         rows = torch.zeros(len(self._visits), dtype=torch.bool, device="cpu")
         rows[index] = True
         rate = self._rates * LAST_RATE ** min(step / self._steps, 1.0)
-        bad = self._adam.step_("values", self._values, lr=rate, step=int(self._visits[index]), rows=rows)
+        bad = self._adam.step_(
+            "values", self._values, lr=rate, step=int(self._visits[index]), rows=rows
+        )
         with torch.no_grad():
             known = self._visits > 0
-            if step > self._begins + len(known):  # all are known: what they have in common is the scene's
+            if step > self._begins + len(known):
+                # all are known: what they have in common is the scene's
                 self._values[known] -= self._values[known].mean(0)
         return bad
 
@@ -143,23 +170,26 @@ class ViewExposures(Loss):
         self._visits, self._values = visits.clone(), values.clone().requires_grad_()
 
     @torch.no_grad()
-    def _guess(self, index: int, image: Image, rendering: Rendering, shown: Tensor, background: Tensor) -> None:
-        """Set the gains of an image to the median ratio, over cells, of it to its rendering ``shown``.
+    def _guess(
+        self, index: int, image: Image, rendering: Rendering, shown: Tensor, background: Tensor
+    ) -> None:
+        """Set the gains of an image to the median ratio, over cells, of it to its rendering
+        ``shown``.
 
-        A rendering that is not sharp yet has the right mean in cells, whereas least squares would take it for flat.
-        Where too little is to be seen it takes after those next to it.
+        A rendering that is not sharp yet has the right mean in cells, whereas least squares would
+        take it for flat. Where too little is to be seen it takes after those next to it.
         """
         every = max(1, max(shown.shape[:2]) // ENOUGH)
         few = slice(every // 2, None, every), slice(every // 2, None, every)
-        truth, through, shown = (
-            image.composite(background)[few],
-            rendering.transmittance[0][few][..., None],
-            shown[few],
-        )
+        truth = image.composite(background)[few]
+        through = rendering.transmittance[0][few][..., None]
+        shown = shown[few]
         counts = ((truth < SATURATED).all(-1, keepdim=True) & (through < COVERED)).float()
         counts = counts if image.mask is None else counts * image.mask[few][..., None]
         behind = 0 if image.alpha is None else through * background
-        pixels = torch.cat([(truth - behind) * counts, (shown - behind) * counts, counts], -1).permute(2, 0, 1)
+        pixels = torch.cat(
+            [(truth - behind) * counts, (shown - behind) * counts, counts], -1
+        ).permute(2, 0, 1)
         cells = torch.nn.functional.adaptive_avg_pool2d(pixels, (CELLS, CELLS)).flatten(1)
         known = (cells[6] > 0.5) & (cells[:6] > DARK * cells[6]).all(0)
         if int(known.sum()) < FEWEST_CELLS:
@@ -168,10 +198,13 @@ class ViewExposures(Loss):
                 self._values[index] = self._values[beside].mean(0)
             return
         ratio = (cells[:3, known] / cells[3:6, known]).log().median(1).values
-        self._values[index].reshape(3, 4).diagonal().copy_(ratio.exp().clamp(1 / MAX_GAIN, MAX_GAIN) - 1)
+        self._values[index].reshape(3, 4).diagonal().copy_(
+            ratio.exp().clamp(1 / MAX_GAIN, MAX_GAIN) - 1
+        )
 
 
 def up_to_white(rendered: Tensor, truth: Tensor) -> Tensor:
-    """Return ``rendered`` (H, W, 3), at most 1 where the image is saturated: no sensor shows more."""
+    """Return ``rendered`` (H, W, 3), at most 1 where the image is saturated: no sensor shows
+    more."""
     white = truth >= SATURATED
     return torch.where(white, rendered.clamp_max(1.0), rendered) if bool(white.any()) else rendered

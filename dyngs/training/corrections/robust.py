@@ -1,12 +1,15 @@
-"""Masks of what disagrees with a static scene, found in training: people who walk through, for instance.
+"""Masks of what disagrees with a static scene, found in training: people who walk through, for
+instance.
 
-Where an image differs from its rendering, either the scene is not learned yet, or the image shows something that the
-other images do not. So cells of an image count no more where the residual is many times the median of the last
-views, *and* other views of that place look like the rendering rather than like this image.
+Where an image differs from its rendering, either the scene is not learned yet, or the image shows
+something that the other images do not. So cells of an image count no more where the residual is
+many times the median of the last views, *and* other views of that place look like the rendering
+rather than like this image.
 
-After RobustNeRF (Sabour et al. 2023: residuals with spatial support) and SpotLessSplats (Sabour et al. 2024: a running
-histogram of residuals, a warm-up without masks). There a fixed fraction of the pixels is left out; here a multiple of
-the median decides, and the other views, so that hardly anything is where they agree.
+After RobustNeRF (Sabour et al. 2023: residuals with spatial support) and SpotLessSplats (Sabour et
+al. 2024: a running histogram of residuals, a warm-up without masks). There a fixed fraction of the
+pixels is left out; here a multiple of the median decides, and the other views, so that hardly
+anything is where they agree.
 """
 
 from __future__ import annotations
@@ -24,22 +27,28 @@ from dyngs.models.renderable import Rendering
 from dyngs.tensor_checks import require_indices, require_tensor
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 
-EVERY = 4  # An image is looked at each so many times that it is trained on; in between its mask stays
+# An image is looked at each so many times that it is trained on; in between its mask stays
+EVERY = 4
 WARM_UP = 0.05  # Fraction of the run in which everything counts
 SEED, GROWN = 5.0, 3.0
-"""Multiples of the median residual: from the first a cell is left out, from the second next to such cells."""
+"""Multiples of the median residual: from the first a cell is left out, from the second next to such
+cells."""
 REACH = 2  # Cells up to which a cell counts as next to another
 SUPPORT = 0.5  # Fraction of the 3 x 3 cells around that must be left out, too
 CLEARLY = 0.5
-"""A place disagrees where the other views differ from the rendering by less than this fraction of what it does."""
+"""A place disagrees where the other views differ from the rendering by less than this fraction of
+what it does."""
 RIM = 1  # Cells around what is left out that are left out with it
 DISCOUNT = 0.95
-"""Weight of the histogram of all looks before against that of the present one: it remembers about twenty."""
-_OCTAVES, _PER_OCTAVE = 12, 16  # The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two
+"""Weight of the histogram of all looks before against that of the present one: it remembers about
+twenty."""
+# The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two
+_OCTAVES, _PER_OCTAVE = 12, 16
 
 
 class RobustMasks:
-    """Masks of the pixels that count, one per training image, brought up to date as it is trained on."""
+    """Masks of the pixels that count, one per training image, brought up to date as it is trained
+    on."""
 
     def __init__(
         self,
@@ -48,7 +57,8 @@ class RobustMasks:
         steps: int,
         corrected: Callable[[int, Cameras], Cameras] | None = None,
     ) -> None:
-        self._others, self._begins = OtherViews(images, cameras, corrected), WARM_UP * steps
+        self._others = OtherViews(images, cameras, corrected)
+        self._begins = WARM_UP * steps
         self._visits = torch.zeros(len(images), dtype=torch.int64, device="cpu")
         self._left_out = torch.zeros(len(images), CELLS, CELLS, dtype=torch.uint8, device="cpu")
         self._histogram = torch.zeros(_OCTAVES * _PER_OCTAVE, dtype=torch.float64, device="cpu")
@@ -62,7 +72,8 @@ class RobustMasks:
         background: Tensor,
         with_depth: Callable[[Cameras], Rendering],
     ) -> Image:
-        """Return ``image``, of which only those pixels count that agree with the other views; call once a step."""
+        """Return ``image``, of which only those pixels count that agree with the other views; call
+        once a step."""
         if step <= self._begins:
             return image
         if int(self._visits[index]) % EVERY == 0:
@@ -82,12 +93,21 @@ class RobustMasks:
         return {"visits": self._visits, "left_out": self._left_out, "histogram": self._histogram}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the state that ``state()`` returned. Raises KeyError, or ValueError for that of other images."""
+        """Restore the state that ``state()`` returned. Raises KeyError, or ValueError for that of
+        other images."""
         count = len(self._visits)
         visits = require_tensor("visits", state["visits"], (count,), torch.int64)
-        left_out = require_indices("left_out", state["left_out"], (count, CELLS, CELLS), 2, torch.uint8)
-        histogram = require_tensor("histogram", state["histogram"], self._histogram.shape, torch.float64)
-        self._visits, self._left_out, self._histogram = visits.clone(), left_out.clone(), histogram.clone()
+        left_out = require_indices(
+            "left_out", state["left_out"], (count, CELLS, CELLS), 2, torch.uint8
+        )
+        histogram = require_tensor(
+            "histogram", state["histogram"], self._histogram.shape, torch.float64
+        )
+        self._visits, self._left_out, self._histogram = (
+            visits.clone(),
+            left_out.clone(),
+            histogram.clone(),
+        )
         if bool(visits.any()):
             self._begins = 0.0  # also where the run has become longer
 
@@ -121,12 +141,17 @@ class RobustMasks:
         odd = candidates.clone()
         odd[candidates] = others < CLEARLY * (drawn - seen).abs().mean(0)[candidates]
         core = odd & _near(candidates & (residual > SEED * median), REACH)
-        core = avg_pool2d(core.float()[None], 3, stride=1, padding=1, count_include_pad=False)[0] >= SUPPORT
+        core = (
+            avg_pool2d(core.float()[None], 3, stride=1, padding=1, count_include_pad=False)[0]
+            >= SUPPORT
+        )
         self._left_out[index, : grid[0], : grid[1]] = _near(core, RIM).to(torch.uint8)
 
     def _remember(self, residual: Tensor) -> None:
         bins = (_PER_OCTAVE * (residual.clamp(2.0**-_OCTAVES, 1.0).log2() + _OCTAVES)).long()
-        counts = torch.bincount(bins.clamp_max(len(self._histogram) - 1), minlength=len(self._histogram))
+        counts = torch.bincount(
+            bins.clamp_max(len(self._histogram) - 1), minlength=len(self._histogram)
+        )
         self._histogram = DISCOUNT * self._histogram + counts.to(self._histogram)
 
     def _median(self) -> float:

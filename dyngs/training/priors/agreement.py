@@ -1,4 +1,5 @@
-"""Priors compared with the images before any training: each must explain them better than its simplest substitute."""
+"""Priors compared with the images before any training: each must explain them better than its
+simplest substitute."""
 
 from __future__ import annotations
 
@@ -33,15 +34,17 @@ class Agreement:
 
     @property
     def holds(self) -> bool:
-        """Return whether the prior explains the images better; not where nothing could be compared."""
+        """Return whether the prior explains the images better; not where nothing could be
+        compared."""
         return self.pairs > 0 and self.error < MARGIN * self.without
 
 
 def flow_agreement(pairs: Sequence[tuple[Image, Image]]) -> Agreement:
-    """Compare flow with no motion, with its reverse, and with the same displacements at other places.
+    """Compare flow with no motion, with its reverse, and with the same displacements at other
+    places.
 
-    Only where images change most: elsewhere no motion is always right. There, displacements at random help a little,
-    too, which is why they are a substitute.
+    Only where images change most: elsewhere no motion is always right. There, displacements at
+    random help a little, too, which is why they are a substitute.
     """
     sums = torch.zeros(4, device="cpu")
     count = 0
@@ -56,7 +59,8 @@ def flow_agreement(pairs: Sequence[tuple[Image, Image]]) -> Agreement:
             continue
         chosen = change.flatten().topk(number).indices
         flow = first.flow.reshape(-1, 2)[chosen]
-        places, wanted = _centers(before)[chosen], before.reshape(-1, 3)[chosen]
+        places = _centers(before)[chosen]
+        wanted = before.reshape(-1, 3)[chosen]
         for i, moved in enumerate((flow, torch.zeros_like(flow), -flow, flow.roll(number // 2, 0))):
             sums[i] += (_sampled(after, places + moved) - wanted).abs().mean()
         count += 1
@@ -71,16 +75,21 @@ def track_agreement(pairs: Sequence[tuple[Image, Image, Tensor, Tensor]]) -> Agr
         before, after = (_blurred(p.rgb_premultiplied) for p in (first, second))
         wanted = _sampled(before, start)
         given += float((_sampled(after, end) - wanted).abs().mean())
-        shuffled += float((_sampled(after, end.roll(max(len(end) // 2, 1), 0)) - wanted).abs().mean())
+        shuffled += float(
+            (_sampled(after, end.roll(max(len(end) // 2, 1), 0)) - wanted).abs().mean()
+        )
     count = max(len(pairs), 1)
     return Agreement(given / count, shuffled / count, len(pairs))
 
 
-def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: float) -> tuple[DepthForm, Agreement]:
-    """Compare depth maps with one depth for a whole image; return what they are affine in, and the agreement.
+def depth_agreement(
+    triples: Sequence[tuple[Image, Image, Image]], distance: float
+) -> tuple[DepthForm, Agreement]:
+    """Compare depth maps with one depth for a whole image; return what they are affine in, and the
+    agreement.
 
-    Scale and shift, and the one depth, are those that warp the first image's second neighbour onto it best; the
-    third one then judges them.
+    Scale and shift, and the one depth, are those that warp the first image's second neighbour onto
+    it best; the third one then judges them.
     """
     sums = torch.zeros(3, device="cpu")
     count = 0
@@ -101,10 +110,11 @@ def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: flo
 
 
 def mask_agreement(pairs: Sequence[tuple[Image, Image]], distance: float) -> Agreement:
-    """Compare what masks call still with what they call moving: how far a still world explains another image of it.
+    """Compare what masks call still with what they call moving: how far a still world explains
+    another image of it.
 
-    Each pixel may choose its depth. What stands is found on its epipolar line in the other image; from a camera that
-    stands, too, at its own place.
+    Each pixel may choose its depth. What stands is found on its epipolar line in the other image;
+    from a camera that stands, too, at its own place.
     """
     still = moving = 0.0
     count = 0
@@ -112,8 +122,11 @@ def mask_agreement(pairs: Sequence[tuple[Image, Image]], distance: float) -> Agr
         first, second = (_small(p) for p in views)
         if first.moves is None or not 0 < float(first.moves.mean()) < 1:
             continue
-        tried = [_warp_errors(first, second, torch.full_like(first.moves, z)) for z in _depths(distance)]
-        error, moves = torch.stack(tried).amin(0), first.moves.flatten()
+        tried = [
+            _warp_errors(first, second, torch.full_like(first.moves, z)) for z in _depths(distance)
+        ]
+        error = torch.stack(tried).amin(0)
+        moves = first.moves.flatten()
         moving += float((error * moves).sum() / moves.sum())
         still += float((error * (1 - moves)).sum() / (1 - moves).sum())
         count += 1
@@ -143,23 +156,31 @@ def _aligned_guesses(given: Tensor, kind: DepthForm, distance: float) -> Iterato
 
 
 def _warp_errors(first: Image, second: Image, depth: Tensor) -> Tensor:
-    """Return differences of an image from another one that is warped to it by ``depth`` (H, W), where that is known.
+    """Return differences of an image from another one that is warped to it by ``depth`` (H, W),
+    where that is known.
 
     (P,) means over channels, for the pixels with a depth, row by row.
     """
     known = (depth > 0).flatten()
-    here, there = first.cameras, second.cameras
+    here = first.cameras
+    there = second.cameras
     k = here.intrinsics[0]
     rays = (_centers(first.rgb_premultiplied)[known] - k[:2, 2]) / k.diagonal()[:2]
     local = torch.cat([rays, torch.ones_like(rays[:, :1])], 1) * depth.flatten()[known, None]
     between = there.cam_from_world[0] @ torch.linalg.inv(here.cam_from_world[0])
     moved = local @ between[:3, :3].T + between[:3, 3]
-    focal, center = there.intrinsics[0].diagonal()[:2], there.intrinsics[0][:2, 2]
+    focal = there.intrinsics[0].diagonal()[:2]
+    center = there.intrinsics[0][:2, 2]
     places = moved[:, :2] / moved[:, 2:].clamp_min(1e-6) * focal + center
     size = places.new_tensor([there.width, there.height])
     inside = (moved[:, 2] > 0) & ((places > 0) & (places < size)).all(1)
-    error = (_sampled(second.rgb_premultiplied, places) - first.rgb_premultiplied.reshape(-1, 3)[known]).abs().mean(1)
-    # What leaves the image costs as much as a mean pixel: otherwise the best warp would show nothing.
+    error = (
+        (_sampled(second.rgb_premultiplied, places) - first.rgb_premultiplied.reshape(-1, 3)[known])
+        .abs()
+        .mean(1)
+    )
+    # What leaves the image costs as much as a mean pixel: otherwise the best warp would show
+    # nothing.
     outside = (first.rgb_premultiplied - first.rgb_premultiplied.mean((0, 1))).abs().mean()
     return torch.where(inside, error, outside)
 
@@ -177,7 +198,9 @@ def _sampled(pixels: Tensor, places: Tensor) -> Tensor:
     height, width = pixels.shape[:2]
     grid = (2 * places / places.new_tensor([width, height]) - 1)[None, None]
     image = pixels.permute(2, 0, 1)[None]
-    return torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)[0, :, 0].T
+    return torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)[
+        0, :, 0
+    ].T
 
 
 def _blurred(pixels: Tensor) -> Tensor:
@@ -186,7 +209,8 @@ def _blurred(pixels: Tensor) -> Tensor:
 
 
 def distance_to_scene(cameras: Sequence[Cameras]) -> float | None:
-    """Return the median distance of cameras from the point that they look at, None where their axes are parallel."""
+    """Return the median distance of cameras from the point that they look at, None where their axes
+    are parallel."""
     poses = torch.linalg.inv(torch.cat([c.cam_from_world for c in cameras]).double())
     focus = focus_point(poses.numpy())
     if focus is None:

@@ -1,4 +1,5 @@
-"""From a capture and its images to the priors that are used: each is compared with the images first."""
+"""From a capture and its images to the priors that are used: each is compared with the images
+first."""
 
 from __future__ import annotations
 
@@ -24,24 +25,37 @@ from dyngs.training.priors.agreement import (
 )
 from dyngs.training.priors.used import MIN_POINTS, DepthForm, Glance, PointTracks, UsedPriors
 
-_NEAR_TIME = 0.1  # Depth is judged by images whose times differ by less; the less, the less has moved
+# Depth is judged by images whose times differ by less; the less, the less has moved
+_NEAR_TIME = 0.1
 _BASELINE = 0.1
-"""Best distance between the cameras of two images for that, as a fraction of their distance from the scene."""
+"""Best distance between the cameras of two images for that, as a fraction of their distance from
+the scene."""
 
 
-def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves: bool) -> UsedPriors:
-    """Return the priors of a capture that agree with its images; nothing is read where it has none."""
-    wanted, views, lines = config.train.priors, images.views, list[str]()
+def used_priors(
+    config: Config, capture: Capture, images: ImageLoader, *, moves: bool
+) -> UsedPriors:
+    """Return the priors of a capture that agree with its images; nothing is read where it has
+    none."""
+    wanted = config.train.priors
+    views = images.views
+    lines = list[str]()
     kind: DepthForm | None = None
     flow_to: dict[int, Glance] = {}
     tracks: PointTracks | None = None
     if "depth" in wanted and any(view.depth_path for view in views):
         kind, agreement = _judged_depth(config, images)
-        lines.append(_line(f"depth maps (aligned in {_NAMES[kind]})", agreement, "one depth for a whole image"))
+        lines.append(
+            _line(
+                f"depth maps (aligned in {_NAMES[kind]})", agreement, "one depth for a whole image"
+            )
+        )
         kind = kind if agreement.holds else None
     if moves and "flow" in wanted and any(view.flow_path for view in views):
         flow_to, agreement = _judged_flow(config, capture, images)
-        lines.append(_line("optical flow", agreement, "no motion, its reverse or flow of other places"))
+        lines.append(
+            _line("optical flow", agreement, "no motion, its reverse or flow of other places")
+        )
         flow_to = flow_to if agreement.holds else {}
     if moves and "tracks" in wanted and capture.tracks_path is not None:
         tracks, agreement = _judged_tracks(config, read_tracks(capture.tracks_path), images)
@@ -77,7 +91,11 @@ def _judged_depth(config: Config, images: ImageLoader) -> tuple[DepthForm, Agree
     triples = []
     for i in spread_pairs([i for i, view in enumerate(views) if view.depth_path]):
         apart = (centers - centers[i]).norm(dim=1) / distance
-        usable = (apart > 0.2 * _BASELINE) & (apart < 12 * _BASELINE) & ((times - times[i]).abs() < _NEAR_TIME)
+        usable = (
+            (apart > 0.2 * _BASELINE)
+            & (apart < 12 * _BASELINE)
+            & ((times - times[i]).abs() < _NEAR_TIME)
+        )
         cost = (apart / _BASELINE).log().abs() + (times - times[i]).abs() / _NEAR_TIME
         nearest = [int(j) for j in cost.argsort() if usable[j]][:2]
         if len(nearest) == 2:
@@ -86,7 +104,8 @@ def _judged_depth(config: Config, images: ImageLoader) -> tuple[DepthForm, Agree
 
 
 def _judged_masks(config: Config, images: ImageLoader) -> Agreement:
-    """Compare each of some images with the one from the nearest camera at another, not the next, time."""
+    """Compare each of some images with the one from the nearest camera at another, not the next,
+    time."""
     views = images.views
     cameras = training_cameras(views, config.data)
     centers = torch.cat([c.centers for c in cameras])
@@ -102,7 +121,9 @@ def _judged_masks(config: Config, images: ImageLoader) -> Agreement:
     return mask_agreement(pairs, distance)
 
 
-def _judged_flow(config: Config, capture: Capture, images: ImageLoader) -> tuple[dict[int, Glance], Agreement]:
+def _judged_flow(
+    config: Config, capture: Capture, images: ImageLoader
+) -> tuple[dict[int, Glance], Agreement]:
     named = {view.name: view for view in all_views(capture.splits)}
     place = {view.name: i for i, view in enumerate(images.views)}
     flow_to = {
@@ -115,7 +136,9 @@ def _judged_flow(config: Config, capture: Capture, images: ImageLoader) -> tuple
     return flow_to, flow_agreement(pairs)
 
 
-def _judged_tracks(config: Config, tracks: ImageTracks, images: ImageLoader) -> tuple[PointTracks, Agreement]:
+def _judged_tracks(
+    config: Config, tracks: ImageTracks, images: ImageLoader
+) -> tuple[PointTracks, Agreement]:
     points = _point_tracks(config, tracks, images.views)
     pairs = []
     order = sorted(range(len(images)), key=lambda i: (points.glances[i].time, i))
@@ -127,7 +150,8 @@ def _judged_tracks(config: Config, tracks: ImageTracks, images: ImageLoader) -> 
 
 
 def _shared_pairs(points: PointTracks, seen: Sequence[int]) -> list[tuple[int, int]]:
-    """Return views, evenly chosen, each with the next one of another time that shares points with it."""
+    """Return views, evenly chosen, each with the next one of another time that shares points with
+    it."""
     pairs = []
     for at in spread_pairs(range(len(seen))):
         i = seen[at]
@@ -140,7 +164,8 @@ def _shared_pairs(points: PointTracks, seen: Sequence[int]) -> list[tuple[int, i
 
 
 def _point_tracks(config: Config, tracks: ImageTracks, views: Sequence[View]) -> PointTracks:
-    """Return tracks in the px of training images, undistorted; what cannot be undistorted is not visible."""
+    """Return tracks in the px of training images, undistorted; what cannot be undistorted is not
+    visible."""
     rows, (_, count) = tracks.rows_of(views), tracks.visible.shape
     xy = torch.zeros(len(views), count, 2, device="cpu")
     visible = torch.zeros(len(views), count, dtype=torch.bool, device="cpu")

@@ -1,4 +1,5 @@
-"""The priors that a run uses (depth maps, flow, tracks): what they need to be drawn, and their losses."""
+"""The priors that a run uses (depth maps, flow, tracks): what they need to be drawn, and their
+losses."""
 
 from __future__ import annotations
 
@@ -27,8 +28,11 @@ class Glance:
     time: float
 
 
-def displacements(start: Gaussians, end: Gaussians, here: Cameras, there: Cameras, options: RenderOptions) -> Tensor:
-    """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights it stands for.
+def displacements(
+    start: Gaussians, end: Gaussians, here: Cameras, there: Cameras, options: RenderOptions
+) -> Tensor:
+    """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights
+    it stands for.
 
     Differentiable in the means of both, not in how much each Gaussian covers.
     """
@@ -43,7 +47,8 @@ def displacements(start: Gaussians, end: Gaussians, here: Cameras, there: Camera
 
 
 def flow_error(drawn: Tensor, image: Image) -> Tensor | None:
-    """Return the mean Charbonnier error of ``drawn`` (see ``displacements``) in the flow of an image.
+    """Return the mean Charbonnier error of ``drawn`` (see ``displacements``) in the flow of an
+    image.
 
     In fractions of the image's longer side, over pixels whose flow is known; None without any.
     """
@@ -59,13 +64,16 @@ def flow_error(drawn: Tensor, image: Image) -> Tensor | None:
 
 
 def track_error(drawn: Tensor, start: Tensor, end: Tensor) -> Tensor | None:
-    """Return the mean Charbonnier error of ``drawn`` at the points ``start`` (P, 2) px, which are at ``end`` (P, 2).
+    """Return the mean Charbonnier error of ``drawn`` at the points ``start`` (P, 2) px, which are
+    at ``end`` (P, 2).
 
     In fractions of the image's longer side; None where no point lies on anything drawn.
     """
     height, width = drawn.shape[:2]
     grid = (2 * start / start.new_tensor([width, height]) - 1)[None, None]
-    sampled = torch.nn.functional.grid_sample(drawn.permute(2, 0, 1)[None], grid, align_corners=False)[0, :, 0].T
+    sampled = torch.nn.functional.grid_sample(
+        drawn.permute(2, 0, 1)[None], grid, align_corners=False
+    )[0, :, 0].T
     counts = sampled[:, 2].detach() > _SOLID
     if not bool(counts.any()):
         return None
@@ -77,14 +85,16 @@ def _charbonnier(errors: Tensor) -> Tensor:
 
 
 def _projected(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    pose, k = cameras.cam_from_world[0], cameras.intrinsics[0]
+    pose = cameras.cam_from_world[0]
+    k = cameras.intrinsics[0]
     local = means @ pose[:3, :3].T + pose[:3, 3]
     depth = local[:, 2]
     return local[:, :2] / depth.clamp_min(1e-6)[:, None] * k.diagonal()[:2] + k[:2, 2], depth
 
 
 DepthForm = Literal["depth", "inverse"]
-"""Form of the map that is affine in the true depth: the map as it is, or its inverse (the nets of single images)."""
+"""Form of the map that is affine in the true depth: the map as it is, or its inverse (the nets of
+single images)."""
 
 _ROUNDS = 4
 _SOLID = 0.5  # Alpha from which the drawn depth means anything
@@ -98,15 +108,18 @@ def values_of(depth: Tensor, kind: DepthForm) -> Tensor:
 
 
 def aligned(given: Tensor, wanted: Tensor) -> Tensor | None:
-    """Return ``a given + b`` nearest to ``wanted``, both (P,); None where that would turn near and far about.
+    """Return ``a given + b`` nearest to ``wanted``, both (P,); None where that would turn near and
+    far about.
 
-    Least absolute deviations by reweighted least squares: 10 % of outliers or a moving thing do not tilt it.
+    Least absolute deviations by reweighted least squares: 10 % of outliers or a moving thing do not
+    tilt it.
     """
     weight = torch.ones_like(given)
     a = b = given.new_zeros(())
     for _ in range(_ROUNDS):
         total = weight.sum()
-        mean_x, mean_y = (weight * given).sum() / total, (weight * wanted).sum() / total
+        mean_x = (weight * given).sum() / total
+        mean_y = (weight * wanted).sum() / total
         x = given - mean_x
         a = (weight * x * (wanted - mean_y)).sum() / (weight * x.square()).sum().clamp_min(_TINY**2)
         b = mean_y - a * mean_x
@@ -118,10 +131,11 @@ def aligned(given: Tensor, wanted: Tensor) -> Tensor | None:
 def depth_error(
     drawn: Tensor, alpha: Tensor, given: Tensor, kind: DepthForm, mask: Tensor | None = None
 ) -> Tensor | None:
-    """Return the mean error of the drawn depth relative to the map; None where there is too little to compare.
+    """Return the mean error of the drawn depth relative to the map; None where there is too little
+    to compare.
 
-    The map is aligned by scale and shift to what is drawn, without a gradient; |difference| over the median of the
-    aligned values (in depth or inverse depth, see ``DepthForm``).
+    The map is aligned by scale and shift to what is drawn, without a gradient; |difference| over
+    the median of the aligned values (in depth or inverse depth, see ``DepthForm``).
     """
     counts = (given > 0) & (drawn > 0) & (alpha.detach() > _SOLID)
     if mask is not None:
@@ -151,13 +165,17 @@ class PointTracks:
     def pair(
         self, index: int, may_use: Callable[[float], bool], generator: torch.Generator
     ) -> tuple[Glance, Tensor, Tensor] | None:
-        """Return another view at random among the nearest in time, and P' points here and there, or None."""
+        """Return another view at random among the nearest in time, and P' points here and there, or
+        None."""
         now = self.glances[index].time
         shared = (self.visible & self.visible[index]).sum(1)
         others = [
             i
             for i, glance in enumerate(self.glances)
-            if i != index and glance.time != now and int(shared[i]) >= MIN_POINTS and may_use(glance.time)
+            if i != index
+            and glance.time != now
+            and int(shared[i]) >= MIN_POINTS
+            and may_use(glance.time)
         ]
         if not others:
             return None
@@ -183,9 +201,12 @@ class UsedPriors(Loss):
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
         found: dict[str, Tensor | None] = {}
-        image, rendering, scene = look.image, look.drawn.rendering, look.model.scene
+        image = look.image
+        rendering = look.drawn.rendering
+        scene = look.model.scene
         if self.depth is not None and image.depth is not None and rendering.depth is not None:
-            drawn, alpha = rendering.depth[0], rendering.alpha[0]
+            drawn = rendering.depth[0]
+            alpha = rendering.alpha[0]
             found["depth"] = depth_error(drawn, alpha, image.depth, self.depth, image.mask)
         if isinstance(scene, GaussianScene) and not scene.is_static and image.time is not None:
             found |= self._motion(scene, look)
@@ -199,15 +220,21 @@ class UsedPriors(Loss):
 
         target = self.flow_to.get(look.index)
         by_flow = target is not None and image.flow is not None and may_use(target.time)
-        pair = None if self.tracks is None else self.tracks.pair(look.index, may_use, look.generator)
+        pair = (
+            None if self.tracks is None else self.tracks.pair(look.index, may_use, look.generator)
+        )
         if not by_flow and pair is None:
             return {}
         canonical = scene.with_gaussians(scene.gaussians.detach())
-        start, here = canonical.time_step(image.time).gaussians, image.cameras
+        start = canonical.time_step(image.time).gaussians
+        here = image.cameras
 
         def drawn(glance: Glance) -> Tensor:
-            there, options = _sized_as(here, glance.cameras), replace(scene.options, nonfinite="trust")
-            return displacements(start, canonical.time_step(glance.time).gaussians, here, there, options)
+            there = _sized_as(here, glance.cameras)
+            options = replace(scene.options, nonfinite="trust")
+            return displacements(
+                start, canonical.time_step(glance.time).gaussians, here, there, options
+            )
 
         found: dict[str, Tensor | None] = {}
         if by_flow and target is not None:
@@ -215,7 +242,9 @@ class UsedPriors(Loss):
         if pair is not None and self.tracks is not None:
             glance, begin, end = pair
             own = self.tracks.glances[look.index].cameras
-            begin, end = (x * _scale(cameras, here) for x, cameras in ((begin, own), (end, glance.cameras)))
+            begin, end = (
+                x * _scale(cameras, here) for x, cameras in ((begin, own), (end, glance.cameras))
+            )
             found["tracks"] = track_error(drawn(glance), begin, end)
         return found
 
@@ -227,4 +256,6 @@ def _scale(cameras: Cameras, here: Cameras) -> Tensor:
 
 def _sized_as(here: Cameras, cameras: Cameras) -> Cameras:
     scale = torch.cat([_scale(cameras, here), here.intrinsics.new_ones(1)])
-    return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, here.width, here.height)
+    return Cameras(
+        cameras.cam_from_world, scale[:, None] * cameras.intrinsics, here.width, here.height
+    )

@@ -23,7 +23,10 @@ def clip(count: int, degrees: float) -> Capture:
     """One camera on its way around the origin, an image at each time."""
     k = pinhole_matrix(40.0, 40.0, 16.0, 12.0)
     poses = [cam_from_opengl(opengl_pose(np.radians(degrees) * i)) for i in range(count)]
-    views = [View(f"{i:03d}", Path(f"{i}.png"), p, k, 32, 24, time=i / (count - 1)) for i, p in enumerate(poses)]
+    views = [
+        View(f"{i:03d}", Path(f"{i}.png"), p, k, 32, 24, time=i / (count - 1))
+        for i, p in enumerate(poses)
+    ]
     return Capture(Path("clip"), "nerfstudio", {"train": tuple(views), "test": ()})
 
 
@@ -31,7 +34,9 @@ def with_points(capture: Capture, xyz: np.ndarray) -> Capture:
     return capture.replace(points=PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
 
 
-@pytest.mark.parametrize(("count", "degrees", "says"), [(12, 35.0, True), (12, 2.0, False), (100, 100.0, False)])
+@pytest.mark.parametrize(
+    ("count", "degrees", "says"), [(12, 35.0, True), (12, 2.0, False), (100, 100.0, False)]
+)
 def test_few_images_far_apart_are_ill_posed(count: int, degrees: float, says: bool) -> None:
     """Not those of a video, nor many that jump about as in D-NeRF."""
     lines = before_training(clip(count, degrees))
@@ -41,8 +46,13 @@ def test_few_images_far_apart_are_ill_posed(count: int, degrees: float, says: bo
 
 def test_several_cameras_at_each_time_are_no_problem() -> None:
     capture = clip(12, 35.0)
-    both = [replace(v, name=f"b{v.name}", time=1 - (v.time or 0.0), camera_id=1) for v in capture.splits["train"]]
-    assert before_training(capture.replace(splits={"train": (*capture.splits["train"], *both)})) == []
+    both = [
+        replace(v, name=f"b{v.name}", time=1 - (v.time or 0.0), camera_id=1)
+        for v in capture.splits["train"]
+    ]
+    assert (
+        before_training(capture.replace(splits={"train": (*capture.splits["train"], *both)})) == []
+    )
     still = tuple(replace(view, time=None) for view in capture.splits["train"])
     assert before_training(capture.replace(splits={"train": still})) == []
 
@@ -60,16 +70,32 @@ def test_points_and_cameras_that_do_not_meet() -> None:
     far = with_points(capture, np.concatenate([xyz, xyz[:150] + np.array([0, 0, 50.0])]))
     assert any("33% of the points are in no camera's view" in line for line in before_training(far))
     straight = capture.splits["train"][7]
-    turned = replace(straight, cam_from_world=np.diag([-1.0, 1.0, -1.0, 1.0]) @ straight.cam_from_world)
+    turned = replace(
+        straight, cam_from_world=np.diag([-1.0, 1.0, -1.0, 1.0]) @ straight.cam_from_world
+    )
     views = tuple(turned if view.name == turned.name else view for view in capture.splits["train"])
     odd = capture.replace(splits={"train": views})
-    assert any("1 of 40 cameras look away from the centre" in line and "'007'" in line for line in before_training(odd))
+    assert any(
+        "1 of 40 cameras look away from the centre" in line and "'007'" in line
+        for line in before_training(odd)
+    )
     lines = before_training(with_points(odd, xyz))
     assert any("1 of 40 cameras see none of the points, first '007'" in line for line in lines)
 
 
 @pytest.mark.parametrize(
-    "name", ["lego400", "colmap_small", "fox", "orbits", "flag", "stage", "clip_duck", "human/casual_m", "human/busi_f"]
+    "name",
+    [
+        "lego400",
+        "colmap_small",
+        "fox",
+        "orbits",
+        "flag",
+        "stage",
+        "clip_duck",
+        "human/casual_m",
+        "human/busi_f",
+    ],
 )
 def test_no_false_alarms(shared: Path, name: str) -> None:
     assert before_training(read_capture(shared / name)) == []
@@ -80,7 +106,9 @@ def capture_with(tmp_path: Path, mask: np.ndarray | None) -> Capture:
     views = []
     for i in range(6):
         write_image(tmp_path / f"{i}.png", np.random.default_rng(i).uniform(size=(8, 12, 3)))
-        view = View(f"{i}", tmp_path / f"{i}.png", opengl_pose(float(i)), np.diag([10.0, 10.0, 1.0]), 12, 8)
+        view = View(
+            f"{i}", tmp_path / f"{i}.png", opengl_pose(float(i)), np.diag([10.0, 10.0, 1.0]), 12, 8
+        )
         if mask is not None and i:
             write_image(tmp_path / f"mask{i}.png", mask[..., None])
             view = replace(view, mask_path=tmp_path / f"mask{i}.png")
@@ -101,7 +129,8 @@ def test_usual_masks_are_fine(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mask", "line"), [(mask_of(1), "are they inverted"), (mask_of(7, 1), "no value above 1, but white is 255")]
+    ("mask", "line"),
+    [(mask_of(1), "are they inverted"), (mask_of(7, 1), "no value above 1, but white is 255")],
 )
 def test_masks_that_ignore_nearly_everything(tmp_path: Path, mask: np.ndarray, line: str) -> None:
     capture = capture_with(tmp_path, mask)
@@ -126,26 +155,41 @@ def test_what_cannot_be_read_is_left_to_others(tmp_path: Path) -> None:
 
 
 def test_the_report_says_which_value_counts(tmp_path: Path) -> None:
-    assert "5 of 6 images; white counts, black is ignored: 25% of the pixels in 4 that were read" in format_report(
-        report_on(capture_with(tmp_path, mask_of(6)))
+    assert (
+        "5 of 6 images; white counts, black is ignored: 25% of the pixels in 4 that were read"
+        in format_report(report_on(capture_with(tmp_path, mask_of(6))))
     )
 
 
-@pytest.mark.parametrize("sides", [(), (0,), (90,), (180,), (270,), (350, 10), (80, 100), (0, 170), (0, 120, 240)])
+@pytest.mark.parametrize(
+    "sides", [(), (0,), (90,), (180,), (270,), (350, 10), (80, 100), (0, 170), (0, 120, 240)]
+)
 @pytest.mark.parametrize("turns", [None, 140.0])
-def test_sides_of_a_person_that_no_camera_sees(tmp_path: Path, sides: tuple[float, ...], turns: float | None) -> None:
-    # One frame per camera; the person leans, is turned to the world, and the camera stands at an angle to the body.
-    view, poses, trans, views = clip(3, 1).splits["train"][0], [], [], []
+def test_sides_of_a_person_that_no_camera_sees(
+    tmp_path: Path, sides: tuple[float, ...], turns: float | None
+) -> None:
+    # One frame per camera; the person leans, is turned to the world, and the camera stands at an
+    # angle to the body.
+    view = clip(3, 1).splits["train"][0]
+    poses = []
+    trans = []
+    views = []
     for row, side in enumerate(sides):
         heading = 77.0 * row
-        turned = Rotation.from_euler("Y", heading, degrees=True) * Rotation.from_euler("X", 8, degrees=True)
+        turned = Rotation.from_euler("Y", heading, degrees=True) * Rotation.from_euler(
+            "X", 8, degrees=True
+        )
         place = np.array([5.0, 1.0, row])
         around = np.radians(side)
         centre = place + turned.apply([3 * np.sin(around), 0.4, 3 * np.cos(around)])
         pose = np.eye(4)
         pose[:3, 3] = -centre  # where it looks does not matter here
         views.append(replace(view, cam_from_world=pose, frame=row))
-        given = turned if turns is None else Rotation.from_rotvec([0, np.radians(turns), 0]).inv() * turned
+        given = (
+            turned
+            if turns is None
+            else Rotation.from_rotvec([0, np.radians(turns), 0]).inv() * turned
+        )
         poses.append(np.concatenate([given.as_rotvec(), np.zeros(69)]))
         trans.append(place)
     if not sides:
@@ -153,7 +197,9 @@ def test_sides_of_a_person_that_no_camera_sees(tmp_path: Path, sides: tuple[floa
         return
     whole = None if turns is None else np.tile([0, np.radians(turns), 0], (len(sides), 1))
     body = body_frames(tmp_path, range(len(sides)), poses, trans, np.zeros(10), turns=whole)
-    capture = Capture(root=tmp_path, format="x", splits={"train": tuple(views)}, body=of_one_clip(body))
+    capture = Capture(
+        root=tmp_path, format="x", splits={"train": tuple(views)}, body=of_one_clip(body)
+    )
     found = body_problems(capture)
     unseen = {(0,): "back", (90,): "right side", (180,): "front", (270,): "left side"}
     unseen |= {(350, 10): "back", (80, 100): "right side"}

@@ -30,7 +30,9 @@ def _capture(root: Path, count: int = 6) -> Capture:
         k = np.array([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]])
         views.append(View(f"{i}", path, cam_from_opengl(pose), k, 32, 24))
     rng = np.random.default_rng(0)
-    points = PointCloud(rng.normal(size=(200, 3)) * 0.3, rng.integers(0, 256, (200, 3), dtype=np.uint8))
+    points = PointCloud(
+        rng.normal(size=(200, 3)) * 0.3, rng.integers(0, 256, (200, 3), dtype=np.uint8)
+    )
     return Capture(root, "blender", {"train": tuple(views[1:]), "test": tuple(views[:1])}, points)
 
 
@@ -48,7 +50,9 @@ def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
 
 
 def test_the_demo_capture_is_quiet(tmp_path: Path) -> None:
-    root = write_still_capture(tmp_path / "demo", StillOptions(size=16, num_train=4, num_test=2, samples=1))
+    root = write_still_capture(
+        tmp_path / "demo", StillOptions(size=16, num_train=4, num_test=2, samples=1)
+    )
     for source in (root, DataConfig(root=root)):  # type: ignore[call-arg]
         report = inspect_capture(source)
         assert not report.problems, report.problems
@@ -66,7 +70,10 @@ def test_the_demo_capture_is_quiet(tmp_path: Path) -> None:
         ({"cam_from_world": np.full((4, 4), np.nan)}, "NaN"),
         ({"intrinsics": np.diag([-40.0, 40.0, 1.0])}, "not a positive"),
         ({"intrinsics": np.array([[40.0, 0, 99], [0, 40, 12], [0, 0, 1]])}, "outside the 32x24"),
-        ({"intrinsics": np.array([[40.0, 0, 16], [0, 80, 12], [0, 0, 1]])}, "differ by more than 10%"),
+        (
+            {"intrinsics": np.array([[40.0, 0, 16], [0, 80, 12], [0, 0, 1]])},
+            "differ by more than 10%",
+        ),
         ({"intrinsics": np.array([[4e4, 0, 16], [0, 4e4, 12], [0, 0, 1]])}, "does not suit"),
         ({"time": 0.5}, "5 of 6 views have no time"),
         ({"time": 2.0}, "outside [0, 1]"),
@@ -86,7 +93,8 @@ def test_damaged_images_and_masks(tmp_path: Path) -> None:
     cut = tmp_path / "4.png"
     write_image(cut, np.random.default_rng(0).uniform(size=(24, 32, 3)))
     cut.write_bytes(cut.read_bytes()[:500])
-    shallow, deep = report_on(capture).problems, report_on(capture, deep=True).problems
+    shallow = report_on(capture).problems
+    deep = report_on(capture, deep=True).problems
     assert any("mask.png has 5x5" in line for line in shallow)
     assert any("3.png" in line for line in shallow)
     assert not any("4.png" in line for line in shallow)
@@ -111,7 +119,8 @@ def test_scene_faults(tmp_path: Path) -> None:
         assert any("look away" in line for line in problems), problems
     assert good.points is not None
     xyz = good.points.xyz.copy()
-    xyz[0], xyz[1] = 1e5, np.nan
+    xyz[0] = 1e5
+    xyz[1] = np.nan
     problems = report_on(good.replace(points=PointCloud(xyz, good.points.rgb))).problems
     assert any("1 of 200 points hold NaN" in line for line in problems)
     assert any("1 of 199 points lie more than 50 times" in line for line in problems)
@@ -129,7 +138,9 @@ def test_many_faults_of_a_kind_are_counted(tmp_path: Path) -> None:
 
 
 def test_what_the_reader_refuses_is_reported_with_the_rest(tmp_path: Path) -> None:
-    root = write_still_capture(tmp_path / "demo", StillOptions(size=8, num_train=4, num_test=2, samples=1))
+    root = write_still_capture(
+        tmp_path / "demo", StillOptions(size=8, num_train=4, num_test=2, samples=1)
+    )
     file = root / "transforms_train.json"
     document = json.loads(file.read_text())
     document["frames"][0]["transform_matrix"][0][0] = float("nan")
@@ -160,7 +171,11 @@ def _sequence(root: Path, cameras: int, times: int) -> Capture:
     seen = [
         [
             replace(
-                view, name=f"c{i}/{time}", image_path=root / f"c{i}_{time}.png", time=time / (times - 1), camera_id=i
+                view,
+                name=f"c{i}/{time}",
+                image_path=root / f"c{i}_{time}.png",
+                time=time / (times - 1),
+                camera_id=i,
             )
             for time in range(times)
         ]
@@ -189,7 +204,10 @@ def test_one_camera_at_rest_cannot_show_a_moving_scene(tmp_path: Path) -> None:
     assert [line for line in report.problems if "cannot be reconstructed" in line]
     assert not any("at one place" in line for line in report.problems), "said already"
     assert not any("cannot be" in line for line in report_on(_sequence(tmp_path, 3, 5)).problems)
-    moved = _with_view(_sequence(tmp_path, 1, 5), cam_from_world=_capture(tmp_path).splits["train"][2].cam_from_world)
+    moved = _with_view(
+        _sequence(tmp_path, 1, 5),
+        cam_from_world=_capture(tmp_path).splits["train"][2].cam_from_world,
+    )
     assert not any("cannot be reconstructed" in line for line in report_on(moved).problems)
 
 
@@ -201,7 +219,10 @@ def test_videos_are_not_decoded_to_be_inspected(tmp_path: Path) -> None:
     report = inspect_capture(tmp_path)
     assert not report.problems, report.problems
     facts = dict(report.facts)
-    assert (facts["frame rate"], facts["sequence"]) == ("25 per second", "4 cameras x 3 times, 12 images")
+    assert (facts["frame rate"], facts["sequence"]) == (
+        "25 per second",
+        "4 cameras x 3 times, 12 images",
+    )
     assert facts["video frames"] == "0 of 12 are decoded already"
     assert sorted(tmp_path.iterdir()) == before
     edit_json(tmp_path / "cameras.json", lambda content: content.update(fps=24))
@@ -216,7 +237,8 @@ def test_the_rate_in_a_transforms_file(blender_root: Path) -> None:
         edit_json(
             blender_root / f"transforms_{split}.json",
             lambda content: content.update(
-                fps=15, frames=[{**frame, "time": i / 16} for i, frame in enumerate(content["frames"])]
+                fps=15,
+                frames=[{**frame, "time": i / 16} for i, frame in enumerate(content["frames"])],
             ),
         )
     facts = dict(inspect_capture(blender_root).facts)
@@ -227,7 +249,9 @@ def test_the_rate_in_a_transforms_file(blender_root: Path) -> None:
 def test_drawing_shows_cameras_and_points(tmp_path: Path) -> None:
     capture = _capture(tmp_path)
     draw_cameras(capture, tmp_path / "cameras.png", size=100)
-    pixels = np.asarray(oiio.ImageBuf(str(tmp_path / "cameras.png")).get_pixels(oiio.UINT8)).astype(int)
+    pixels = np.asarray(oiio.ImageBuf(str(tmp_path / "cameras.png")).get_pixels(oiio.UINT8)).astype(
+        int
+    )
     assert pixels.shape == (100, 200, 3)
     for panel in (pixels[:, :100], pixels[:, 100:]):
         orange = (panel[..., 0] > 150) & (panel[..., 2] < 120) & (panel[..., 1] > 80)
@@ -250,7 +274,9 @@ def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
     (root / "notes").symlink_to(tmp_path)
     report = inspect_capture(root)
     assert report.capture is not None
-    assert report.problems == (f"{root / 'notes'}: a link that leads out of the capture, to {tmp_path.resolve()}",)
+    assert report.problems == (
+        f"{root / 'notes'}: a link that leads out of the capture, to {tmp_path.resolve()}",
+    )
     image = next((root / "train").iterdir())
     image.rename(tmp_path / "own.png")
     image.symlink_to(tmp_path / "own.png")
@@ -278,7 +304,9 @@ def test_large_images_are_reported_by_a_deep_look(tmp_path: Path) -> None:
         ((None, 1), "of 6"),
     ],
 )
-def test_exposures_of_the_tags_are_a_fact(tmp_path: Path, light: tuple[float | None, ...], said: str | None) -> None:
+def test_exposures_of_the_tags_are_a_fact(
+    tmp_path: Path, light: tuple[float | None, ...], said: str | None
+) -> None:
     capture = _capture(tmp_path)
     views = [replace(view, exposure=light[i % 2]) for i, view in enumerate(capture.splits["train"])]
     facts = dict(report_on(capture.replace(splits={**capture.splits, "train": tuple(views)})).facts)

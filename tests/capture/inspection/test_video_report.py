@@ -31,7 +31,9 @@ def test_a_camera_that_moves(tmp_path: Path) -> None:
     assert facts["sound"] == "none"
     assert "1 blurred frame" in facts["sharpness"]
     assert "moves" in facts["camera"]
-    assert f"dyngs train static data.root={tmp_path / 'walk.mp4'}" in video_report(tmp_path / "walk.mp4")
+    assert f"dyngs train static data.root={tmp_path / 'walk.mp4'}" in video_report(
+        tmp_path / "walk.mp4"
+    )
 
 
 def test_conversion_of_colours(tmp_path: Path) -> None:
@@ -40,14 +42,19 @@ def test_conversion_of_colours(tmp_path: Path) -> None:
     assert "colours" not in dict(video_facts(_turning(tmp_path / "walk.mp4")).facts)
 
 
-def test_a_camera_that_stands_and_a_folder_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_that_stands_and_a_folder_of_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_videos(tmp_path / "rig", {"a": 40.0, "b": 50.0}, {"a": 0.0, "b": 0.0}, 10.0, 8)
     found = video_facts(tmp_path / "rig" / "a.mp4")
     assert found.stands
     assert "shows no depth" in video_report(tmp_path / "rig" / "a.mp4")
     assert main(["data", "inspect", str(tmp_path / "rig")]) == 0
     shown = capsys.readouterr().out
-    assert "2 fixed cameras, 10 frames per second; offsets between them: found by sound or motion" in shown
+    assert (
+        "2 fixed cameras, 10 frames per second; offsets between them: found by sound or motion"
+        in shown
+    )
     assert f"next: dyngs train dynamic data.root={tmp_path / 'rig'}" in shown
 
 

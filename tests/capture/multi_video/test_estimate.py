@@ -35,13 +35,16 @@ def capture_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_offsets_are_written(capture_root: Path) -> None:
     found = json.loads((capture_root / "videos.json").read_text())["starts"]
-    assert {name: start - found["middle"] for name, start in found.items()} == pytest.approx(STARTS, abs=1e-5)
+    assert {name: start - found["middle"] for name, start in found.items()} == pytest.approx(
+        STARTS, abs=1e-5
+    )
 
 
 def test_silent_videos_without_offsets_are_refused(tmp_path: Path) -> None:
     write_videos(tmp_path / "rig", {"a": 40.0, "b": 50.0}, {"a": 0.0, "b": 0.2}, 10.0, 6)
     with pytest.raises(
-        DyngsError, match=r'there is no sound; give the second .* in videos\.json beside them, {"starts"'
+        DyngsError,
+        match=r'there is no sound; give the second .* in videos\.json beside them, {"starts"',
     ):
         poses_of_videos(tmp_path / "rig", tmp_path / "out", SfmOptions(num_threads=1))
     assert not (tmp_path / "out").exists()
@@ -52,7 +55,9 @@ def test_cameras_stand_where_they_did(capture_root: Path) -> None:
     poses = {view.name.split("/")[0]: view.cam_from_world for view in all_views(capture.splits)}
     names = list(AZIMUTHS)
     for name in names[1:]:
-        expected = camera(AZIMUTHS[name], 0.9 + 0.15 * (names.index(name) % 2)) @ np.linalg.inv(camera(32.0, 0.9))
+        expected = camera(AZIMUTHS[name], 0.9 + 0.15 * (names.index(name) % 2)) @ np.linalg.inv(
+            camera(32.0, 0.9)
+        )
         turned = poses[name] @ np.linalg.inv(poses["left"])
         cosine = (np.trace(expected[:3, :3] @ turned[:3, :3].T) - 1) / 2
         assert np.degrees(np.arccos(np.clip(cosine, -1, 1))) < 1.5, name

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dyngs.capture.multi_video.films import STANDS, VIDEOS_FILE, displaced_by, displacement, read_given
+from dyngs.capture.multi_video.films import (
+    STANDS,
+    VIDEOS_FILE,
+    displaced_by,
+    displacement,
+    read_given,
+)
 from dyngs.errors import DyngsError
 
 NAMES = ["left", "right"]
@@ -83,7 +89,9 @@ def test_a_camera_that_turns_does_not_stand(step: float) -> None:
 
 def test_a_displacement_is_measured() -> None:
     scenery = _scenery()
-    assert displacement(_shown(30, scenery), _shown(31.3, scenery)) == pytest.approx(1.3 / 160, abs=2e-4)
+    assert displacement(_shown(30, scenery), _shown(31.3, scenery)) == pytest.approx(
+        1.3 / 160, abs=2e-4
+    )
     assert np.isinf(displacement(_shown(0, scenery), _shown(200, scenery)))
 
 

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from dyngs.capture.multi_video.films import open_film
-from dyngs.capture.multi_video.starts import RATE, Correlation, align, correlate, found_starts, onsets, peak_place
+from dyngs.capture.multi_video.starts import (
+    RATE,
+    Correlation,
+    align,
+    correlate,
+    found_starts,
+    onsets,
+    peak_place,
+)
 
 HERTZ = 16000
 
@@ -21,7 +29,9 @@ def _clatter(seconds: float) -> np.ndarray:
     sound = 0.003 * rng.normal(size=int(seconds * HERTZ))
     for begin in rng.uniform(0, seconds - 0.3, int(6 * seconds)):
         at = np.arange(int(0.2 * HERTZ))
-        tone = np.sin(2 * np.pi * rng.uniform(100, 3000) * at / HERTZ) * np.exp(-at / (0.03 * HERTZ))
+        tone = np.sin(2 * np.pi * rng.uniform(100, 3000) * at / HERTZ) * np.exp(
+            -at / (0.03 * HERTZ)
+        )
         sound[int(begin * HERTZ) :][: len(at)] += 0.3 * tone
     return sound
 
@@ -32,14 +42,18 @@ def _write(path: Path, sound: np.ndarray | None, count: int = 40) -> Path:
         image = container.add_stream("libx264", rate=10)
         image.width = image.height = 32
         image.pix_fmt = "yuv420p"
-        audio = container.add_stream("aac", rate=HERTZ, layout="mono") if sound is not None else None
+        audio = (
+            container.add_stream("aac", rate=HERTZ, layout="mono") if sound is not None else None
+        )
         for _ in range(count):
             frame = av.VideoFrame.from_ndarray(np.full((32, 32, 3), 90, np.uint8), format="rgb24")
             container.mux(image.encode(frame))
         container.mux(image.encode(None))
         if audio is not None and sound is not None:
             for begin in range(0, len(sound), 1024):
-                block = av.AudioFrame.from_ndarray(sound[None, begin : begin + 1024].astype(np.float32), "fltp", "mono")
+                block = av.AudioFrame.from_ndarray(
+                    sound[None, begin : begin + 1024].astype(np.float32), "fltp", "mono"
+                )
                 block.sample_rate, block.pts = HERTZ, begin
                 container.mux(audio.encode(block))
             container.mux(audio.encode(None))
@@ -51,7 +65,10 @@ def test_offsets_of_recordings_with_noise_of_their_own(tmp_path: Path) -> None:
     clatter = _clatter(6.0)
     starts = [0.0, 1.23, 0.4]
     parts = [clatter[int(start * HERTZ) :][: 4 * HERTZ] for start in starts]
-    noisy = [gain * part + 0.01 * rng.normal(size=len(part)) for gain, part in zip((1.0, 0.3, 0.6), parts, strict=True)]
+    noisy = [
+        gain * part + 0.01 * rng.normal(size=len(part))
+        for gain, part in zip((1.0, 0.3, 0.6), parts, strict=True)
+    ]
     films = [open_film(_write(tmp_path / f"{i}.mp4", sound)) for i, sound in enumerate(noisy)]
     seconds, line = found_starts(films)
     assert list(seconds.values()) == pytest.approx(starts, abs=0.015)
@@ -65,7 +82,9 @@ def test_without_sound_there_is_none(tmp_path: Path) -> None:
 
 def test_different_sounds_are_not_certain(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
-    both = [onsets(_write(tmp_path / f"{i}.mp4", 0.1 * rng.normal(size=4 * HERTZ))) for i in range(2)]
+    both = [
+        onsets(_write(tmp_path / f"{i}.mp4", 0.1 * rng.normal(size=4 * HERTZ))) for i in range(2)
+    ]
     assert both[0] is not None
     assert both[1] is not None
     assert len(both[0]) == pytest.approx(4 * RATE, abs=12)
@@ -76,7 +95,9 @@ def test_different_sounds_are_not_certain(tmp_path: Path) -> None:
 
 def _smooth_noise(rng: np.random.Generator, length: int, bins: int = 6) -> np.ndarray:
     kernel = np.exp(-0.5 * (np.arange(-9, 10) / 3.0) ** 2)
-    return np.stack([np.convolve(rng.normal(size=length), kernel, "same") for _ in range(bins)], axis=1)
+    return np.stack(
+        [np.convolve(rng.normal(size=length), kernel, "same") for _ in range(bins)], axis=1
+    )
 
 
 def _shown(signal: np.ndarray, begin: float, length: int) -> np.ndarray:

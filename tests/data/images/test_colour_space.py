@@ -11,7 +11,9 @@ PQ, HLG, DISPLAY_P3, BT709 = 16, 18, 12, 1
 
 
 def grey_level(signal: float, transfer: int) -> int:
-    levels = to_srgb(np.full((1, 1, 3), round(65535 * signal), np.uint16), ColourTags(transfer=transfer))
+    levels = to_srgb(
+        np.full((1, 1, 3), round(65535 * signal), np.uint16), ColourTags(transfer=transfer)
+    )
     assert np.ptp(levels) <= 1, "grey stays grey in other primaries"
     return int(levels[0, 0, 1])
 
@@ -19,8 +21,8 @@ def grey_level(signal: float, transfer: int) -> int:
 @pytest.mark.parametrize(
     ("transfer", "signal", "light"),
     [
-        # BT.2100: the square root of HLG ends at half the signal, which is a twelfth of the light; BT.2408: 75 % is
-        # diffuse white, and 38 % is a grey card of 18 %.
+        # BT.2100: the square root of HLG ends at half the signal, which is a twelfth of the light;
+        # BT.2408: 75 % is diffuse white, and 38 % is a grey card of 18 %.
         (HLG, 0.0, 0.0),
         (HLG, 0.5, 1 / 12 / 0.265),
         (HLG, 0.75, 1.0),
@@ -65,5 +67,8 @@ def test_missing_tags_are_filled_and_present_ones_kept() -> None:
 def test_what_is_done_is_said() -> None:
     assert "HLG is tone-mapped" in ColourTags(BT2020, HLG).conversion
     assert "PQ is tone-mapped to SDR (white: 203 cd/m2" in ColourTags(transfer=PQ).conversion
-    assert ColourTags(DISPLAY_P3, BT709).conversion == "colours are converted from Display P3 to BT.709"
+    assert (
+        ColourTags(DISPLAY_P3, BT709).conversion
+        == "colours are converted from Display P3 to BT.709"
+    )
     assert ColourTags(BT709, BT709, BT709).conversion == ""

@@ -14,13 +14,19 @@ def channels(layer: str, names: str = "RGBA") -> list[str]:
 @pytest.mark.parametrize(
     ("parts", "name"),
     [
-        ([("", channels("N") + channels("ViewLayer.Combined") + ["ViewLayer.Depth.Z"])], "ViewLayer.Combined"),
+        (
+            [("", channels("N") + channels("ViewLayer.Combined") + ["ViewLayer.Depth.Z"])],
+            "ViewLayer.Combined",
+        ),
         ([("", channels("albedo") + channels("") + ["Z"])], ""),
         ([("", channels("diffuse", "RGB") + channels("BEAUTY", "rgb"))], "BEAUTY"),
         ([("N", channels("", "RGB")), ("C", channels(""))], "C"),
         ([("first", channels("depth", "Z")), ("second", channels("beauty"))], "beauty"),
         ([("", ["n.red", "n.green", "n.blue", "rgba.red", "rgba.green", "rgba.blue"])], "rgba"),
-        ([("", channels("RenderLayer.Combined") + channels("Composite.Combined"))], "Composite.Combined"),
+        (
+            [("", channels("RenderLayer.Combined") + channels("Composite.Combined"))],
+            "Composite.Combined",
+        ),
         ([("", channels("beauty", "Y") + channels("N", "RGB"))], "beauty"),
     ],
 )
@@ -29,7 +35,10 @@ def test_the_image_itself(parts: list[tuple[str, list[str]]], name: str) -> None
     assert layer is not None
     assert layer.name == name
     names = parts[layer.part][1]
-    assert [names[index].rpartition(".")[2][0].upper() for index in layer.colours] in (["R", "G", "B"], ["Y"])
+    assert [names[index].rpartition(".")[2][0].upper() for index in layer.colours] in (
+        ["R", "G", "B"],
+        ["Y"],
+    )
 
 
 @pytest.mark.parametrize(

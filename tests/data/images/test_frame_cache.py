@@ -1,4 +1,5 @@
-"""Frames of videos in the user's cache: those asked for, once, within the limit; nothing else is ever removed."""
+"""Frames of videos in the user's cache: those asked for, once, within the limit; nothing else is
+ever removed."""
 
 from __future__ import annotations
 
@@ -58,7 +59,12 @@ def forget() -> None:
 
 def test_planning_writes_nothing(root: Path) -> None:
     frames = planned_frames(root / "cam00.mp4")
-    assert (frames.info.width, frames.info.height, frames.info.num_frames, frames.info.fps) == (16, 12, 6, 30.0)
+    assert (frames.info.width, frames.info.height, frames.info.num_frames, frames.info.fps) == (
+        16,
+        12,
+        6,
+        30.0,
+    )
     assert len(set(frames.paths)) == 6
     assert all(cache_folder("frames") in path.parents for path in frames.paths)
     assert [path.name for path in root.iterdir()] == ["cam00.mp4"]
@@ -76,15 +82,21 @@ def test_only_wanted_frames_are_written_and_none_to_the_capture(root: Path) -> N
         assert np.abs(pixels - level_of(frame.number)).max() <= 6
 
 
-def test_frames_are_found_again_also_of_a_copy(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_found_again_also_of_a_copy(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     frames = plan(root / "cam00.mp4")
     decode_frames(root, some(frames, 0, 1, 2), 10)
     asked = []
     real = frame_cache.read_numbered_frames
     monkeypatch.setattr(
-        frame_cache, "read_numbered_frames", lambda path, numbers: asked.append(list(numbers)) or real(path, numbers)
+        frame_cache,
+        "read_numbered_frames",
+        lambda path, numbers: asked.append(list(numbers)) or real(path, numbers),
     )
-    monkeypatch.setattr(frame_cache, "probe_video", lambda path: pytest.fail("what it says is stored"))
+    monkeypatch.setattr(
+        frame_cache, "probe_video", lambda path: pytest.fail("what it says is stored")
+    )
     shutil.copytree(root, tmp_path / "copy")
     copied = plan(tmp_path / "copy" / "cam00.mp4")
     assert list(copied) == list(frames)
@@ -95,7 +107,8 @@ def test_frames_are_found_again_also_of_a_copy(root: Path, tmp_path: Path, monke
 
 
 def test_another_video_under_the_same_name(root: Path) -> None:
-    """Neither its size nor its frames are mixed up with the former one's, even if size and time are the same."""
+    """Neither its size nor its frames are mixed up with the former one's, even if size and time are
+    the same."""
     video = root / "cam00.mp4"
     before = planned_frames(video)
     decode_frames(root, plan(video), 10)
@@ -113,7 +126,9 @@ def test_another_video_under_the_same_name(root: Path) -> None:
     assert read_image(frames.paths[0]).shape == (16, 32, 3)
 
 
-def test_huge_videos_are_told_apart_by_samples_and_time(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_huge_videos_are_told_apart_by_samples_and_time(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(frame_cache, "WHOLE_BYTES", 10)
     video = root / "cam00.mp4"
     first = planned_frames(video).paths
@@ -124,14 +139,18 @@ def test_huge_videos_are_told_apart_by_samples_and_time(root: Path, monkeypatch:
 
 def test_cameras_that_saw_the_same_have_frames_of_their_own(root: Path) -> None:
     shutil.copy(root / "cam00.mp4", root / "cam01.mp4")
-    assert not set(planned_frames(root / "cam00.mp4").paths) & set(planned_frames(root / "cam01.mp4").paths)
+    assert not set(planned_frames(root / "cam00.mp4").paths) & set(
+        planned_frames(root / "cam01.mp4").paths
+    )
 
 
 def test_the_limit_is_refused_at_once(root: Path) -> None:
     frames = plan(root / "cam00.mp4")
     decode_frames(root, some(frames, 0), 10)
     one_mb = next(iter(frames)).stat().st_size / 1e6
-    with pytest.raises(DyngsError, match=r"need about .* MB on disk, of which .* MB are there.*raise"):
+    with pytest.raises(
+        DyngsError, match=r"need about .* MB on disk, of which .* MB are there.*raise"
+    ):
         decode_frames(root, frames, 3 * one_mb)
     assert len(cached()) <= 2, "the estimate is made from the first frame"
     decode_frames(root, frames, 20 * one_mb)
@@ -151,12 +170,17 @@ def test_what_was_not_used_for_longest_makes_room(root: Path) -> None:
     forget()
     size_mb = sum(path.stat().st_size for path in cached()) / 2e6
     decode_frames(root, new, 2.5 * size_mb)
-    assert [any(path.exists() for path in frames) for frames in (old, used, new)] == [False, True, True]
+    assert [any(path.exists() for path in frames) for frames in (old, used, new)] == [
+        False,
+        True,
+        True,
+    ]
     assert not next(iter(old)).parent.exists()
 
 
 def test_frames_that_another_process_reads_stay(root: Path) -> None:
-    """A lock is one of an open file: what was locked here, and is no longer known, is as locked by another process."""
+    """A lock is one of an open file: what was locked here, and is no longer known, is as locked by
+    another process."""
     shutil.copy(root / "cam00.mp4", root / "cam01.mp4")
     decode_frames(root, plan(root / "cam00.mp4"), 10)
     held = [*frame_cache._locked.values()]
@@ -172,7 +196,8 @@ def test_frames_that_another_process_reads_stay(root: Path) -> None:
 
 
 def test_nothing_but_our_own_is_removed_from_the_cache(root: Path, tmp_path: Path) -> None:
-    """Not folders without our mark, not what a link leads to, not files of others in a folder of ours."""
+    """Not folders without our mark, not what a link leads to, not files of others in a folder of
+    ours."""
     decode_frames(root, plan(root / "cam00.mp4"), 10)
     ours = next(iter(plan(root / "cam00.mp4"))).parent
     (ours / "letter.txt").write_text("dear")
@@ -194,7 +219,8 @@ def test_nothing_but_our_own_is_removed_from_the_cache(root: Path, tmp_path: Pat
 
 
 def test_a_foreign_capture_cannot_have_folders_removed(tmp_path: Path) -> None:
-    """An image named like a frame in our old cache, and that cache a link to the folder above (folders vanished)."""
+    """An image named like a frame in our old cache, and that cache a link to the folder above
+    (folders vanished)."""
     root = tmp_path / "Downloads" / "capture"
     documents = tmp_path / "Downloads" / "z"
     documents.mkdir(parents=True)
@@ -217,7 +243,9 @@ def test_frames_that_an_older_version_left_in_the_capture_are_left_alone(root: P
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
     capture = read_capture(DataConfig(root=root, test_every=0))  # type: ignore[call-arg]
     assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
-    assert all(cache_folder("frames") in view.image_path.parents for view in capture.splits["train"])
+    assert all(
+        cache_folder("frames") in view.image_path.parents for view in capture.splits["train"]
+    )
 
 
 def test_a_full_disk_is_refused_at_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,7 +270,10 @@ def test_a_cache_that_cannot_be_written_is_one_line(
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path / "file"))
-    with pytest.raises(DyngsError, match=r"frames of a video cannot be kept there .*; set DYNGS_CACHE_DIR to a folder"):
+    with pytest.raises(
+        DyngsError,
+        match=r"frames of a video cannot be kept there .*; set DYNGS_CACHE_DIR to a folder",
+    ):
         decode_frames(root, plan(root / "cam00.mp4"), 10)
 
 

@@ -46,13 +46,17 @@ def test_8_bit_png_comes_out_bit_for_bit(tmp_path: Path, channels: int) -> None:
 def test_grey_becomes_rgb(tmp_path: Path) -> None:
     pixels = random_pixels(5, 7, 1)
     write_image(tmp_path / "a.png", pixels)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png").numpy(), np.repeat(pixels, 3, axis=2))
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "a.png").numpy(), np.repeat(pixels, 3, axis=2)
+    )
 
 
 def test_16_bit_is_rounded(tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 65536, (9, 9, 3), dtype=np.uint16)
     write_image(tmp_path / "a.png", pixels)
-    np.testing.assert_allclose(read_image(tmp_path / "a.png").numpy(), pixels / 257.0, atol=0.5 + 1e-6)
+    np.testing.assert_allclose(
+        read_image(tmp_path / "a.png").numpy(), pixels / 257.0, atol=0.5 + 1e-6
+    )
 
 
 def test_jpeg_is_close(tmp_path: Path) -> None:
@@ -76,16 +80,25 @@ def test_exr_alpha_is_premultiplied(tmp_path: Path) -> None:
     assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [255, 255, 255, 128]
 
 
-@pytest.mark.parametrize(("name", "channels", "alpha"), [("a.png", 4, True), ("a.png", 3, False), ("a.jpg", 3, False)])
+@pytest.mark.parametrize(
+    ("name", "channels", "alpha"), [("a.png", 4, True), ("a.png", 3, False), ("a.jpg", 3, False)]
+)
 def test_header(tmp_path: Path, name: str, channels: int, alpha: bool) -> None:
     write_image(tmp_path / name, random_pixels(5, 7, channels))
     header = read_header(tmp_path / name)
-    assert (header.width, header.height, header.channels, header.has_alpha) == (7, 5, channels, alpha)
+    assert (header.width, header.height, header.channels, header.has_alpha) == (
+        7,
+        5,
+        channels,
+        alpha,
+    )
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
 @pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9])
-def test_truncated_image_is_named_by_check_and_by_read(tmp_path: Path, name: str, kept: float) -> None:
+def test_truncated_image_is_named_by_check_and_by_read(
+    tmp_path: Path, name: str, kept: float
+) -> None:
     path = tmp_path / name
     write_image(path, random_pixels(64, 64, 3))
     check_image(path)
@@ -99,8 +112,12 @@ def test_truncated_image_is_named_by_check_and_by_read(tmp_path: Path, name: str
 
 
 @pytest.mark.parametrize("kept", [0.5, 1.0])
-@pytest.mark.parametrize(("content", "name"), [("jpg", "a.png"), ("png", "a.jpg"), ("webp", "a.jpg"), ("tif", "a.png")])
-def test_files_are_read_and_checked_by_content(tmp_path: Path, content: str, name: str, kept: float) -> None:
+@pytest.mark.parametrize(
+    ("content", "name"), [("jpg", "a.png"), ("png", "a.jpg"), ("webp", "a.jpg"), ("tif", "a.png")]
+)
+def test_files_are_read_and_checked_by_content(
+    tmp_path: Path, content: str, name: str, kept: float
+) -> None:
     pixels = np.full((40, 50, 3), (200, 90, 30), np.uint8)
     write_image(tmp_path / f"b.{content}", pixels)
     data = (tmp_path / f"b.{content}").read_bytes()
@@ -115,9 +132,12 @@ def test_files_are_read_and_checked_by_content(tmp_path: Path, content: str, nam
 
 
 def write_exr(
-    path: Path, parts: Sequence[tuple[str, dict[str, float]]], window: tuple[int, int, int, int] = (0, 0, 4, 3)
+    path: Path,
+    parts: Sequence[tuple[str, dict[str, float]]],
+    window: tuple[int, int, int, int] = (0, 0, 4, 3),
 ) -> None:
-    """An EXR of parts (name, channels with their value), data in ``window`` (x, y, width, height) of 4x3 pixels."""
+    """An EXR of parts (name, channels with their value), data in ``window`` (x, y, width, height)
+    of 4x3 pixels."""
     specs = []
     for name, channels in parts:
         spec = oiio.ImageSpec(window[2], window[3], len(channels), "half")
@@ -157,21 +177,37 @@ def test_the_beauty_pass_of_several_layers_is_found_by_name(tmp_path: Path, pref
     others = {"A.R": 0.1, "A.G": 0.1, "A.B": 0.1, "N.X": 0.2, "N.Y": 0.2, "N.Z": 0.2, "Z": 3.0}
     own = {f"{prefix}{channel}": 0.5 * value for channel, value in {**RGB, "A": 1.0}.items()}
     write_exr(path, [("", {**others, **own})])
-    assert read_image(path)[1, 1].tolist() == [*SHOWN, 128], "colours are multiplied by the layer's own alpha"
+    assert read_image(path)[1, 1].tolist() == [*SHOWN, 128], (
+        "colours are multiplied by the layer's own alpha"
+    )
 
 
 @pytest.mark.parametrize(
     "parts",
     [
         [("N", OTHER), ("albedo", RGB)],
-        [("", {"A.Combined.R": 1.0, "A.Combined.G": 1.0, "A.Combined.B": 1.0, "B.Combined.Y": 0.2})],
+        [
+            (
+                "",
+                {
+                    "A.Combined.R": 1.0,
+                    "A.Combined.G": 1.0,
+                    "A.Combined.B": 1.0,
+                    "B.Combined.Y": 0.2,
+                },
+            )
+        ],
     ],
 )
-def test_layers_that_are_not_clear_are_listed(tmp_path: Path, parts: list[tuple[str, dict[str, float]]]) -> None:
+def test_layers_that_are_not_clear_are_listed(
+    tmp_path: Path, parts: list[tuple[str, dict[str, float]]]
+) -> None:
     path = tmp_path / "a.exr"
     write_exr(path, parts)
     names = [name for name, _ in parts if name] or ["A.Combined", "B.Combined"]
-    with pytest.raises(DyngsError, match=rf"a\.exr: which layer .*The file has .*{names[0]} .*{names[1]} \("):
+    with pytest.raises(
+        DyngsError, match=rf"a\.exr: which layer .*The file has .*{names[0]} .*{names[1]} \("
+    ):
         read_image(path)
 
 
@@ -183,7 +219,9 @@ def test_layers_that_are_not_clear_are_listed(tmp_path: Path, parts: list[tuple[
         ({"Odd.R": 1.0, "Odd.G": 0.5, "Odd.B": 0.0}, SHOWN),
     ],
 )
-def test_an_exr_with_one_layer_of_any_name(tmp_path: Path, channels: dict[str, float], shown: list[int]) -> None:
+def test_an_exr_with_one_layer_of_any_name(
+    tmp_path: Path, channels: dict[str, float], shown: list[int]
+) -> None:
     write_exr(tmp_path / "a.exr", [("", channels)])
     assert read_image(tmp_path / "a.exr")[0, 0].tolist() == shown
 
@@ -267,9 +305,12 @@ def test_area_filter_known_answer() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.data())
-def test_area_filter_is_the_mean_over_the_covered_rectangle(height: int, width: int, data: st.DataObject) -> None:
+def test_area_filter_is_the_mean_over_the_covered_rectangle(
+    height: int, width: int, data: st.DataObject
+) -> None:
     """Against the integral image, in float64; so also the mean of the image is kept."""
-    new_height, new_width = data.draw(st.integers(1, height)), data.draw(st.integers(1, width))
+    new_height = data.draw(st.integers(1, height))
+    new_width = data.draw(st.integers(1, width))
     pixels = np.random.default_rng(height * 41 + width).random((height, width, 2))
 
     def axis_means(array: np.ndarray, size: int) -> np.ndarray:
@@ -288,9 +329,14 @@ def test_area_filter_is_the_mean_over_the_covered_rectangle(height: int, width: 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([3, 4]), st.data())
-def test_strips_give_the_same_bytes(height: int, width: int, channels: int, data: st.DataObject) -> None:
-    new_height, new_width = data.draw(st.integers(1, height)), data.draw(st.integers(1, width))
-    numbers = np.random.default_rng(height * 41 + width).integers(0, 256, (height, width, channels), dtype=np.uint8)
+def test_strips_give_the_same_bytes(
+    height: int, width: int, channels: int, data: st.DataObject
+) -> None:
+    new_height = data.draw(st.integers(1, height))
+    new_width = data.draw(st.integers(1, width))
+    numbers = np.random.default_rng(height * 41 + width).integers(
+        0, 256, (height, width, channels), dtype=np.uint8
+    )
     pixels = torch.from_numpy(numbers)
     wanted = straight_uint8(area_downscale(premultiplied(pixels), new_width, new_height))
     assert torch.equal(area_downscale_uint8(pixels, new_width, new_height), wanted)
@@ -319,7 +365,9 @@ def test_colour_of_transparent_pixels_does_not_bleed() -> None:
         ((3, 2), 100, None, (1, 1)),
     ],
 )
-def test_target_size(size: tuple[int, int], downscale: float, longest: int | None, wanted: tuple[int, int]) -> None:
+def test_target_size(
+    size: tuple[int, int], downscale: float, longest: int | None, wanted: tuple[int, int]
+) -> None:
     assert target_size(*size, downscale, longest) == wanted
 
 
@@ -328,7 +376,8 @@ def test_target_size(size: tuple[int, int], downscale: float, longest: int | Non
 
 def mutated(data: bytes, seed: int) -> bytes:
     """``data`` with some bytes changed, removed or inserted, most of them near the beginning."""
-    rng, changed = np.random.default_rng(seed), bytearray(data)
+    rng = np.random.default_rng(seed)
+    changed = bytearray(data)
     for _ in range(rng.choice([1, 2, 4, 16])):
         at = int(rng.integers(min(len(changed), rng.choice([64, 200, len(changed)]))))
         kind = rng.random()
@@ -347,7 +396,9 @@ def mutated(data: bytes, seed: int) -> bytes:
 def test_damaged_images_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str) -> None:
     """One in fifty ended in a traceback, because OpenImageIO quotes bytes that are no text."""
     pixels = random_pixels(20, 24, 3)
-    write_image(tmp_path / f"a{suffix}", pixels.astype(np.float32) / 255 if suffix == ".exr" else pixels)
+    write_image(
+        tmp_path / f"a{suffix}", pixels.astype(np.float32) / 255 if suffix == ".exr" else pixels
+    )
     data = (tmp_path / f"a{suffix}").read_bytes()
     path = tmp_path / f"m{suffix}"
     lines = []
@@ -366,15 +417,24 @@ def test_texts_that_are_not_utf_8_are_shown_with_escapes(tmp_path: Path) -> None
     path = tmp_path / "a.exr"
     write_image(path, random_pixels(4, 4, 3).astype(np.float32))
     path.write_bytes(path.read_bytes().replace(b"channels\0chlist\0", b"channels\xe4chlist\0"))
-    with pytest.raises(DyngsError, match=r"a\.exr: cannot be read as an image \(.*copy or convert it again"):
+    with pytest.raises(
+        DyngsError, match=r"a\.exr: cannot be read as an image \(.*copy or convert it again"
+    ):
         read_header(path)
 
 
 def write_empty_png(path: Path, side: int) -> None:
     """A real grey image, black throughout."""
     data = zlib.compress(bytes((1 + side // 8) * side), 6)
-    parts = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", data), (b"IEND", b"")]
-    chunks = [struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in parts]
+    parts = [
+        (b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)),
+        (b"IDAT", data),
+        (b"IEND", b""),
+    ]
+    chunks = [
+        struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d))
+        for kind, d in parts
+    ]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
 
 
@@ -387,7 +447,9 @@ def test_a_small_file_with_a_huge_image_is_refused_before_it_is_decoded(tmp_path
     assert read_header(path).width == 20_000
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for read in (read_image, read_mask, check_image):
-        with pytest.raises(DyngsError, match=r"20000x20000 .*max_megapixels is 150; shrink .*or raise"):
+        with pytest.raises(
+            DyngsError, match=r"20000x20000 .*max_megapixels is 150; shrink .*or raise"
+        ):
             read(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
 
@@ -413,7 +475,9 @@ _RNG = np.random.default_rng(0)
 UPRIGHT = _RNG.integers(0, 256, (6, 10, 3), dtype=np.uint8)
 
 
-def _photo(path: Path, orientation: int, pixels: np.ndarray, tags: Mapping[int, object] | None = None) -> Path:
+def _photo(
+    path: Path, orientation: int, pixels: np.ndarray, tags: Mapping[int, object] | None = None
+) -> Path:
     exif = Image.Exif()
     exif[0x0112] = orientation
     for key, value in (tags or {}).items():
@@ -432,7 +496,9 @@ def test_each_orientation_is_turned_as_pillow_turns_it(tmp_path: Path, orientati
     header = read_header(path)
     assert header.upright_size == shown.shape[1::-1]
     assert np.array_equal(read_image(path).numpy(), UPRIGHT), "as stored"
-    assert np.array_equal(read_image(path, (10, 6)).numpy(), UPRIGHT), "the camera has the stored shape"
+    assert np.array_equal(read_image(path, (10, 6)).numpy(), UPRIGHT), (
+        "the camera has the stored shape"
+    )
     if header.upright_size != header.size:
         assert np.array_equal(read_image(path, header.upright_size).numpy(), shown)
         assert header.size_for((30, 50)) == header.upright_size, "of another size, too"
@@ -462,7 +528,9 @@ def test_focal_length_and_exposure(tmp_path: Path) -> None:
     assert tags.exposure == pytest.approx(0.01 * 4 / 4)
     # 4 mm over 2,000 pixels an inch, of an image that was 800 px wide when it was taken
     sensor = {0x920A: IFDRational(4, 1), 0xA20E: IFDRational(25400, 10), 0xA210: 2, 0xA002: 800}
-    assert read_header(_photo(tmp_path / "b.jpg", 1, pixels, sensor)).tags.focal_px == pytest.approx(4 * 100 / 2)
+    assert read_header(
+        _photo(tmp_path / "b.jpg", 1, pixels, sensor)
+    ).tags.focal_px == pytest.approx(4 * 100 / 2)
     absurd = {0xA405: 60000, 0x829A: IFDRational(0, 1)}
     tags = read_header(_photo(tmp_path / "c.jpg", 9, pixels, absurd)).tags
     assert (tags.focal_px, tags.exposure, tags.orientation) == (None, None, 1)

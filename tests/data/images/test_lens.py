@@ -33,12 +33,18 @@ def test_zero_coefficients_are_a_pinhole_except_for_a_fisheye() -> None:
 def test_known_points() -> None:
     """k1 alone: r = 0.5 goes to 0.5 (1 + k1 / 4). Fisheye without coefficients: to the angle."""
     point = torch.tensor([[0.3, 0.4]], dtype=torch.float64)
-    torch.testing.assert_close(distort(Lens("opencv", (0.1,)), point), point * 1.025, rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        distort(Lens("opencv", (0.1,)), point), point * 1.025, rtol=1e-12, atol=0
+    )
     wanted = point / 0.5 * np.arctan(0.5)
-    torch.testing.assert_close(distort(Lens("fisheye", (0.0,) * 4), point), wanted, rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        distort(Lens("fisheye", (0.0,) * 4), point), wanted, rtol=1e-12, atol=0
+    )
 
 
-@pytest.mark.parametrize("lens", [BARREL, FISHEYE, Lens("opencv", (0.1, -0.05, 0.01, 0.02, 0.03, 0.01, 0.0, 0.01))])
+@pytest.mark.parametrize(
+    "lens", [BARREL, FISHEYE, Lens("opencv", (0.1, -0.05, 0.01, 0.02, 0.03, 0.01, 0.0, 0.01))]
+)
 def test_axis_stays_and_small_angles_are_undistorted(lens: Lens) -> None:
     tiny = torch.tensor([[0.0, 0.0], [1e-6, -2e-6]], dtype=torch.float64)
     torch.testing.assert_close(distort(lens, tiny), tiny, rtol=1e-6, atol=1e-12)
@@ -49,7 +55,9 @@ def test_undistort_points_of_kornia_goes_back() -> None:
 
     points = torch.rand(1, 30, 2, dtype=torch.float64) - 0.5
     coefficients = torch.tensor([BARREL.params], dtype=torch.float64)
-    back = undistort_points(distort(BARREL, points), torch.eye(3).double()[None], coefficients, num_iters=50)
+    back = undistort_points(
+        distort(BARREL, points), torch.eye(3).double()[None], coefficients, num_iters=50
+    )
     torch.testing.assert_close(back, points, rtol=0, atol=1e-9)
 
 
@@ -63,10 +71,18 @@ def test_map_of_no_distortion_is_the_identity() -> None:
 
 @pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["barrel", "fisheye"])
 def test_distorted_image_of_a_smooth_scene_becomes_the_pinhole_image(lens: Lens) -> None:
-    """Ground truth by evaluating the same smooth function of the ray through a pinhole and through the lens."""
+    """Ground truth by evaluating the same smooth function of the ray through a pinhole and through
+    the lens."""
 
     def scene(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.stack([0.5 + 0.4 * np.sin(5 * x + 1), 0.5 + 0.4 * np.cos(6 * y), 0.5 + 0.4 * np.sin(4 * x * y)], -1)
+        return np.stack(
+            [
+                0.5 + 0.4 * np.sin(5 * x + 1),
+                0.5 + 0.4 * np.cos(6 * y),
+                0.5 + 0.4 * np.sin(4 * x * y),
+            ],
+            -1,
+        )
 
     def ray_through_lens(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         target = torch.from_numpy(np.stack([(u - 31) / 50, (v - 23.5) / 52], axis=-1))
@@ -95,7 +111,8 @@ def test_pixels_from_outside_are_not_valid_and_black() -> None:
 
 
 def test_no_ghosts_where_the_polynomial_turns_back() -> None:
-    """k1 = -1 turns at r = 1/sqrt(3); beyond, positions fall back into the image but mean nothing."""
+    """k1 = -1 turns at r = 1/sqrt(3); beyond, positions fall back into the image but mean
+    nothing."""
     intrinsics = pinhole_matrix(30.0, 30.0, 32.0, 32.0)
     lens_map = undistort_map(Lens("opencv", (-1.0, 0.0, 0.0, 0.0)), intrinsics, 64, 64)
     inside = (lens_map.grid.abs() <= 1).all(dim=-1)
@@ -105,7 +122,8 @@ def test_no_ghosts_where_the_polynomial_turns_back() -> None:
 
 
 def test_share_of_a_fisheye_image_that_is_kept() -> None:
-    """Equidistant: a point at a distance r (in focal lengths) from the middle is seen at tan(r) by the pinhole."""
+    """Equidistant: a point at a distance r (in focal lengths) from the middle is seen at tan(r) by
+    the pinhole."""
     intrinsics = pinhole_matrix(200, 200, 200, 200)
     fraction = kept_fraction(Lens("fisheye", (0.0, 0.0, 0.0, 0.0)), intrinsics, 400, 400)
     x, y = np.meshgrid(*[(np.arange(1000) + 0.5) / 500 - 1] * 2)
@@ -117,7 +135,8 @@ def test_share_of_a_fisheye_image_that_is_kept() -> None:
 def test_lenses_that_keep_everything() -> None:
     intrinsics = pinhole_matrix(200, 200, 200, 200)
     assert kept_fraction(Lens(), intrinsics, 400, 400) == 1
-    assert kept_fraction(Lens("opencv", (0.1, 0, 0, 0)), intrinsics, 400, 400) == 1  # a cushion: the pinhole sees more
+    # a cushion: the pinhole sees more
+    assert kept_fraction(Lens("opencv", (0.1, 0, 0, 0)), intrinsics, 400, 400) == 1
     assert kept_fraction(Lens("opencv", (-0.1, 0, 0, 0)), intrinsics, 400, 400) < 1
 
 
@@ -129,7 +148,8 @@ def fisheye_matrix(degrees: float) -> np.ndarray:
 
 @pytest.mark.parametrize("degrees", [60.0, 90.0, 110.0])
 def test_a_wide_pinhole_shows_all_that_the_lens_saw(degrees: float) -> None:
-    lens, intrinsics = Lens("fisheye", (0.0,) * 4), fisheye_matrix(degrees)
+    lens = Lens("fisheye", (0.0,) * 4)
+    intrinsics = fisheye_matrix(degrees)
     wide, pinhole = wide_pinhole(lens, intrinsics, 160, 120)
     corner = np.radians(degrees / 2) * 1.25  # of a 4:3 image
     assert wide.focal_ratio > 1
@@ -140,24 +160,33 @@ def test_a_wide_pinhole_shows_all_that_the_lens_saw(degrees: float) -> None:
         # no wider than it must be: a corner of the image lies on its edge
         np.testing.assert_allclose(0.8 * np.tan(corner) * pinhole[0, 0], 80, rtol=1e-3)
     else:
-        assert kept_fraction(lens, intrinsics, 160, 120) + 0.3 < kept_fraction(wide, pinhole, 160, 120) < 1
+        assert (
+            kept_fraction(lens, intrinsics, 160, 120) + 0.3
+            < kept_fraction(wide, pinhole, 160, 120)
+            < 1
+        )
     valid = undistort_map(wide, pinhole, 160, 120).valid
     assert not bool(valid.all())
     assert bool(valid[20:100, 20:140].all())
 
 
 def test_a_image_through_a_wide_pinhole_shows_what_the_lens_saw() -> None:
-    """The stored image holds the angle from the axis and the direction; so must the pinhole's, at its own places."""
+    """The stored image holds the angle from the axis and the direction; so must the pinhole's, at
+    its own places."""
     intrinsics = fisheye_matrix(90.0)
     v, u = np.mgrid[:120, :160] + 0.5
-    x, y = ((u - 80) / intrinsics[0, 0], (v - 60) / intrinsics[1, 1])
+    x = (u - 80) / intrinsics[0, 0]
+    y = (v - 60) / intrinsics[1, 1]
     stored = torch.from_numpy(np.stack([np.hypot(x, y), 0.5 + x / 4, 0.5 + y / 4], -1)).float()
     wide, pinhole = wide_pinhole(Lens("fisheye", (0.0,) * 4), intrinsics, 160, 120)
     lens_map = undistort_map(wide, pinhole, 160, 120)
     found = undistort(stored, lens_map)
-    x, y = ((u - 80) / pinhole[0, 0], (v - 60) / pinhole[1, 1])
+    x = (u - 80) / pinhole[0, 0]
+    y = (v - 60) / pinhole[1, 1]
     angle = np.arctan(np.hypot(x, y))
-    wanted = np.stack([angle, 0.5 + angle * x / np.hypot(x, y) / 4, 0.5 + angle * y / np.hypot(x, y) / 4], -1)
+    wanted = np.stack(
+        [angle, 0.5 + angle * x / np.hypot(x, y) / 4, 0.5 + angle * y / np.hypot(x, y) / 4], -1
+    )
     inner = lens_map.valid.numpy() & (angle < 0.98) & (angle > 0.05)
     inner[1:-1, 1:-1] &= inner[:-2, 1:-1] & inner[2:, 1:-1]
     assert inner.mean() > 0.6
@@ -169,20 +198,26 @@ def test_a_image_through_a_wide_pinhole_shows_what_the_lens_saw() -> None:
 def test_undistorted_points_go_back(lens: Lens, ratio: float) -> None:
     lens = replace(lens, focal_ratio=ratio)
     points = torch.rand(40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 40
-    focal, center = torch.tensor([50.0, 52.0]).double(), torch.tensor([31.0, 23.5]).double()
+    focal = torch.tensor([50.0, 52.0]).double()
+    center = torch.tensor([31.0, 23.5]).double()
     straight = (undistorted_points(lens, INTRINSICS, points) - center) / focal
     torch.testing.assert_close(distort(lens, straight) * focal + center, points, rtol=0, atol=0.05)
 
 
 def test_lenses_that_need_no_wider_pinhole_keep_theirs() -> None:
-    for lens in (Lens(), Lens("opencv", (0.1, 0.02, 0.0, 0.0)), Lens("opencv", (-1e-3, 0.0, 0.0, 0.0))):
+    for lens in (
+        Lens(),
+        Lens("opencv", (0.1, 0.02, 0.0, 0.0)),
+        Lens("opencv", (-1e-3, 0.0, 0.0, 0.0)),
+    ):
         same, intrinsics = wide_pinhole(lens, INTRINSICS, 64, 48)
         assert same == lens
         assert intrinsics is INTRINSICS
 
 
 def test_where_a_lens_folds_back_nothing_is_valid() -> None:
-    """r (1 - r^6 / 2) falls from r = 3.5^(-1/6) = 0.81 on: beyond, the image would appear a second time."""
+    """r (1 - r^6 / 2) falls from r = 3.5^(-1/6) = 0.81 on: beyond, the image would appear a second
+    time."""
     intrinsics = np.array([[100.0, 0.0, 100.0], [0.0, 100.0, 100.0], [0.0, 0.0, 1.0]])
     found = undistort_map(Lens("opencv", (0.0, 0.0, 0.0, 0.0, -0.5)), intrinsics, 200, 200)
     place = (torch.arange(200) + 0.5 - 100) / 100

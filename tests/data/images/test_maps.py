@@ -29,7 +29,9 @@ from dyngs.errors import DyngsError
 
 def test_sixteen_bits_are_millimetres_and_zero_is_unknown(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", np.array([[[0], [1]], [[1500], [65535]]], np.uint16))
-    np.testing.assert_allclose(read_depth(tmp_path / "a.png").numpy(), [[0, 0.001], [1.5, 65.535]], rtol=1e-6)
+    np.testing.assert_allclose(
+        read_depth(tmp_path / "a.png").numpy(), [[0, 0.001], [1.5, 65.535]], rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("ending", ["npy", "npz", "exr"])
@@ -90,12 +92,15 @@ def test_all_three_kinds_of_files_hold_the_same(tmp_path: Path) -> None:
 
 def test_huge_and_infinite_displacements_are_unknown(tmp_path: Path) -> None:
     values = np.zeros((1, 3, 2), np.float32)
-    values[0, 1, 0], values[0, 2, 1] = 1e10, np.inf
+    values[0, 1, 0] = 1e10
+    values[0, 2, 1] = np.inf
     (tmp_path / "a.flo").write_bytes(flo(3, 1, values))
     assert read_flow(tmp_path / "a.flo").isnan().all(-1).tolist() == [[False, True, True]]
 
 
-@pytest.mark.parametrize("data", [b"", b"no flow at all, but text", flo(5, 3, np.zeros(7)), flo(-1, 3, np.zeros(7))])
+@pytest.mark.parametrize(
+    "data", [b"", b"no flow at all, but text", flo(5, 3, np.zeros(7)), flo(-1, 3, np.zeros(7))]
+)
 def test_damaged_files_are_refused(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "a.flo").write_bytes(data)
     with pytest.raises(DyngsError, match=r"a\.flo"):
@@ -129,7 +134,11 @@ def test_silhouettes_become_alpha(tmp_path: Path, person: Any, expected: list[in
 def test_silhouettes_and_alpha_multiply(tmp_path: Path) -> None:
     write_image(tmp_path / "m.png", np.array([[[0], [128], [255]]], np.uint8))
     pixels = torch.tensor([[[9, 9, 9, 200]] * 3], dtype=torch.uint8)
-    assert cut_out(pixels, Silhouette(tmp_path / "m.png", "white"))[0, :, 3].tolist() == [0, 100, 200]
+    assert cut_out(pixels, Silhouette(tmp_path / "m.png", "white"))[0, :, 3].tolist() == [
+        0,
+        100,
+        200,
+    ]
 
 
 def test_bad_silhouettes(tmp_path: Path) -> None:
@@ -148,7 +157,10 @@ def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
     with h5py.File(hdf5, "w") as file:
         file.create_dataset("masks", data=masks, compression="lzf")
     pixels = torch.zeros(2, 3, 3, dtype=torch.uint8)
-    assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [[0, 0, 0], [0, 0, 255]]
+    assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [
+        [0, 0, 0],
+        [0, 0, 255],
+    ]
     with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
         cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
 
@@ -188,4 +200,6 @@ def test_flow_through_a_lens_ends_where_the_pinhole_sees_the_point() -> None:
     stored = (lens_map.grid[8, 20] + 1) / 2 * torch.tensor([32.0, 24.0])
     end = undistorted_points(lens, INTRINSICS, stored + torch.tensor([3.0, 0.0]))
     torch.testing.assert_close(found[8, 20], end - start, rtol=0, atol=1e-3)
-    torch.testing.assert_close(undistorted_points(lens, INTRINSICS, stored), start, rtol=0, atol=1e-2)
+    torch.testing.assert_close(
+        undistorted_points(lens, INTRINSICS, stored), start, rtol=0, atol=1e-2
+    )

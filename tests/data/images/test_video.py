@@ -25,7 +25,13 @@ from hdr_clips import (
 from tiny_captures import level_of, packet_places, truncate_video, write_video
 
 from dyngs.data.images import video as video_module
-from dyngs.data.images.video import VideoInfo, colour_notes, probe_video, read_frames, read_numbered_frames
+from dyngs.data.images.video import (
+    VideoInfo,
+    colour_notes,
+    probe_video,
+    read_frames,
+    read_numbered_frames,
+)
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
 
@@ -53,7 +59,9 @@ def test_wanted_frames_in_order(video: Path, numbers: list[int]) -> None:
     assert len(everything) == 9
     for number, rgb in found:
         assert rgb.shape == (24, 32, 3)
-        assert np.abs(rgb.astype(int) - level_of(number)).max() <= 6, "colours are converted in 8 bit"
+        assert np.abs(rgb.astype(int) - level_of(number)).max() <= 6, (
+            "colours are converted in 8 bit"
+        )
         np.testing.assert_array_equal(rgb, everything[number])
 
 
@@ -105,7 +113,11 @@ def test_a_title_in_latin_1(tmp_path: Path) -> None:
         stream = container.add_stream("libx264", rate=30)
         stream.width, stream.height, stream.pix_fmt = 16, 12, "yuv420p"
         for _ in range(3):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((12, 16, 3), np.uint8), format="rgb24")))
+            container.mux(
+                stream.encode(
+                    av.VideoFrame.from_ndarray(np.zeros((12, 16, 3), np.uint8), format="rgb24")
+                )
+            )
         container.mux(stream.encode(None))
     path.write_bytes(path.read_bytes().replace("Café".encode(), b"Caf\xe9 "))
     assert b"Caf\xe9 " in path.read_bytes()
@@ -114,7 +126,8 @@ def test_a_title_in_latin_1(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["ffconcat version 1.0\nfile cam00.mp4\n", "#EXTM3U\n#EXTINF:1,\n{video}\n#EXT-X-ENDLIST\n"]
+    "content",
+    ["ffconcat version 1.0\nfile cam00.mp4\n", "#EXTM3U\n#EXTINF:1,\n{video}\n#EXT-X-ENDLIST\n"],
 )
 def test_playlists_which_name_other_files_are_no_videos(video: Path, content: str) -> None:
     path = video.with_name("list.mp4")
@@ -123,22 +136,29 @@ def test_playlists_which_name_other_files_are_no_videos(video: Path, content: st
         probe_video(path)
 
 
-def test_large_videos_are_refused_before_they_are_decoded(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_videos_are_refused_before_they_are_decoded(
+    video: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with (
         images_up_to(0.0005),
         pytest.raises(DyngsError, match=r"32x24 .*data\.max_megapixels is 0\.0005"),
     ):
         probe_video(video)
     monkeypatch.setattr(video_module, "MAX_FRAMES", 8)
-    with pytest.raises(DyngsError, match=r"cam00\.mp4: the video has 9 frames, of which 8 are read at most; cut it up"):
+    with pytest.raises(
+        DyngsError,
+        match=r"cam00\.mp4: the video has 9 frames, of which 8 are read at most; cut it up",
+    ):
         probe_video(video)
 
 
 def test_mutated_videos_are_read_or_refused_in_one_line(video: Path) -> None:
-    data, path = video.read_bytes(), video.with_name("mutated.mp4")
+    data = video.read_bytes()
+    path = video.with_name("mutated.mp4")
     lines = []
     for seed in range(150):
-        rng, changed = np.random.default_rng(seed), bytearray(data)
+        rng = np.random.default_rng(seed)
+        changed = bytearray(data)
         for _ in range(rng.choice([1, 4, 16])):
             changed[int(rng.integers(rng.choice([200, 1000, len(data)])))] = rng.integers(256)
         path.write_bytes(changed)
@@ -167,24 +187,31 @@ def test_display_matrices_rotate_and_mirror(tmp_path: Path, orientation: int) ->
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30)
         stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(np.dstack([stored] * 3), format="rgb24")))
+        container.mux(
+            stream.encode(av.VideoFrame.from_ndarray(np.dstack([stored] * 3), format="rgb24"))
+        )
         container.mux(stream.encode(None))
-    data, upright = path.read_bytes(), _display_matrix(1, 0, 0, 1)
+    data = path.read_bytes()
+    upright = _display_matrix(1, 0, 0, 1)
     place = data.index(upright, data.index(b"tkhd"))
     a, b, c, d = MATRICES[orientation]
     path.write_bytes(data[:place] + _display_matrix(a, b, c, d) + data[place + len(upright) :])
     rows, columns = np.mgrid[:32, :48]
-    x, y = a * columns + c * rows, b * columns + d * rows
+    x = a * columns + c * rows
+    y = b * columns + d * rows
     shown = np.zeros((np.ptp(y) + 1, np.ptp(x) + 1), np.uint8)
     shown[y - y.min(), x - x.min()] = stored
     (frame,) = read_frames(path)
     assert frame.shape[:2] == shown.shape
-    assert np.abs(frame[..., 1].astype(int) - shown).max() < 30, "but for the edges of a compressed image"
+    assert np.abs(frame[..., 1].astype(int) - shown).max() < 30, (
+        "but for the edges of a compressed image"
+    )
     assert (probe_video(path).width, probe_video(path).height) == shown.shape[::-1]
 
 
 def levels_off(path: Path, rgb: np.ndarray) -> float:
-    """Root of the mean squared difference of the frames of a clip from an sRGB image in [0, 1], in levels."""
+    """Root of the mean squared difference of the frames of a clip from an sRGB image in [0, 1], in
+    levels."""
     frames = [*read_frames(path), *(frame for _, frame in read_numbered_frames(path, [1]))]
     assert len(frames) == 3
     return max(float(np.sqrt(np.mean((frame - 255 * rgb) ** 2))) for frame in frames)
@@ -205,7 +232,9 @@ def levels_off(path: Path, rgb: np.ndarray) -> float:
         (BT709, BT709, BT2020),
     ],
 )
-def test_colours_come_back(tmp_path: Path, primaries: int, transfer: int, matrix: int, is_full_range: bool) -> None:
+def test_colours_come_back(
+    tmp_path: Path, primaries: int, transfer: int, matrix: int, is_full_range: bool
+) -> None:
     path = tmp_path / "a.mp4"
     rgb = patches()
     signal = encoded(rgb, primaries, transfer)
@@ -213,7 +242,9 @@ def test_colours_come_back(tmp_path: Path, primaries: int, transfer: int, matrix
     write_clip(path, signal, tags, matrix=matrix, is_full_range=is_full_range)
     assert levels_off(path, rgb) < 2.5
     kinds = {HLG: "HLG is tone-mapped", PQ: "PQ is tone-mapped"}
-    sdr = {BT2020: "from BT.2020 to BT.709", DISPLAY_P3: "from Display P3 to BT.709", BT709: ""}[primaries]
+    sdr = {BT2020: "from BT.2020 to BT.709", DISPLAY_P3: "from Display P3 to BT.709", BT709: ""}[
+        primaries
+    ]
     assert kinds.get(transfer, sdr) in probe_video(path).colours
 
 
@@ -251,7 +282,9 @@ def test_brighter_than_white_is_clipped(tmp_path: Path) -> None:
     assert frame[:, 34:].min() >= 254
 
 
-@pytest.mark.parametrize(("size", "matrix"), [((576, 64), BT601), ((720, 64), BT709), ((64, 1280), BT709)])
+@pytest.mark.parametrize(
+    ("size", "matrix"), [((576, 64), BT601), ((720, 64), BT709), ((64, 1280), BT709)]
+)
 @pytest.mark.parametrize("bits", [8, 10])
 def test_untagged_video_is_bt601_in_sd_and_bt709_in_hd(
     tmp_path: Path, size: tuple[int, int], matrix: int, bits: int
@@ -276,7 +309,9 @@ def test_a_matrix_that_cannot_be_converted_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     ictcp = 14
     write_clip(path, patches(), (BT2020, PQ, ictcp))
-    with pytest.raises(DyngsError, match=r"a\.mp4: its colours have the matrix 14 .* export .*HDR10"):
+    with pytest.raises(
+        DyngsError, match=r"a\.mp4: its colours have the matrix 14 .* export .*HDR10"
+    ):
         probe_video(path)
 
 

@@ -15,13 +15,20 @@ from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View, all_views
 from dyngs.data.images.images import read_image
-from dyngs.data.readers.blender import BODY_FORMAT, FORMAT, read_blender, read_body_json, read_nerfstudio
+from dyngs.data.readers.blender import (
+    BODY_FORMAT,
+    FORMAT,
+    read_blender,
+    read_body_json,
+    read_nerfstudio,
+)
 from dyngs.data.readers.transforms import view_name
 from dyngs.errors import DyngsError
 
 
 def test_camera_looks_where_blender_says(blender_root: Path) -> None:
-    """The camera's forward axis in the world is minus the third column of Blender's matrix, down minus the second."""
+    """The camera's forward axis in the world is minus the third column of Blender's matrix, down
+    minus the second."""
     view = read_blender(blender_root).splits["train"][3]
     written = opengl_pose(0.9)
     world_from_cam = np.linalg.inv(view.cam_from_world)
@@ -42,7 +49,9 @@ def test_origin_projects_to_the_image_centre(blender_root: Path) -> None:
 def test_focal_length_follows_the_field_of_view(blender_root: Path) -> None:
     view = read_blender(blender_root).splits["test"][0]
     focal = 6 / np.tan(0.35)
-    np.testing.assert_allclose(view.intrinsics, [[focal, 0, 6], [0, focal, 4], [0, 0, 1]], rtol=1e-12)
+    np.testing.assert_allclose(
+        view.intrinsics, [[focal, 0, 6], [0, focal, 4], [0, 0, 1]], rtol=1e-12
+    )
     assert (view.width, view.height, view.name) == (12, 8, "test/r_0")
 
 
@@ -75,7 +84,9 @@ def test_time_camera_and_frame_are_carried(tmp_path: Path) -> None:
 
     edit_json(tmp_path / "transforms_train.json", change)
     views = read_blender(tmp_path).splits["train"]
-    assert [(v.time, v.camera_id, v.frame) for v in views] == [(float(t), c, t) for t in range(2) for c in range(3)]
+    assert [(v.time, v.camera_id, v.frame) for v in views] == [
+        (float(t), c, t) for t in range(2) for c in range(3)
+    ]
 
 
 def test_slightly_loose_rotation_is_repaired_with_a_warning(blender_root: Path) -> None:
@@ -121,7 +132,9 @@ def matrix(change: np.ndarray) -> list:
         (lambda content: content["frames"].append(3), "frame 16"),
     ],
 )
-def test_bad_frames_are_one_line_that_names_the_file(blender_root: Path, change: object, message: str) -> None:
+def test_bad_frames_are_one_line_that_names_the_file(
+    blender_root: Path, change: object, message: str
+) -> None:
     edit_json(blender_root / "transforms_train.json", lambda c: (c.update(h=8), change(c)))  # type: ignore[operator]
     with pytest.raises(DyngsError) as caught:
         read_blender(blender_root)
@@ -134,7 +147,9 @@ def test_bad_frames_are_one_line_that_names_the_file(blender_root: Path, change:
 def test_broken_json_names_line_and_column(blender_root: Path) -> None:
     path = blender_root / "transforms_train.json"
     path.write_text(json.dumps(json.loads(path.read_text()), indent=1)[:700])
-    with pytest.raises(DyngsError, match=r"transforms_train\.json, line \d+ column \d+: broken JSON"):
+    with pytest.raises(
+        DyngsError, match=r"transforms_train\.json, line \d+ column \d+: broken JSON"
+    ):
         read_blender(blender_root)
 
 
@@ -142,7 +157,10 @@ def test_images_of_two_sizes_need_intrinsics_of_their_own(blender_root: Path) ->
     write_image(blender_root / "train/r_7.png", random_pixels(4, 6, 4))
     with pytest.raises(DyngsError, match=r"different sizes.*r_7\.png"):
         read_blender(blender_root)
-    edit_json(blender_root / "transforms_train.json", lambda c: [f.update(camera_angle_x=0.7) for f in c["frames"]])
+    edit_json(
+        blender_root / "transforms_train.json",
+        lambda c: [f.update(camera_angle_x=0.7) for f in c["frames"]],
+    )
     view = read_blender(blender_root).splits["train"][7]
     assert view.width == 6
     assert view.intrinsics[0, 0] == pytest.approx(3 / np.tan(0.35))
@@ -154,7 +172,8 @@ def test_missing_image_takes_the_size_of_the_others(blender_root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "name"), [("a/b.c.png", "a/b.c"), ("../x/y.jpg", "x/y"), ("plain", "plain"), ("a/./b.png", "a/b")]
+    ("path", "name"),
+    [("a/b.c.png", "a/b.c"), ("../x/y.jpg", "x/y"), ("plain", "plain"), ("a/./b.png", "a/b")],
 )
 def test_names_are_safe_relative_paths(tmp_path: Path, path: str, name: str) -> None:
     assert view_name(tmp_path / path, tmp_path) == name
@@ -162,7 +181,10 @@ def test_names_are_safe_relative_paths(tmp_path: Path, path: str, name: str) -> 
 
 def test_lego(shared: Path) -> None:
     capture = read_blender(shared / "lego400")
-    assert {name: len(views) for name, views in capture.splits.items()} == {"train": 100, "test": 50}
+    assert {name: len(views) for name, views in capture.splits.items()} == {
+        "train": 100,
+        "test": 50,
+    }
     assert capture.splits["train"][0].intrinsics[0, 0] == pytest.approx(555.5555155968841)
 
 
@@ -193,7 +215,10 @@ def test_intrinsics_and_distortion_of_a_frame(nerfstudio_root: Path) -> None:
         ({"camera_model": None, "is_fisheye": True}, Lens("fisheye", (0.1, 0.0, 0.0, 0.0))),
         ({"camera_model": None}, Lens("opencv", (0.1, 0.0, 0.0, -0.01))),
         ({"k1": 0, "p2": 0}, Lens()),
-        ({"camera_model": "FULL_OPENCV", "k4": 0.2}, Lens("opencv", (0.1, 0.0, 0.0, -0.01, 0.0, 0.2))),
+        (
+            {"camera_model": "FULL_OPENCV", "k4": 0.2},
+            Lens("opencv", (0.1, 0.0, 0.0, -0.01, 0.0, 0.2)),
+        ),
     ],
 )
 def test_camera_models(nerfstudio_root: Path, fields: dict, lens: Lens) -> None:
@@ -201,8 +226,12 @@ def test_camera_models(nerfstudio_root: Path, fields: dict, lens: Lens) -> None:
     assert read_nerfstudio(nerfstudio_root).splits["train"][0].lens == lens
 
 
-@pytest.mark.parametrize(("fields", "word"), [({"camera_model": "EQUIRECTANGULAR"}, "EQUI"), ({"k4": 0.1}, "k4")])
-def test_models_that_we_cannot_undo_are_refused(nerfstudio_root: Path, fields: dict, word: str) -> None:
+@pytest.mark.parametrize(
+    ("fields", "word"), [({"camera_model": "EQUIRECTANGULAR"}, "EQUI"), ({"k4": 0.1}, "k4")]
+)
+def test_models_that_we_cannot_undo_are_refused(
+    nerfstudio_root: Path, fields: dict, word: str
+) -> None:
     edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(fields))
     with pytest.raises(DyngsError, match=word):
         read_nerfstudio(nerfstudio_root)
@@ -224,7 +253,9 @@ def test_split_lists(nerfstudio_root: Path) -> None:
 
 
 def test_val_list_alone_is_what_is_held_out(nerfstudio_root: Path) -> None:
-    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(val_filenames=["images/01.jpg"]))
+    edit_json(
+        nerfstudio_root / "transforms.json", lambda c: c.update(val_filenames=["images/01.jpg"])
+    )
     splits = read_nerfstudio(nerfstudio_root).splits
     assert names(splits["test"]) == ["images/01"]
     assert len(splits["train"]) == 9
@@ -232,7 +263,11 @@ def test_val_list_alone_is_what_is_held_out(nerfstudio_root: Path) -> None:
 
 
 def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
-    change = {"file_path": "images\\03.jpg", "mask_path": "masks/03.png", "silhouette_path": "masks/a.png"}
+    change = {
+        "file_path": "images\\03.jpg",
+        "mask_path": "masks/03.png",
+        "silhouette_path": "masks/a.png",
+    }
     edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][3].update(change))
     view = read_nerfstudio(nerfstudio_root).splits["train"][3]
     assert view.name == "images/03"
@@ -240,7 +275,9 @@ def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
     assert view.silhouette == Silhouette(nerfstudio_root / "masks/a.png", "white")
 
 
-@pytest.mark.parametrize("name", ["03.jpg.png", "03.png", "03.mask.png", "03.JPG.PNG", "images/03.png"])
+@pytest.mark.parametrize(
+    "name", ["03.jpg.png", "03.png", "03.mask.png", "03.JPG.PNG", "images/03.png"]
+)
 @pytest.mark.parametrize("form", ["nerfstudio", "blender"])
 def test_masks_that_no_frame_names(nerfstudio_root: Path, name: str, form: str) -> None:
     """As nerfstudio, COLMAP and Brush name the masks of ``images/03.jpg``."""
@@ -248,7 +285,9 @@ def test_masks_that_no_frame_names(nerfstudio_root: Path, name: str, form: str) 
     if form == "blender":
         (nerfstudio_root / "transforms.json").rename(nerfstudio_root / "transforms_train.json")
     capture = {"nerfstudio": read_nerfstudio, "blender": read_blender}[form](nerfstudio_root)
-    masks = {view.name: view.mask_path for view in capture.splits["train"] if view.mask_path is not None}
+    masks = {
+        view.name: view.mask_path for view in capture.splits["train"] if view.mask_path is not None
+    }
     assert masks == {"images/03": nerfstudio_root / "masks" / name}
     count = len(all_views(capture.splits)) - 1
     assert any(line.startswith(f"{count} images have no mask") for line in capture.warnings)
@@ -256,9 +295,14 @@ def test_masks_that_no_frame_names(nerfstudio_root: Path, name: str, form: str) 
 
 def test_masks_beside_named_ones_are_not_read(nerfstudio_root: Path) -> None:
     write_image(nerfstudio_root / "masks/03.png", random_pixels(8, 12, 1))
-    edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][1].update(mask_path="other/1.png"))
+    edit_json(
+        nerfstudio_root / "transforms.json",
+        lambda c: c["frames"][1].update(mask_path="other/1.png"),
+    )
     capture = read_nerfstudio(nerfstudio_root)
-    masks = {view.name: view.mask_path for view in capture.splits["train"] if view.mask_path is not None}
+    masks = {
+        view.name: view.mask_path for view in capture.splits["train"] if view.mask_path is not None
+    }
     assert masks == {"images/01": nerfstudio_root / "other/1.png"}
 
 
@@ -283,7 +327,12 @@ def test_another_shape_is_an_error(nerfstudio_root: Path) -> None:
 
 def test_points_of_a_ply_in_double(nerfstudio_root: Path) -> None:
     """Georeferenced points keep their millimetres; colours come along."""
-    header = ["ply", "format ascii 1.0", "element vertex 2", *[f"property double {axis}" for axis in "xyz"]]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 2",
+        *[f"property double {axis}" for axis in "xyz"],
+    ]
     header += [*[f"property uchar {channel}" for channel in ("red", "green", "blue")], "end_header"]
     rows = ["4567890.123 1.5 -2 255 0 7", "4567890.124 0 0 1 2 3"]
     (nerfstudio_root / "points.ply").write_text("\n".join(header + rows) + "\n")
@@ -308,16 +357,25 @@ LENS = {"w": 4, "h": 3, "fl_x": 5.0, "fl_y": 5.0, "cx": 2.0, "cy": 1.5}
 def write_body(path: Path, count: int, first: float = 0.0, **changes: Any) -> None:
     """Parameters whose numbers tell their frame."""
     numbers = first + np.arange(count, dtype=np.float32)[:, None]
-    fields = {"poses": numbers * np.ones(165), "trans": numbers * np.ones(3), "betas": np.zeros(10), "scale": 1.5}
+    fields = {
+        "poses": numbers * np.ones(165),
+        "trans": numbers * np.ones(3),
+        "betas": np.zeros(10),
+        "scale": 1.5,
+    }
     fields |= {"gender": "neutral", "mocap_frame_rate": 12.0, "surface_model_type": "smplx"}
-    np.savez(path, **{name: value for name, value in (fields | changes).items() if value is not None})
+    np.savez(
+        path, **{name: value for name, value in (fields | changes).items() if value is not None}
+    )
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """3 frames by 2 cameras to train on and 1 to test, and 2 frames of another clip."""
     for split, count, cameras in (("train", 3, (0, 1)), ("test", 3, (2,)), ("pose", 2, (2,))):
-        names = [f"images/{split}/f{frame}_c{camera}.png" for frame in range(count) for camera in cameras]
+        names = [
+            f"images/{split}/f{frame}_c{camera}.png" for frame in range(count) for camera in cameras
+        ]
         path = tmp_path / f"transforms_{split}.json"
         write_frames(path, names, LENS)
         edit_json(path, lambda c, n=count, k=cameras: number_frames(c, n, k))
@@ -354,7 +412,9 @@ def test_every_split_has_its_frames(root: Path) -> None:
     }
     body = bodies(capture)
     assert body["test"] is body["train"] is body["val"]
-    assert [(b.kind, len(b.frames), b.scale[0], b.trans[0, 0]) for b in (body["train"], body["pose"])] == [
+    assert [
+        (b.kind, len(b.frames), b.scale[0], b.trans[0, 0]) for b in (body["train"], body["pose"])
+    ] == [
         ("smplx", 3, 1.5, 0.0),
         ("smplx", 2, 1.5, 10.0),
     ]
@@ -376,12 +436,16 @@ def test_other_splits_may_lack(root: Path) -> None:
 
 def test_missing_files(root: Path) -> None:
     (root / "body_pose.npz").unlink()
-    with pytest.raises(DyngsError, match=r"body_pose\.npz: no such file; transforms_pose\.json shows another clip"):
+    with pytest.raises(
+        DyngsError, match=r"body_pose\.npz: no such file; transforms_pose\.json shows another clip"
+    ):
         read_body_json(root)
     write_body(root / "body_pose.npz", 2)
     (root / "body_train.npz").unlink()
     assert BODY_FORMAT.recognise(root)
-    with pytest.raises(DyngsError, match=r"body_train\.npz: no such file; it should hold the body parameters poses"):
+    with pytest.raises(
+        DyngsError, match=r"body_train\.npz: no such file; it should hold the body parameters poses"
+    ):
         read_body_json(root)
     (root / "body_pose.npz").unlink()
     assert not BODY_FORMAT.recognise(root)
@@ -396,7 +460,10 @@ def test_missing_files(root: Path) -> None:
         ({"scale": -1.0}, r"body_train\.npz: 'scale' must be positive"),
         ({"betas": None}, r"body_train\.npz: the key 'betas' is missing"),
         ({"poses": np.zeros(()), "trans": np.zeros(())}, r"body_train\.npz: holds no frame"),
-        ({"poses": np.zeros((2, 165)), "trans": np.zeros((2, 3))}, r"no body parameters for 1 frames .*\(2\)"),
+        (
+            {"poses": np.zeros((2, 165)), "trans": np.zeros((2, 3))},
+            r"no body parameters for 1 frames .*\(2\)",
+        ),
     ],
 )
 def test_bad_parameters(root: Path, change: dict[str, Any], line: str) -> None:
@@ -414,12 +481,17 @@ def test_images_need_frame_numbers(root: Path) -> None:
 
 @pytest.mark.parametrize("name", ["casual_m", "busi_f"])
 def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
-    """Cameras, frames and parameters of every split agree: the template's pelvis appears on opaque pixels."""
+    """Cameras, frames and parameters of every split agree: the template's pelvis appears on opaque
+    pixels."""
     template = shared / "body" / "anny_smplx55_tpose.npz"
     if not (shared / "human" / name).is_dir() or not template.is_file():
         pytest.skip("the captures of people are not here")
     capture = read_body_json(shared / "human" / name)
-    assert {str(split): len(views) for split, views in capture.splits.items()} == {"train": 160, "test": 80, "pose": 32}
+    assert {str(split): len(views) for split, views in capture.splits.items()} == {
+        "train": 160,
+        "test": 80,
+        "pose": 32,
+    }
     pelvis = np.load(template)["J"][0].astype(float)
     for split, body in bodies(capture).items():
         views: tuple[View, ...] = dict(capture.splits).get(split, ())[::11]  # type: ignore[call-overload]
@@ -430,7 +502,9 @@ def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
 
 
 def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
-    with pytest.raises(DyngsError, match=r"has a clip of new poses of its own; remove data\.pose_frames=2::"):
+    with pytest.raises(
+        DyngsError, match=r"has a clip of new poses of its own; remove data\.pose_frames=2::"
+    ):
         read_capture(DataConfig(root=root, pose_frames="2::"))
     for name in ("transforms_pose.json", "body_pose.npz"):
         (root / name).unlink()
@@ -445,7 +519,10 @@ def test_times_that_are_not_given_follow_from_frame_numbers(root: Path) -> None:
     """Or else every image would be compared with the first pose."""
     timed = read_capture(DataConfig(root=root))
     for split in ("train", "test", "pose"):
-        edit_json(root / f"transforms_{split}.json", lambda content: [own.pop("time") for own in content["frames"]])
+        edit_json(
+            root / f"transforms_{split}.json",
+            lambda content: [own.pop("time") for own in content["frames"]],
+        )
     found = read_capture(DataConfig(root=root))
     for split, views in timed.splits.items():
         assert [view.time for view in found.splits[split]] == [view.time for view in views]

@@ -62,7 +62,9 @@ def change(root: Path, camera: str, **fields: Any) -> None:
 def test_views_times_and_splits(root: Path) -> None:
     capture = read(root)
     assert (capture.format, capture.warnings) == ("camera_folders", ())
-    assert [view.name for view in capture.splits["test"]] == [f"cam01/frame_000{i}" for i in range(4)]
+    assert [view.name for view in capture.splits["test"]] == [
+        f"cam01/frame_000{i}" for i in range(4)
+    ]
     assert {view.name.split("/")[0] for view in capture.splits["train"]} == {"cam00", "cam02"}
     for view in (view for views in capture.splits.values() for view in views):
         assert view.frame == int(view.name[-4:])
@@ -92,13 +94,16 @@ def test_lens_is_read(root: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_names_of_folders_and_frames_are_free(tmp_path: Path, suffix: str) -> None:
-    """The last number in the name counts; numbers need not start at 0; images may lie in ``images``."""
+    """The last number in the name counts; numbers need not start at 0; images may lie in
+    ``images``."""
     write_cameras_json(tmp_path, ("left eye", "right"))
     write_folder(tmp_path / "left eye", (10, 20, 40), prefix="take2 img", suffix=suffix)
     write_folder(tmp_path / "right" / "images", (10, 20, 40), prefix="", suffix=suffix)
     capture = read(tmp_path, test_every=0)
     views = {view.name: view for view in capture.splits["train"]}
-    assert {name: (view.frame, view.time) for name, view in views.items() if name.startswith("right")} == {
+    assert {
+        name: (view.frame, view.time) for name, view in views.items() if name.startswith("right")
+    } == {
         "right/images/0010": (10, 0.0),
         "right/images/0020": (20, pytest.approx(1 / 3)),
         "right/images/0040": (40, 1.0),
@@ -112,7 +117,9 @@ def test_without_test_cameras(tmp_path: Path) -> None:
         write_folder(tmp_path / name, range(2))
     capture = read(tmp_path)
     assert {view.name.split("/")[0] for view in capture.splits["test"]} == {"cam00"}
-    assert capture.warnings == ("cameras.json names no 'test' cameras: the first one, cam00, is held out",)
+    assert capture.warnings == (
+        "cameras.json names no 'test' cameras: the first one, cam00, is held out",
+    )
     write_cameras_json(tmp_path, NAMES[:2])
     capture = read(tmp_path)
     assert len(capture.splits["test"]) == 1, "two cameras are too few to lose one: every n-th image"
@@ -123,7 +130,9 @@ def test_frames_that_some_cameras_lack(root: Path) -> None:
     (root / "cam02" / "frame_0001.png").unlink()
     (root / "cam02" / "frame_0003.png").unlink()
     capture = read(root)
-    assert capture.warnings == ("cameras have different numbers of frames: cam02 has 2 frames, others 4",)
+    assert capture.warnings == (
+        "cameras have different numbers of frames: cam02 has 2 frames, others 4",
+    )
     assert {view.name: view.time for view in capture.splits["train"] if view.camera_id == 2} == {
         "cam02/frame_0000": 0.0,
         "cam02/frame_0002": pytest.approx(2 / 3),
@@ -132,7 +141,8 @@ def test_frames_that_some_cameras_lack(root: Path) -> None:
 
 @pytest.mark.parametrize("described", [(16, 12), (32, 24), None])
 def test_videos(tmp_path: Path, described: tuple[int, int] | None) -> None:
-    """Videos are decoded where wanted, their intrinsics scaled from what they were calibrated for."""
+    """Videos are decoded where wanted, their intrinsics scaled from what they were calibrated
+    for."""
     write_cameras_json(tmp_path, NAMES, test=[])
     for name in NAMES[:2]:
         write_video(tmp_path / f"{name}.mp4", 6)
@@ -145,7 +155,9 @@ def test_videos(tmp_path: Path, described: tuple[int, int] | None) -> None:
     assert not list(cached())
     capture = read(tmp_path, frames="1:6:2")
     assert capture.warnings == planned.warnings
-    assert len(capture.warnings) == (3 if described == (32, 24) else 0), "one note for each rescaled camera"
+    assert len(capture.warnings) == (3 if described == (32, 24) else 0), (
+        "one note for each rescaled camera"
+    )
     for views in (planned.splits["train"], capture.splits["train"]):
         assert [(view.name, view.time) for view in views[:4]] == [
             ("cam00/frame_000001", 0.0),
@@ -254,7 +266,9 @@ def test_a_camera_without_images_is_left_out(root: Path) -> None:
 
 def test_numbers_of_frames_must_be_clear(root: Path) -> None:
     write_image(root / "cam00" / "frame_01.png", random_pixels(12, 16, 3))
-    with pytest.raises(DyngsError, match=r"frame_0001\.png and frame_01\.png have the same frame number"):
+    with pytest.raises(
+        DyngsError, match=r"frame_0001\.png and frame_01\.png have the same frame number"
+    ):
         read_camera_folders(root)
     (root / "cam00" / "frame_01.png").rename(root / "cam00" / "first.png")
     with pytest.raises(DyngsError, match=r"first\.png: no frame number"):
@@ -264,7 +278,9 @@ def test_numbers_of_frames_must_be_clear(root: Path) -> None:
 def test_the_documented_example_can_be_read(tmp_path: Path) -> None:
     """The JSON block of docs/formats.md, as it stands there."""
     text = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
-    block = next(part.split("```")[0] for part in text.split("```json\n")[1:] if '"cameras"' in part)
+    block = next(
+        part.split("```")[0] for part in text.split("```json\n")[1:] if '"cameras"' in part
+    )
     (tmp_path / "cameras.json").write_text(block)
     for name, camera in json.loads(block)["cameras"].items():
         for number in range(2):
@@ -288,7 +304,9 @@ def test_folders(llff: Path) -> None:
     write_folder(llff / "colmap", range(3))
     capture = read(llff)
     assert (capture.format, capture.warnings) == ("llff", ())
-    assert [view.name for view in capture.splits["test"]] == [f"cam00/images/000{i}" for i in range(5)]
+    assert [view.name for view in capture.splits["test"]] == [
+        f"cam00/images/000{i}" for i in range(5)
+    ]
     assert [view.time for view in capture.splits["test"]] == [0, 0.25, 0.5, 0.75, 1]
     assert {view.camera_id for view in capture.splits["train"]} == {1, 2}
     for point, pixel in SIDE_PIXELS:
@@ -305,7 +323,8 @@ def test_smaller_images_scale_the_intrinsics(llff: Path) -> None:
 
 
 def test_videos_and_frames(tmp_path: Path) -> None:
-    """Only the chosen frames are decoded, and they are found again under another choice of times."""
+    """Only the chosen frames are decoded, and they are found again under another choice of
+    times."""
     write_poses_bounds(tmp_path, 2)
     for i in range(2):
         write_video(tmp_path / f"cam0{i}.mp4", 6)
@@ -320,7 +339,9 @@ def test_videos_and_frames(tmp_path: Path) -> None:
         assert pixel_of(capture.splits["test"][0], point) == pytest.approx(pixel)
     everything = read(tmp_path)
     assert len(cached()) == 12
-    assert [view.time for view in everything.splits["train"]] == pytest.approx([i / 5 for i in range(6)])
+    assert [view.time for view in everything.splits["train"]] == pytest.approx(
+        [i / 5 for i in range(6)]
+    )
     assert everything.warnings == ()
 
 
@@ -346,7 +367,10 @@ def test_a_truncated_video(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "line"),
     [
-        (2, r"has poses of 2 cameras, but 3 videos or folders.*cam00 to cam02.*remove those without a pose"),
+        (
+            2,
+            r"has poses of 2 cameras, but 3 videos or folders.*cam00 to cam02.*remove those without a pose",
+        ),
         (5, r"has poses of 5 cameras, but 3 videos or folders.*restore the missing ones"),
     ],
 )
@@ -364,7 +388,8 @@ def test_a_missing_camera_is_named(llff: Path) -> None:
 
 
 def test_numbers_without_zeros(tmp_path: Path) -> None:
-    """cam10 comes before cam2 by name, which is how rows are matched: said, as it may not be meant."""
+    """cam10 comes before cam2 by name, which is how rows are matched: said, as it may not be
+    meant."""
     write_poses_bounds(tmp_path, 3)
     for name in ("cam1", "cam2", "cam10"):
         write_folder(tmp_path / name, range(2))

@@ -38,7 +38,11 @@ def test_lens_images_points_where_colmap_does(model: str) -> None:
     if model not in pycolmap.CameraModelId.__members__:
         pytest.skip("this pycolmap does not know the model yet")
     camera = pycolmap.Camera(
-        camera_id=1, model=getattr(pycolmap.CameraModelId, model), width=12, height=8, params=list(MODELS[model])
+        camera_id=1,
+        model=getattr(pycolmap.CameraModelId, model),
+        width=12,
+        height=8,
+        params=list(MODELS[model]),
     )
     intrinsics, lens = pinhole_and_lens(ModelCamera(1, model, (12, 8), MODELS[model]), "here")
     rays = np.random.default_rng(1).uniform(-0.6, 0.6, (50, 2))
@@ -80,7 +84,8 @@ def test_model_may_lie_in_sparse_or_at_the_root(colmap_root: Path, folder: str) 
 
 
 @pytest.mark.parametrize(
-    "name", ["right/00.jpg.png", "right/00.png", "right/00.jpg", "right/00.mask.png", "Right/00.JPG.png"]
+    "name",
+    ["right/00.jpg.png", "right/00.png", "right/00.jpg", "right/00.mask.png", "Right/00.JPG.png"],
 )
 def test_masks_are_found_by_any_usual_name(colmap_root: Path, name: str) -> None:
     write_image(colmap_root / "masks" / name, random_pixels(8, 12, 1))
@@ -103,8 +108,12 @@ def numbered_models(root: Path, *counts: int) -> None:
         (part / "images.txt").write_text("\n".join(lines[: 2 * count]) + "\n")
 
 
-@pytest.mark.parametrize(("counts", "read"), [((2, 6, 3), 1), ((6, 2), 0), ((2, 2), 0), ((0, 1), 1)])
-def test_largest_of_several_models_is_read(tmp_path: Path, counts: tuple[int, ...], read: int) -> None:
+@pytest.mark.parametrize(
+    ("counts", "read"), [((2, 6, 3), 1), ((6, 2), 0), ((2, 2), 0), ((0, 1), 1)]
+)
+def test_largest_of_several_models_is_read(
+    tmp_path: Path, counts: tuple[int, ...], read: int
+) -> None:
     root = write_colmap(tmp_path, "txt")
     numbered_models(root, *counts)
     capture = read_colmap(root)
@@ -129,7 +138,9 @@ def test_an_unreadable_smaller_model_does_not_matter(tmp_path: Path) -> None:
     assert len(read_colmap(root).splits["train"]) == 9
 
 
-@pytest.mark.parametrize("folder", ["colmap/sparse/0", "colmap/sparse", "colmap", "distorted/sparse/0", "sparse/3"])
+@pytest.mark.parametrize(
+    "folder", ["colmap/sparse/0", "colmap/sparse", "colmap", "distorted/sparse/0", "sparse/3"]
+)
 def test_model_in_the_folders_of_other_programs(colmap_root: Path, folder: str) -> None:
     (colmap_root / folder).parent.mkdir(parents=True, exist_ok=True)
     (colmap_root / "sparse/0").rename(colmap_root / folder)
@@ -195,7 +206,9 @@ def test_missing_images_folder(colmap_root: Path) -> None:
 def test_smaller_images_rescale_other_shapes_are_errors(colmap_root: Path) -> None:
     write_image(colmap_root / "images/left/01.jpg", random_pixels(4, 6, 3))
     capture = read_colmap(colmap_root)
-    np.testing.assert_allclose(capture.splits["train"][0].intrinsics, [[5, 0, 3], [0, 5.5, 2], [0, 0, 1]])
+    np.testing.assert_allclose(
+        capture.splits["train"][0].intrinsics, [[5, 0, 3], [0, 5.5, 2], [0, 0, 1]]
+    )
     assert any("rescaled" in warning for warning in capture.warnings)
     write_image(colmap_root / "images/left/01.jpg", random_pixels(8, 8, 3))
     with pytest.raises(DyngsError, match=r"left/01\.jpg: the image is 8x8"):
@@ -203,7 +216,8 @@ def test_smaller_images_rescale_other_shapes_are_errors(colmap_root: Path) -> No
 
 
 def test_cup(shared: Path) -> None:
-    """The real model: every point, projected into an image that shows it, is found near its observation."""
+    """The real model: every point, projected into an image that shows it, is found near its
+    observation."""
     import pycolmap
 
     capture = read_colmap(shared / "colmap_small")
@@ -224,13 +238,17 @@ def test_cup(shared: Path) -> None:
 def test_listed_images_are_for_testing(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     images = tmp_path / "images"
-    names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
+    names = sorted(
+        path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file()
+    )
     (model,) = model_folders(tmp_path)
     (model / "test.txt").write_text(f"{names[1]}\n\nnowhere.png\n")
     capture = read_capture(tmp_path)
     assert [view.image_path for view in capture.splits["test"]] == [images / names[1]]
     assert len(capture.splits["train"]) == len(names) - 1
-    assert any("1 listed images have no pose, first nowhere.png" in line for line in capture.warnings)
+    assert any(
+        "1 listed images have no pose, first nowhere.png" in line for line in capture.warnings
+    )
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 3.0])
@@ -245,5 +263,8 @@ def test_a_quaternion_that_is_no_rotation(tmp_path: Path, factor: float) -> None
     path.write_text("\n".join(" ".join(words) for words in rows) + "\n")
     for name in ("rigs.txt", "frames.txt"):
         (root / "sparse/0" / name).unlink(missing_ok=True)
-    with pytest.raises(DyngsError, match=rf"right/02.jpg: the quaternion of its rotation has length {factor:g}, not 1"):
+    with pytest.raises(
+        DyngsError,
+        match=rf"right/02.jpg: the quaternion of its rotation has length {factor:g}, not 1",
+    ):
         read_colmap(root)

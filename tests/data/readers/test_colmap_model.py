@@ -23,7 +23,9 @@ POINTS_2D = "1.5 2.5 -1 3 4 17"
 def test_every_camera_model_that_pycolmap_writes(tmp_path: Path, extension: str) -> None:
     import pycolmap
 
-    models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
+    models = [
+        model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"
+    ]
     scene = pycolmap.Reconstruction()
     expected = {}
     for number, model in enumerate(models, start=1):
@@ -32,7 +34,9 @@ def test_every_camera_model_that_pycolmap_writes(tmp_path: Path, extension: str)
         expected[number] = (model.name, (12, 8), tuple(camera.params))
     (scene.write_binary if extension == ".bin" else scene.write_text)(str(tmp_path))
     found = read_model(tmp_path).cameras
-    assert {number: (camera.model, camera.size, camera.params) for number, camera in found.items()} == expected
+    assert {
+        number: (camera.model, camera.size, camera.params) for number, camera in found.items()
+    } == expected
     assert {name for name, _, _ in expected.values()} <= set(NUM_PARAMS)
 
 
@@ -59,7 +63,9 @@ def test_truncated_text_file_is_one_line_that_names_it(tmp_path: Path, name: str
     root = write_colmap(tmp_path, "txt")
     path = root / "sparse/0" / f"{name}.txt"
     lines = path.read_text().splitlines(keepends=True)
-    entries = [i for i, line in enumerate(lines) if not line.startswith("#")][:: 2 if name == "images" else 1]
+    entries = [i for i, line in enumerate(lines) if not line.startswith("#")][
+        :: 2 if name == "images" else 1
+    ]
     for cut in entries:
         path.write_text("".join(lines[:cut]))
         assert_refused(root, path)
@@ -78,7 +84,9 @@ def test_image_of_an_unknown_camera(tmp_path: Path) -> None:
     root = write_colmap(tmp_path, "txt")
     path = root / "sparse/0/images.txt"
     path.write_text(path.read_text().replace(" 2 left/01.jpg", " 77 left/01.jpg"))
-    with pytest.raises(DyngsError, match=r"images\.txt: left/01\.jpg is of camera 77, which cameras\.txt lacks"):
+    with pytest.raises(
+        DyngsError, match=r"images\.txt: left/01\.jpg is of camera 77, which cameras\.txt lacks"
+    ):
         read_colmap(root)
 
 
@@ -138,7 +146,9 @@ def lines_of(*seconds: str | None) -> list[str]:
         ("", None, ""),
     ],
 )
-@pytest.mark.parametrize("header", ["", "# Image list\n# Number of images: 3, mean observations per image: 0\n"])
+@pytest.mark.parametrize(
+    "header", ["", "# Image list\n# Number of images: 3, mean observations per image: 0\n"]
+)
 @pytest.mark.parametrize(
     "encode",
     [
@@ -149,14 +159,25 @@ def lines_of(*seconds: str | None) -> list[str]:
         lambda text: text.encode("utf-16"),
         lambda text: text.encode("utf-16-le"),
     ],
-    ids=["plain", "crlf", "mark_and_blank_lines", "blank_lines_between", "utf16", "utf16_without_mark"],
+    ids=[
+        "plain",
+        "crlf",
+        "mark_and_blank_lines",
+        "blank_lines_between",
+        "utf16",
+        "utf16_without_mark",
+    ],
 )
 def test_second_lines_of_images_may_be_missing(
     tmp_path: Path, seconds: tuple[str | None, ...], header: str, encode: Callable[[str], bytes]
 ) -> None:
-    model = read_model(write_text_model(tmp_path, encode(header + "\n".join(lines_of(*seconds)) + "\n")))
+    model = read_model(
+        write_text_model(tmp_path, encode(header + "\n".join(lines_of(*seconds)) + "\n"))
+    )
     assert [image.name for image in model.images] == ["1.png", "2.png", "3.png"]
-    assert [image.pose[4:] for image in model.images] == [(number + 0.5, -0.2, 3) for number in (1, 2, 3)]
+    assert [image.pose[4:] for image in model.images] == [
+        (number + 0.5, -0.2, 3) for number in (1, 2, 3)
+    ]
     assert num_images(tmp_path) == 3
 
 
@@ -182,7 +203,9 @@ def test_names_are_the_rest_of_the_line(tmp_path: Path, second: str | None) -> N
 )
 def test_lines_that_fit_no_image_are_refused(tmp_path: Path, lines: list[str], line: int) -> None:
     write_text_model(tmp_path, "\n".join(lines).encode())
-    with pytest.raises(DyngsError, match=rf"images\.txt, line {line}: the line is truncated or damaged"):
+    with pytest.raises(
+        DyngsError, match=rf"images\.txt, line {line}: the line is truncated or damaged"
+    ):
         read_model(tmp_path)
     assert num_images(tmp_path) == 0
 
@@ -191,7 +214,8 @@ def test_tracks_of_points_do_not_count(tmp_path: Path) -> None:
     """Photos of a track may be absent, and their points, too."""
     points = "7 1.5 2 -3 10 20 255 0.5 99 0 1 12\n3 4e+000 5 6 1.0 2.0 3.0 0.1\n"
     model = read_model(write_text_model(tmp_path, pose_line(1).encode(), points))
-    np.testing.assert_array_equal(model.points.xyz, [[4, 5, 6], [1.5, 2, -3]])  # in order of their ids
+    # in order of their ids
+    np.testing.assert_array_equal(model.points.xyz, [[4, 5, 6], [1.5, 2, -3]])
     np.testing.assert_array_equal(model.points.rgb, [[1, 2, 3], [10, 20, 255]])
 
 

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny_captures import SIDE_PIXELS, edit_json, pixel_of, random_pixels, write_image, write_nerfies
+from tiny_captures import (
+    SIDE_PIXELS,
+    edit_json,
+    pixel_of,
+    random_pixels,
+    write_image,
+    write_nerfies,
+)
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
@@ -77,19 +84,25 @@ def test_points_are_in_the_frame_of_the_poses(root: Path) -> None:
     assert capture.points is not None
     assert capture.points.xyz == pytest.approx(np.array([[0.0, 0, 0], [1, 0, 0]]))
     assert (capture.points.rgb == 128).all()
-    assert capture.warnings == ("1 points hold NaN, infinite or far too large numbers and are ignored",)
+    assert capture.warnings == (
+        "1 points hold NaN, infinite or far too large numbers and are ignored",
+    )
 
 
 def test_lens_and_aspect(root: Path) -> None:
     change = {"radial_distortion": [0.1, 0.02, 0.003], "tangential_distortion": [0.01, -0.02]}
-    edit_json(root / "camera" / "000000.json", lambda c: c.update(change, pixel_aspect_ratio=1.5, skew=0.5))
+    edit_json(
+        root / "camera" / "000000.json",
+        lambda c: c.update(change, pixel_aspect_ratio=1.5, skew=0.5),
+    )
     capture = read(root)
     view = capture.splits["train"][0]
     assert view.lens.model == "opencv"
     assert view.lens.params == (0.1, 0.02, 0.01, -0.02, 0.003)
     assert view.intrinsics[1, 1] == pytest.approx(30)
     assert "1 cameras have skew" in capture.warnings[0]
-    x, y = 0.3, -0.2  # Nerfies' formula, written out
+    x = 0.3
+    y = -0.2  # Nerfies' formula, written out
     r2 = x * x + y * y
     radial = 1 + r2 * (0.1 + r2 * (0.02 + r2 * 0.003))
     expected = (
@@ -109,7 +122,9 @@ def test_without_validation_ids_every_nth_is_held_out(root: Path) -> None:
 
 def test_time_id_and_no_times(root: Path) -> None:
     times = [view.time for view in read(root).splits["train"]]
-    edit_json(root / "metadata.json", lambda c: [m.update(time_id=m.pop("warp_id")) for m in c.values()])
+    edit_json(
+        root / "metadata.json", lambda c: [m.update(time_id=m.pop("warp_id")) for m in c.values()]
+    )
     assert [view.time for view in read(root).splits["train"]] == times
     edit_json(root / "metadata.json", lambda c: [m.pop("time_id") for m in c.values()])
     assert {view.time for view in read(root).splits["train"]} == {None}
@@ -127,8 +142,13 @@ def test_one_time_is_a_still_scene(root: Path) -> None:
 
 def test_frames_are_chosen(root: Path) -> None:
     capture = read(root, frames="2:5")
-    assert [(view.name, view.time) for view in capture.splits["train"]] == [("000002", 0.0), ("000004", 1.0)]
-    assert [(view.name, view.time) for view in capture.splits["test"]] == [("000003", pytest.approx(0.5))]
+    assert [(view.name, view.time) for view in capture.splits["train"]] == [
+        ("000002", 0.0),
+        ("000004", 1.0),
+    ]
+    assert [(view.name, view.time) for view in capture.splits["test"]] == [
+        ("000003", pytest.approx(0.5))
+    ]
 
 
 @pytest.mark.parametrize(
@@ -140,13 +160,25 @@ def test_frames_are_chosen(root: Path) -> None:
         ("dataset.json", {"train_ids": ["000009"]}, "no entry for '000009'"),
         ("metadata.json", {"000002": {"warp_id": -1}}, "'000002': warp_id must be a whole number"),
         ("metadata.json", {"000002": {"warp_id": 0.5}}, "'000002': warp_id must be a whole number"),
-        ("metadata.json", {"000002": {"warp_id": float("nan")}}, "'000002': warp_id must be a whole number"),
+        (
+            "metadata.json",
+            {"000002": {"warp_id": float("nan")}},
+            "'000002': warp_id must be a whole number",
+        ),
         ("metadata.json", {"000002": 1}, "no entry for '000002'"),
         ("scene.json", {"scale": 0}, "'scale' must be positive"),
         ("scene.json", {"center": [1, 2]}, "'center' must hold 3 finite numbers"),
-        ("camera/000002.json", {"orientation": [[1, 0, 0]]}, "'orientation' must hold 3x3 finite numbers"),
+        (
+            "camera/000002.json",
+            {"orientation": [[1, 0, 0]]},
+            "'orientation' must hold 3x3 finite numbers",
+        ),
         ("camera/000002.json", {"orientation": np.diag([1, 1, -1]).tolist()}, "mirrored"),
-        ("camera/000002.json", {"position": [0, 0, float("nan")]}, "'position' must hold 3 finite numbers"),
+        (
+            "camera/000002.json",
+            {"position": [0, 0, float("nan")]},
+            "'position' must hold 3 finite numbers",
+        ),
         ("camera/000002.json", {"focal_length": -3}, "fl_x must be positive"),
         ("camera/000002.json", {"focal_length": None}, "'focal_length' must hold finite numbers"),
         ("camera/000002.json", {"image_size": [0, 0]}, "'image_size' must be positive"),
@@ -162,7 +194,9 @@ def test_bad_values(root: Path, file: str, change: dict[str, Any], line: str) ->
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "\x00"])
-@pytest.mark.parametrize("file", ["dataset.json", "metadata.json", "scene.json", "camera/000002.json"])
+@pytest.mark.parametrize(
+    "file", ["dataset.json", "metadata.json", "scene.json", "camera/000002.json"]
+)
 def test_broken_files(root: Path, file: str, text: str) -> None:
     (root / file).write_text(text)
     with pytest.raises(DyngsError, match=file):

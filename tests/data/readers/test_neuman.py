@@ -25,7 +25,10 @@ PELVIS = np.array([0.02, -0.24, 0.03])
 
 def fit() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
-    return {"pose": rng.normal(size=(COUNT, 72)).astype(np.float32), "betas": np.ones((COUNT, 10), np.float32)}
+    return {
+        "pose": rng.normal(size=(COUNT, 72)).astype(np.float32),
+        "betas": np.ones((COUNT, 10), np.float32),
+    }
 
 
 def alignment(index: int) -> tuple[float, Rotation, np.ndarray]:
@@ -87,7 +90,8 @@ def test_views(root: Path) -> None:
 
 
 def test_bodies_are_brought_into_the_models_world(root: Path) -> None:
-    """``world = s R v + t`` with v as SMPL has it without a translation; here a point that hangs on the root alone."""
+    """``world = s R v + t`` with v as SMPL has it without a translation; here a point that hangs on
+    the root alone."""
     body = body_of(read_neuman(root))
     same = about_pelvis(body, PELVIS)
     point = np.array([0.3, 0.1, -0.2])
@@ -96,7 +100,8 @@ def test_bodies_are_brought_into_the_models_world(root: Path) -> None:
         v = Rotation.from_rotvec(fit()["pose"][index, :3]).apply(point - PELVIS) + PELVIS
         root_turn = Rotation.from_rotvec(same.poses[index, 0])
         ours = same.scale[index] * (root_turn.apply(point - PELVIS) + PELVIS) + same.trans[index]
-        np.testing.assert_allclose(ours, scale * turn.apply(v) + trans, atol=1e-6)  # alignments are float32
+        # alignments are float32
+        np.testing.assert_allclose(ours, scale * turn.apply(v) + trans, atol=1e-6)
     assert same.scale == pytest.approx([alignment(i)[0] for i in range(COUNT)], rel=1e-6)
     assert body.betas.tolist() == [1] * 10
 
@@ -104,7 +109,11 @@ def test_bodies_are_brought_into_the_models_world(root: Path) -> None:
 def test_refined_parameters_come_first(root: Path) -> None:
     write_aligned(root)
     body = body_of(read_neuman(root))
-    assert (body.turns, body.scale.tolist(), body.trans[:, 0].tolist()) == (None, [0.7] * COUNT, list(range(COUNT)))
+    assert (body.turns, body.scale.tolist(), body.trans[:, 0].tolist()) == (
+        None,
+        [0.7] * COUNT,
+        list(range(COUNT)),
+    )
     assert body.poses[4].ravel() == pytest.approx([0.1] * 3 + [0.2] * 69)
     for name in ("alignments.npy", "smpl_output_romp.pkl"):
         (root / name).unlink()
@@ -113,7 +122,9 @@ def test_refined_parameters_come_first(root: Path) -> None:
 
 
 def test_optimized_before_romp(root: Path) -> None:
-    (root / "smpl_output_optimized.pkl").write_bytes(pickle.dumps({1: {**fit(), "betas": np.zeros((COUNT, 10))}}))
+    (root / "smpl_output_optimized.pkl").write_bytes(
+        pickle.dumps({1: {**fit(), "betas": np.zeros((COUNT, 10))}})
+    )
     assert not body_of(read_neuman(root)).betas.any()
 
 
@@ -158,7 +169,10 @@ def test_missing_files(root: Path) -> None:
         ([fit()], "must hold the body parameters of one person, got 0"),
         ({1: 5}, "must be a dictionary with the key 'pose'"),
         ({1: {"pose": fit()["pose"]}}, "the key 'betas' is missing"),
-        ({1: {**fit(), "pose": np.zeros((4, 72))}}, "'pose' has 4 rows, but the COLMAP model has 9 posed images"),
+        (
+            {1: {**fit(), "pose": np.zeros((4, 72))}},
+            "'pose' has 4 rows, but the COLMAP model has 9 posed images",
+        ),
         ({1: {**fit(), "pose": [1, [2]]}}, "'pose' has 0 rows"),
         ({1: {**fit(), "pose": np.full((9, 72), np.nan)}}, "'poses' of frame 0 holds NaN"),
         ({1: {**fit(), "pose": np.zeros((9, 70))}}, "'poses' has 70 numbers per frame"),
@@ -184,7 +198,9 @@ def test_bad_fits(root: Path, person: object, line: str) -> None:
     ],
 )
 def test_bad_alignments(root: Path, matrix: np.ndarray | None, line: str) -> None:
-    found = {name: value for name, value in {**matrices(), "04.jpg": matrix}.items() if value is not None}
+    found = {
+        name: value for name, value in {**matrices(), "04.jpg": matrix}.items() if value is not None
+    }
     write_fit(root, {1: fit()}, found)
     with pytest.raises(DyngsError, match=line) as caught:
         read_neuman(root)
@@ -194,7 +210,10 @@ def test_bad_alignments(root: Path, matrix: np.ndarray | None, line: str) -> Non
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"body_pose": np.zeros((COUNT - 1, 69))}, "'body_pose' has 8 rows, but the COLMAP model has 9 posed images"),
+        (
+            {"body_pose": np.zeros((COUNT - 1, 69))},
+            "'body_pose' has 8 rows, but the COLMAP model has 9 posed images",
+        ),
         ({"body_pose": np.zeros((COUNT, 66))}, "'poses' has 69 numbers per frame"),
         ({"scale": np.zeros(COUNT)}, "'scale' must be positive"),
         ({"transl": np.zeros((COUNT, 2))}, "'trans' has 2 numbers per frame instead of 3"),

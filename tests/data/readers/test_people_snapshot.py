@@ -33,7 +33,9 @@ def write_camera(root: Path, **changes: Any) -> None:
         "width": WIDTH,
         "height": HEIGHT,
     } | changes
-    (root / "camera.pkl").write_bytes(pickle.dumps({k: v for k, v in fields.items() if v is not None}, 2))
+    (root / "camera.pkl").write_bytes(
+        pickle.dumps({k: v for k, v in fields.items() if v is not None}, 2)
+    )
 
 
 def write_hdf5(path: Path, **arrays: np.ndarray | None) -> None:
@@ -66,14 +68,22 @@ def root(tmp_path: Path) -> Path:
 def test_frames_masks_and_parameters_go_together(root: Path) -> None:
     assert FORMAT.recognise(root)
     capture = read_people_snapshot(root)
-    assert (capture.format, capture.warnings, set(capture.splits)) == ("people_snapshot", (), {"train"})
+    assert (capture.format, capture.warnings, set(capture.splits)) == (
+        "people_snapshot",
+        (),
+        {"train"},
+    )
     views = capture.splits["train"]
     assert [(v.frame, v.time) for v in views] == [(f, f / 5) for f in range(FRAMES)]
     assert views[2].name == "female-3-casual/frame_000002"
     body: Any = capture.body
     assert body["train"].frames == tuple(range(FRAMES))
     assert body["train"].trans[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
-    assert (body["train"].kind, body["train"].turns, body["train"].betas.tolist()) == ("smpl", None, [1] * 10)
+    assert (body["train"].kind, body["train"].turns, body["train"].betas.tolist()) == (
+        "smpl",
+        None,
+        [1] * 10,
+    )
     for frame, view in enumerate(views):
         assert view.silhouette is not None
         alpha = cut_out(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), view.silhouette)[..., 3]
@@ -85,7 +95,12 @@ def test_camera(root: Path) -> None:
     point = np.array([0.1, -0.2, 3.0])
     x, y, z = np.add(Rotation.from_rotvec([0, 0.4, 0]).apply(point), (0.1, 0.2, 0.3))
     assert pixel_of(view, point.tolist()) == pytest.approx([20 * x / z + 8, 21 * y / z + 6])
-    assert (view.lens.model, view.lens.params[0], view.width, view.height) == ("opencv", 0.1, WIDTH, HEIGHT)
+    assert (view.lens.model, view.lens.params[0], view.width, view.height) == (
+        "opencv",
+        0.1,
+        WIDTH,
+        HEIGHT,
+    )
 
 
 def test_frames_without_mask_or_fit_are_left_out(root: Path) -> None:
@@ -94,7 +109,9 @@ def test_frames_without_mask_or_fit_are_left_out(root: Path) -> None:
     write_poses(root, pose=numbers * np.ones(72), trans=numbers * np.ones(3))
     capture = read_people_snapshot(root)
     assert [view.frame for view in capture.splits["train"]] == [0, 2, 3]
-    assert capture.warnings == ("female-3-casual.mp4: 3 of 6 frames lack a mask or a pose and are left out",)
+    assert capture.warnings == (
+        "female-3-casual.mp4: 3 of 6 frames lack a mask or a pose and are left out",
+    )
 
 
 def test_smaller_video(root: Path) -> None:
@@ -169,13 +186,17 @@ def test_no_frame_has_everything(root: Path) -> None:
     poses = np.zeros((7, 72))
     poses[3:] = 1
     write_poses(root, pose=poses, trans=poses[:, :3])
-    with pytest.raises(DyngsError, match=r"no frame of female-3-casual\.mp4 has both a mask and body parameters"):
+    with pytest.raises(
+        DyngsError, match=r"no frame of female-3-casual\.mp4 has both a mask and body parameters"
+    ):
         read_people_snapshot(root)
 
 
 def test_the_last_frames_are_held_out_as_new_poses(root: Path) -> None:
     capture = read_capture(DataConfig(root=root, pose_frames="4::", test_every=2))
-    assert [[view.frame for view in capture.splits[name]] for name in ("train", "test", "pose")] == [
+    assert [
+        [view.frame for view in capture.splits[name]] for name in ("train", "test", "pose")
+    ] == [
         [1, 3],
         [0, 2],
         [4, 5],

@@ -68,7 +68,9 @@ def test_polycam_in_an_archive_without_a_top_folder(tmp_path: Path) -> None:
         ({"width": WIDTH * 3}, r"the image is 16x12 but its intrinsics are for 48x12"),
     ],
 )
-def test_damaged_cameras_of_polycam_are_one_line(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_damaged_cameras_of_polycam_are_one_line(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
     file = write_polycam(tmp_path) / "keyframes" / "corrected_cameras" / "1700000002.json"
     edit_json(file, lambda content: content.update(change))
     with pytest.raises(DyngsError, match=message) as error:

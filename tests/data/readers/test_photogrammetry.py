@@ -1,4 +1,5 @@
-"""Metashape, RealityCapture and ODM: files written by their published definitions, against the cameras they are of."""
+"""Metashape, RealityCapture and ODM: files written by their published definitions, against the
+cameras they are of."""
 
 from __future__ import annotations
 
@@ -65,9 +66,12 @@ def assert_same_views(
             )
 
 
-def metashape_frame(local: np.ndarray, own: dict[str, float], *, fisheye: bool = False) -> tuple[float, float]:
+def metashape_frame(
+    local: np.ndarray, own: dict[str, float], *, fisheye: bool = False
+) -> tuple[float, float]:
     c = dict.fromkeys(("k4", "b2", "p1", "p2", "b1", "k1", "k2", "k3"), 0.0) | own
-    x, y = local[0] / local[2], local[1] / local[2]
+    x = local[0] / local[2]
+    y = local[1] / local[2]
     if fisheye:
         radius = math.hypot(x, y)
         x, y = (q * math.atan(radius) / radius if radius else 0.0 for q in (x, y))
@@ -80,7 +84,9 @@ def metashape_frame(local: np.ndarray, own: dict[str, float], *, fisheye: bool =
 
 @pytest.mark.parametrize("labels", [NAMES, [name.removesuffix(".jpg") for name in NAMES]])
 @pytest.mark.parametrize("placement", [None, "component"])
-def test_metashape_has_its_cameras(tmp_path: Path, placement: str | None, labels: list[str]) -> None:
+def test_metashape_has_its_cameras(
+    tmp_path: Path, placement: str | None, labels: list[str]
+) -> None:
     capture = read(write_metashape(tmp_path, placement=placement, labels=labels))
     assert_same_views(capture, lambda local, _: metashape_frame(local, METASHAPE))
     assert (capture.format, capture.warnings) == ("metashape", ())
@@ -90,7 +96,9 @@ def test_metashape_has_its_cameras(tmp_path: Path, placement: str | None, labels
 def test_a_chunk_is_placed_where_its_component_is_not(tmp_path: Path, old: bool) -> None:
     file = write_metashape(tmp_path, placement="chunk") / "cameras.xml"
     if old:
-        file.write_text(file.read_text().replace('<components><component id="5"></component></components>', ""))
+        file.write_text(
+            file.read_text().replace('<components><component id="5"></component></components>', "")
+        )
     assert_same_views(read(tmp_path), lambda local, _: metashape_frame(local, METASHAPE))
 
 
@@ -114,7 +122,9 @@ def test_k4_is_approximated(tmp_path: Path) -> None:
     view = capture.splits["train"][0]
     world = view.cam_from_world[:3, :3].T @ (at_corner - view.cam_from_world[:3, 3])
     np.testing.assert_allclose(pixel(view, world), metashape_frame(at_corner, lens), atol=4e-3)
-    with pytest.raises(DyngsError, match=r"sensor X-T4: its distortion with k4=-9 cannot be expressed"):
+    with pytest.raises(
+        DyngsError, match=r"sensor X-T4: its distortion with k4=-9 cannot be expressed"
+    ):
         read(write_metashape(tmp_path, METASHAPE | {"k4": -9.0}))
 
 
@@ -138,13 +148,19 @@ def test_photos_that_metashape_did_not_align_are_left_out(tmp_path: Path) -> Non
         ('type="frame"', 'type="equisolid_fisheye"', "is of type equisolid_fisheye"),
         ("<f>40.0</f>", "<f>forty</f>", r"cameras\.xml: cannot be read .*forty"),
         ("</document>", "", r"cameras\.xml: cannot be read"),
-        ("<document", '<!DOCTYPE d [<!ENTITY a "aaaa">]><document', r"cameras\.xml: defines entities"),
+        (
+            "<document",
+            '<!DOCTYPE d [<!ENTITY a "aaaa">]><document',
+            r"cameras\.xml: defines entities",
+        ),
         (' label="DSC_1.jpg"', ' label="DSC_0.jpg"', "DSC_0.jpg is listed more than once"),
         ('sensor_id="7"', 'sensor_id="8"', r"cameras\.xml: cannot be read .*'8'"),
         ("DSC_", "IMG_", "no photo in .*images has the name of a camera"),
     ],
 )
-def test_damaged_cameras_of_metashape_are_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_damaged_cameras_of_metashape_are_one_line(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
     file = write_metashape(tmp_path) / "cameras.xml"
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
@@ -153,15 +169,19 @@ def test_damaged_cameras_of_metashape_are_one_line(tmp_path: Path, old: str, new
 
 
 def reality_pixel(local: np.ndarray, _: Path) -> tuple[float, float]:
-    x, y = local[0] / local[2], local[1] / local[2]
+    x = local[0] / local[2]
+    y = local[1] / local[2]
     r2 = x * x + y * y
     radial = 1 + REALITY["k1"] * r2 + REALITY["k2"] * r2**2 + REALITY["k3"] * r2**3
-    t1, t2 = REALITY["t1"], REALITY["t2"]
+    t1 = REALITY["t1"]
+    t2 = REALITY["t2"]
     u = x * radial + t1 * (r2 + 2 * x * x) + 2 * t2 * x * y
     v = y * radial + t2 * (r2 + 2 * y * y) + 2 * t1 * x * y
     side = max(WIDTH, HEIGHT)
     scale = REALITY["f"] / 36 * side
-    return WIDTH / 2 + REALITY["px"] * side + u * scale, HEIGHT / 2 + REALITY["py"] * side + v * scale
+    return WIDTH / 2 + REALITY["px"] * side + u * scale, HEIGHT / 2 + REALITY[
+        "py"
+    ] * side + v * scale
 
 
 @pytest.mark.parametrize("folder", ["images", ".", "day 1/left"])
@@ -185,16 +205,22 @@ def test_headings_are_clockwise_from_north(
     tmp_path: Path, heading: float, pitch: float, forward: Sequence[float], up: Sequence[float]
 ) -> None:
     write_photos(tmp_path, NAMES[:1])
-    (tmp_path / "a.csv").write_text(f"#name,x,y,alt,heading,pitch,roll,f\n{NAMES[0]},1,2,3,{heading},{pitch},0,36\n")
+    (tmp_path / "a.csv").write_text(
+        f"#name,x,y,alt,heading,pitch,roll,f\n{NAMES[0]},1,2,3,{heading},{pitch},0,36\n"
+    )
     view = read(tmp_path).splits["train"][0]
     np.testing.assert_allclose(view.cam_from_world[2, :3], forward, atol=1e-12)
     np.testing.assert_allclose(-view.cam_from_world[1, :3], up, atol=1e-12)
-    np.testing.assert_allclose(view.intrinsics, [[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
+    np.testing.assert_allclose(
+        view.intrinsics, [[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]]
+    )
 
 
 def test_portrait_photos_are_measured_by_their_longer_side(tmp_path: Path) -> None:
     write_photos(tmp_path, NAMES[:1], (HEIGHT, WIDTH))
-    (tmp_path / "a.csv").write_text(f"#name,x,y,alt,heading,pitch,roll,f,px,py\n{NAMES[0]},1,2,3,0,0,0,18,.1,.2\n")
+    (tmp_path / "a.csv").write_text(
+        f"#name,x,y,alt,heading,pitch,roll,f,px,py\n{NAMES[0]},1,2,3,0,0,0,18,.1,.2\n"
+    )
     view = read(tmp_path).splits["train"][0]
     expected = [[24, 0, 18 + 4.8], [0, 24, 24 + 9.6], [0, 0, 1]]
     np.testing.assert_allclose(view.intrinsics, expected)
@@ -209,7 +235,9 @@ def test_portrait_photos_are_measured_by_their_longer_side(tmp_path: Path) -> No
         ("DSC_1.jpg", "DSC_0.jpg", "more than once"),
     ],
 )
-def test_damaged_files_of_reality_capture_are_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_damaged_files_of_reality_capture_are_one_line(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
     file = write_reality(tmp_path) / "registration.csv"
     file.write_text(file.read_text().replace(old, new))
     with pytest.raises(DyngsError, match=message):
@@ -227,13 +255,16 @@ def test_two_files_of_cameras_are_refused(tmp_path: Path) -> None:
 
 def odm_pixel(local: np.ndarray, _: Path) -> tuple[float, float]:
     c = {key: value for key, value in ODM.items() if key != "projection_type"}
-    x, y = local[0] / local[2], local[1] / local[2]
+    x = local[0] / local[2]
+    y = local[1] / local[2]
     r2 = x * x + y * y
     radial = 1 + r2 * (c["k1"] + r2 * (c["k2"] + r2 * c["k3"]))
     u = x * radial + 2 * c["p1"] * x * y + c["p2"] * (r2 + 2 * x * x)
     v = y * radial + 2 * c["p2"] * x * y + c["p1"] * (r2 + 2 * y * y)
     # Normalised coordinates: the middle of the image is zero, its longer side has length one.
-    return (c["focal_x"] * u + c["c_x"]) * WIDTH + WIDTH / 2, (c["focal_y"] * v + c["c_y"]) * WIDTH + HEIGHT / 2
+    return (c["focal_x"] * u + c["c_x"]) * WIDTH + WIDTH / 2, (
+        c["focal_y"] * v + c["c_y"]
+    ) * WIDTH + HEIGHT / 2
 
 
 def test_odm_has_its_cameras_and_points(tmp_path: Path) -> None:
@@ -247,7 +278,9 @@ def test_odm_has_its_cameras_and_points(tmp_path: Path) -> None:
 
 
 def test_a_project_of_opensfm_is_read(tmp_path: Path) -> None:
-    (write_odm(tmp_path) / "opensfm" / "reconstruction.json").rename(tmp_path / "reconstruction.json")
+    (write_odm(tmp_path) / "opensfm" / "reconstruction.json").rename(
+        tmp_path / "reconstruction.json"
+    )
     assert_same_views(read(tmp_path), odm_pixel)
 
 
@@ -261,7 +294,14 @@ def test_odm_without_a_reconstruction(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("kind", "model"), [("perspective", "opencv"), ("fisheye", "fisheye")])
 def test_one_focal_length_of_odm_is_for_both_axes(tmp_path: Path, kind: str, model: str) -> None:
-    lens = {"projection_type": kind, "width": WIDTH, "height": HEIGHT, "focal": 0.75, "k1": 0.1, "k2": -0.05}
+    lens = {
+        "projection_type": kind,
+        "width": WIDTH,
+        "height": HEIGHT,
+        "focal": 0.75,
+        "k1": 0.1,
+        "k2": -0.05,
+    }
     view = read(write_odm(tmp_path, lens)).splits["train"][0]  # type: ignore[arg-type]
     np.testing.assert_allclose(view.intrinsics, [[36, 0, 24], [0, 36, 18], [0, 0, 1]])
     assert (view.lens.model, view.lens.params) == (model, (0.1, -0.05, 0.0, 0.0))
@@ -279,12 +319,16 @@ def test_one_focal_length_of_odm_is_for_both_axes(tmp_path: Path, kind: str, mod
         ({"width": 0, "height": 0}, "w and h must be|cannot be read"),
     ],
 )
-def test_damaged_cameras_of_odm_are_one_line(tmp_path: Path, change: dict[str, object], message: str) -> None:
+def test_damaged_cameras_of_odm_are_one_line(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
     with pytest.raises(DyngsError, match=message):
         read_odm(write_odm(tmp_path, ODM | change))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", "[{}]", '[{"shots": 1}]', '[{"shots": {"a": {}}, "cameras": {}}]'])
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", "[{}]", '[{"shots": 1}]', '[{"shots": {"a": {}}, "cameras": {}}]']
+)
 def test_damaged_reconstructions_are_one_line(tmp_path: Path, content: str) -> None:
     (write_odm(tmp_path) / "opensfm" / "reconstruction.json").write_text(content)
     with pytest.raises(DyngsError, match=r"reconstruction\.json: cannot be read"):

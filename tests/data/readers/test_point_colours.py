@@ -24,9 +24,13 @@ def write_ply(path: Path, columns: dict[str, np.ndarray], byte_order: str | None
     head = "\n".join([*header, "end_header", ""]).encode()
     if byte_order is None:
         rows = zip(*every.values(), strict=True)
-        body = "".join(" ".join(repr(number.item()) for number in row) + "\n" for row in rows).encode()
+        body = "".join(
+            " ".join(repr(number.item()) for number in row) + "\n" for row in rows
+        ).encode()
     else:
-        table = np.zeros(3, [(name, byte_order + value.dtype.str[1:]) for name, value in every.items()])
+        table = np.zeros(
+            3, [(name, byte_order + value.dtype.str[1:]) for name, value in every.items()]
+        )
         for name, value in every.items():
             table[name] = value
         body = table.tobytes()
@@ -69,7 +73,9 @@ def test_alpha_of_packed_floats_does_not_change_their_colours(tmp_path: Path) ->
     np.testing.assert_array_equal(points.rgb, COLOURS)
 
 
-@pytest.mark.parametrize("columns", [{}, {"red": np.zeros(3, np.uint8)}, {"intensity": np.ones(3, np.float32)}])
+@pytest.mark.parametrize(
+    "columns", [{}, {"red": np.zeros(3, np.uint8)}, {"intensity": np.ones(3, np.float32)}]
+)
 def test_points_without_colours_are_grey(tmp_path: Path, columns: dict[str, np.ndarray]) -> None:
     points = read_points(write_ply(tmp_path / "points.ply", columns, "<"))
     assert (points.rgb == GREY).all()
@@ -81,4 +87,5 @@ def test_odd_colours_are_bytes_nevertheless() -> None:
     found = point_colours({"red": wild, "green": wild, "blue": wild}, 4)
     assert found.dtype == np.uint8
     assert found[:2].tolist() == [[GREY] * 3, [0] * 3]
-    assert (point_colours({"red": wild, "green": wild, "blue": wild}, 3) == GREY).all()  # of another element
+    # of another element
+    assert (point_colours({"red": wild, "green": wild, "blue": wild}, 3) == GREY).all()

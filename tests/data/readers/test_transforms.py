@@ -45,8 +45,25 @@ ODD = (
         "true",
         "null",
     ),
-    *('""', '"/"', '"x"', '"\\u0000"', '"\\ud800"', '"\\u001b[2J"', "[]", "{}", "[[]]", "[1, 2, 3, 4]", '{"a": [1]}'),
-    *("[" * 500 + "]" * 500, "[" * 200_000, "[[1,0,0,0],[0,1,0,0],[0,0,1,1e300],[0,0,0,1]]", "[[1,2],[3]]"),
+    *(
+        '""',
+        '"/"',
+        '"x"',
+        '"\\u0000"',
+        '"\\ud800"',
+        '"\\u001b[2J"',
+        "[]",
+        "{}",
+        "[[]]",
+        "[1, 2, 3, 4]",
+        '{"a": [1]}',
+    ),
+    *(
+        "[" * 500 + "]" * 500,
+        "[" * 200_000,
+        "[[1,0,0,0],[0,1,0,0],[0,0,1,1e300],[0,0,0,1]]",
+        "[[1,2],[3]]",
+    ),
 )
 
 
@@ -56,12 +73,29 @@ def root(tmp_path: Path) -> Path:
     names = [f"images/{i}.png" for i in range(2)]
     for i, name in enumerate(names):
         write_image(tmp_path / name, random_pixels(8, 12, 3, seed=i))
-    lens = {"w": 12, "h": 8, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.0, "k1": 0.01, "p1": 0.001}
-    shared = {**lens, "camera_model": "OPENCV", "train_filenames": names[:1], "val_filenames": names[1:], "fps": 30}
+    lens = {
+        "w": 12,
+        "h": 8,
+        "fl_x": 10.0,
+        "fl_y": 11.0,
+        "cx": 6.0,
+        "cy": 4.0,
+        "k1": 0.01,
+        "p1": 0.001,
+    }
+    shared = {
+        **lens,
+        "camera_model": "OPENCV",
+        "train_filenames": names[:1],
+        "val_filenames": names[1:],
+        "fps": 30,
+    }
     write_frames(tmp_path / "transforms.json", names, shared)
     content = json.loads((tmp_path / "transforms.json").read_text())
     for i, frame in enumerate(content["frames"]):
-        frame.update(time=i / 3, frame=i, camera=0, mask_path=names[i], camera_angle_x=1.0, is_fisheye=False)
+        frame.update(
+            time=i / 3, frame=i, camera=0, mask_path=names[i], camera_angle_x=1.0, is_fisheye=False
+        )
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     return tmp_path
 
@@ -83,8 +117,30 @@ def use(root: Path) -> str:
     return ""
 
 
-KEYS = ("w", "h", "fl_x", "cx", "k1", "p1", "camera_model", "train_filenames", "frames", "ply_file_path", "fps")
-OWN = ("file_path", "transform_matrix", "time", "frame", "camera", "mask_path", "fl_x", "w", "is_fisheye")
+KEYS = (
+    "w",
+    "h",
+    "fl_x",
+    "cx",
+    "k1",
+    "p1",
+    "camera_model",
+    "train_filenames",
+    "frames",
+    "ply_file_path",
+    "fps",
+)
+OWN = (
+    "file_path",
+    "transform_matrix",
+    "time",
+    "frame",
+    "camera",
+    "mask_path",
+    "fl_x",
+    "w",
+    "is_fisheye",
+)
 
 
 @pytest.mark.parametrize("key", [*KEYS, *(f"frames/{key}" for key in OWN)])
@@ -120,13 +176,20 @@ def test_sizes_that_no_image_has(root: Path) -> None:
 
 
 def write_ply(path: Path, count: int) -> Path:
-    header = ["ply", "format ascii 1.0", f"element vertex {count}", *[f"property float {axis}" for axis in "xyz"]]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {count}",
+        *[f"property float {axis}" for axis in "xyz"],
+    ]
     path.write_text("\n".join([*header, "end_header", *["1 2 3"] * count]) + "\n")
     return path
 
 
 def names_file(root: Path, named: str | None = None) -> FrameFile:
-    return FrameFile(root / "transforms.json", (), {} if named is None else {"ply_file_path": named})
+    return FrameFile(
+        root / "transforms.json", (), {} if named is None else {"ply_file_path": named}
+    )
 
 
 @pytest.mark.parametrize(
@@ -141,7 +204,9 @@ def names_file(root: Path, named: str | None = None) -> FrameFile:
         ([], None, None),
     ],
 )
-def test_which_file_is_read(tmp_path: Path, files: list[str], named: str | None, read: str | None) -> None:
+def test_which_file_is_read(
+    tmp_path: Path, files: list[str], named: str | None, read: str | None
+) -> None:
     """The key wins, then the usual names in their order, then an only file."""
     for count, name in enumerate(files, 1):
         write_ply(tmp_path / name, count)
@@ -176,8 +241,16 @@ def test_names_as_other_programs_write_them(tmp_path: Path, written: str, encodi
     mask = folder + "masks\\a.png"
     write_image(tmp_path / "masks/a.png", random_pixels(8, 12, 1))
     frame = {"file_path": written, "mask_path": mask, "transform_matrix": np.eye(4).tolist()}
-    fields = {"w": 12, "h": 8, "fl_x": 10.0, "ply_file_path": folder + "points\\cloud.ply", "frames": [frame]}
-    (tmp_path / "transforms.json").write_bytes(json.dumps(fields, ensure_ascii=False).encode(encoding))
+    fields = {
+        "w": 12,
+        "h": 8,
+        "fl_x": 10.0,
+        "ply_file_path": folder + "points\\cloud.ply",
+        "frames": [frame],
+    }
+    (tmp_path / "transforms.json").write_bytes(
+        json.dumps(fields, ensure_ascii=False).encode(encoding)
+    )
     capture = read_nerfstudio(tmp_path)
     (view,) = capture.splits["train"]
     assert (view.image_path, view.mask_path) == (image, tmp_path / "masks/a.png")
@@ -210,14 +283,17 @@ def test_both_json_formats_read_them(blender_root: Path, nerfstudio_root: Path) 
         assert capture.points is not None
         assert (len(capture.points.xyz), capture.points_file) == (4, root / "points3d.ply")
         (root / "points3d.ply").unlink()
-    fields = json.loads((blender_root / "transforms_train.json").read_text()) | {"ply_file_path": "own.ply"}
+    fields = json.loads((blender_root / "transforms_train.json").read_text()) | {
+        "ply_file_path": "own.ply"
+    }
     (blender_root / "transforms_train.json").write_text(json.dumps(fields))
     own = write_ply(blender_root / "own.ply", 1)
     assert read_blender(blender_root).points_file == own
 
 
 @pytest.mark.parametrize(
-    "content", [None, b"", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", b"\x00" * 99]
+    "content",
+    [None, b"", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", b"\x00" * 99],
 )
 def test_bad_point_files_are_named(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "points.ply"
@@ -241,11 +317,15 @@ def test_bad_point_files_are_named(tmp_path: Path, content: bytes | None) -> Non
 def test_points_that_are_no_ply_are_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "points.ply"
     path.write_bytes(content)
-    with pytest.raises(DyngsError, match=r"points\.ply: cannot be read \(.*it must be a \.ply file of points"):
+    with pytest.raises(
+        DyngsError, match=r"points\.ply: cannot be read \(.*it must be a \.ply file of points"
+    ):
         read_points(path)
 
 
-def test_textures_that_points_name_are_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_textures_that_points_name_are_not_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lines = ["ply", "format ascii 1.0", "comment TextureFile ../own.png", "element vertex 3"]
     lines += [f"property float {name}" for name in ("x", "y", "z", "s", "t")]
     lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]

@@ -32,7 +32,12 @@ def params(frame: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(frame)
     poses = rng.normal(size=(1, 72))
     poses[:, :3] = 0
-    return {"poses": poses, "Rh": rng.normal(size=(1, 3)), "Th": rng.normal(size=(1, 3)), "shapes": np.ones((1, 10))}
+    return {
+        "poses": poses,
+        "Rh": rng.normal(size=(1, 3)),
+        "Th": rng.normal(size=(1, 3)),
+        "shapes": np.ones((1, 10)),
+    }
 
 
 def save(path: Path, value: object) -> None:
@@ -40,7 +45,9 @@ def save(path: Path, value: object) -> None:
     np.save(path, np.array(value, dtype=object), allow_pickle=True)
 
 
-def write_annots(root: Path, cameras: int = 4, frames: tuple[int, ...] = (0, 1, 2)) -> dict[str, Any]:
+def write_annots(
+    root: Path, cameras: int = 4, frames: tuple[int, ...] = (0, 1, 2)
+) -> dict[str, Any]:
     """The layout of several cameras; returns what ``annots.npy`` holds."""
     poses = [cam_from_world(camera) for camera in range(cameras)]
     cams = {
@@ -65,12 +72,17 @@ def write_annots(root: Path, cameras: int = 4, frames: tuple[int, ...] = (0, 1, 
 
 def write_single(root: Path, frames: int = 3) -> tuple[dict[str, Any], dict[str, Any]]:
     """The layout of one camera; returns what the two pickles hold."""
-    cameras, meshes = {}, {}
+    cameras = {}
+    meshes = {}
     joints = np.random.default_rng(7).normal(size=(24, 3))
     joints[0] = PELVIS
     for frame in range(frames):
         name = f"frame_{frame:06d}"
-        cameras[name] = {"intrinsics": K, "extrinsics": cam_from_world(0), "distortions": LENS[:, 0]}
+        cameras[name] = {
+            "intrinsics": K,
+            "extrinsics": cam_from_world(0),
+            "distortions": LENS[:, 0],
+        }
         own = {key: value[0] for key, value in params(frame).items() if key != "shapes"}
         meshes[name] = {**own, "joints": joints + 1, "tpose_joints": joints}
         write_image(root / "images" / f"{name}.png", random_pixels(12, 16, 3))
@@ -98,19 +110,29 @@ def test_cameras_frames_and_masks(tmp_path: Path) -> None:
         "zju_mocap",
         ("no camera is named for testing: the first one is held out",),
     )
-    keys = {name: [(v.frame, v.camera_id, v.time) for v in views] for name, views in capture.splits.items()}
+    keys = {
+        name: [(v.frame, v.camera_id, v.time) for v in views]
+        for name, views in capture.splits.items()
+    }
     assert keys == {
         "train": [(f, c, t) for f, t in ((3, 0.0), (4, 0.25), (7, 1.0)) for c in (1, 2, 3)],
         "test": [(f, 0, t) for f, t in ((3, 0.0), (4, 0.25), (7, 1.0))],
     }
     view = capture.splits["test"][0]
     assert view.silhouette == Silhouette(tmp_path / "mask_cihp/Camera_B1/000003.png", "nonzero")
-    assert (view.name, view.mask_path, view.width, view.height) == ("Camera_B1/000003", None, 16, 12)
+    assert (view.name, view.mask_path, view.width, view.height) == (
+        "Camera_B1/000003",
+        None,
+        16,
+        12,
+    )
     assert body_of(capture).frames == (3, 4, 7)
 
 
 @pytest.mark.parametrize("write", [write_annots, write_single])
-def test_points_appear_where_opencv_puts_them(tmp_path: Path, write: Callable[[Path], object]) -> None:
+def test_points_appear_where_opencv_puts_them(
+    tmp_path: Path, write: Callable[[Path], object]
+) -> None:
     """In metres, and with pixel centres at 0.5 instead of OpenCV's 0."""
     write(tmp_path)
     capture = read_zju_mocap(tmp_path)
@@ -124,7 +146,8 @@ def test_points_appear_where_opencv_puts_them(tmp_path: Path, write: Callable[[P
 
 @pytest.mark.parametrize("write", [write_annots, write_single])
 def test_global_motion_is_about_the_origin(tmp_path: Path, write: Callable[[Path], object]) -> None:
-    """``Rh (LBS about the pelvis) + Th``, here of a point that hangs on the root alone, also with a turned root."""
+    """``Rh (LBS about the pelvis) + Th``, here of a point that hangs on the root alone, also with a
+    turned root."""
     write(tmp_path)
     body = body_of(read_zju_mocap(tmp_path))
     same = about_pelvis(body, PELVIS)
@@ -132,7 +155,11 @@ def test_global_motion_is_about_the_origin(tmp_path: Path, write: Callable[[Path
         own = params(frame)
         turn = Rotation.from_rotvec(own["Rh"][0])
         point = np.array([0.3, 0.1, -0.2])
-        ours = Rotation.from_rotvec(same.poses[frame, 0]).apply(point - PELVIS) + PELVIS + same.trans[frame]
+        ours = (
+            Rotation.from_rotvec(same.poses[frame, 0]).apply(point - PELVIS)
+            + PELVIS
+            + same.trans[frame]
+        )
         np.testing.assert_allclose(ours, turn.apply(point) + own["Th"][0], atol=1e-12)
         np.testing.assert_array_equal(same.poses[frame, 1:].ravel(), own["poses"][0, 3:])
 
@@ -152,7 +179,11 @@ def test_one_camera(tmp_path: Path) -> None:
 
 def test_shape_coefficients_of_one_camera(tmp_path: Path) -> None:
     cameras, meshes = write_single(tmp_path)
-    dump(tmp_path, cameras, {name: {**own, "betas": np.full(10, 2.0)} for name, own in meshes.items()})
+    dump(
+        tmp_path,
+        cameras,
+        {name: {**own, "betas": np.full(10, 2.0)} for name, own in meshes.items()},
+    )
     assert body_of(read_zju_mocap(tmp_path)).betas.tolist() == [2.0] * 10
 
 
@@ -200,7 +231,12 @@ def test_missing_masks_are_counted(tmp_path: Path) -> None:
 
 def test_lenses_of_other_lengths(tmp_path: Path) -> None:
     annots = write_annots(tmp_path)
-    annots["cams"]["D"] = [np.zeros(5), np.arange(1, 5) / 100, np.arange(1, 9) / 100, np.zeros((1, 5))]
+    annots["cams"]["D"] = [
+        np.zeros(5),
+        np.arange(1, 5) / 100,
+        np.arange(1, 9) / 100,
+        np.zeros((1, 5)),
+    ]
     save(tmp_path / "annots.npy", annots)
     capture = read_zju_mocap(tmp_path)
     lenses = {v.camera_id: v.lens.params for views in capture.splits.values() for v in views}
@@ -210,7 +246,9 @@ def test_lenses_of_other_lengths(tmp_path: Path) -> None:
 def test_missing_files(tmp_path: Path) -> None:
     write_annots(tmp_path)
     (tmp_path / "new_params/1.npy").unlink()
-    with pytest.raises(DyngsError, match=r"new_params: no body parameters for 1 of 3 frames \(1\.npy\); restore"):
+    with pytest.raises(
+        DyngsError, match=r"new_params: no body parameters for 1 of 3 frames \(1\.npy\); restore"
+    ):
         read_zju_mocap(tmp_path)
     single = tmp_path / "single"
     write_single(single)
@@ -227,21 +265,47 @@ def test_missing_files(tmp_path: Path) -> None:
         (lambda a: a["cams"].pop("R"), "cams: the key 'R' is missing"),
         (lambda a: a["cams"].update(R=3), "cams: 'R' must be a list"),
         (lambda a: a["cams"].update(R=np.array({}, dtype=object)), "cams: 'R' must be a list"),
-        (lambda a: a["ims"][0]["ims"].__setitem__(0, "9" * 3000 + ".jpg"), "no frame number in the name"),
+        (
+            lambda a: a["ims"][0]["ims"].__setitem__(0, "9" * 3000 + ".jpg"),
+            "no frame number in the name",
+        ),
         (lambda a: a.update(cams=[]), "cams: must be a dictionary"),
-        (lambda a: a["cams"]["K"].__setitem__(1, [[1], [2, 3]]), "camera 1: the intrinsics must hold 3x3 finite"),
-        (lambda a: a["cams"]["K"].__setitem__(1, np.diag([-1.0, 1, 1])), "camera 1: fl_x must be positive"),
-        (lambda a: a["cams"]["D"].__setitem__(2, np.zeros(6)), "camera 2: the distortion must have 4, 5 or 8"),
-        (lambda a: a["cams"]["D"].__setitem__(2, ["x"]), "camera 2: the distortion must hold finite numbers"),
-        (lambda a: a["cams"]["R"].__setitem__(0, np.diag([1.0, 1, -1])), "camera 0: the pose is mirrored"),
-        (lambda a: a["cams"]["T"].__setitem__(3, np.full(3, np.nan)), "camera 3: 'T' must hold 3 finite numbers"),
-        (lambda a: a["ims"][1]["ims"].pop(), "ims 1: must name one image for each of the 4 cameras, got 3"),
+        (
+            lambda a: a["cams"]["K"].__setitem__(1, [[1], [2, 3]]),
+            "camera 1: the intrinsics must hold 3x3 finite",
+        ),
+        (
+            lambda a: a["cams"]["K"].__setitem__(1, np.diag([-1.0, 1, 1])),
+            "camera 1: fl_x must be positive",
+        ),
+        (
+            lambda a: a["cams"]["D"].__setitem__(2, np.zeros(6)),
+            "camera 2: the distortion must have 4, 5 or 8",
+        ),
+        (
+            lambda a: a["cams"]["D"].__setitem__(2, ["x"]),
+            "camera 2: the distortion must hold finite numbers",
+        ),
+        (
+            lambda a: a["cams"]["R"].__setitem__(0, np.diag([1.0, 1, -1])),
+            "camera 0: the pose is mirrored",
+        ),
+        (
+            lambda a: a["cams"]["T"].__setitem__(3, np.full(3, np.nan)),
+            "camera 3: 'T' must hold 3 finite numbers",
+        ),
+        (
+            lambda a: a["ims"][1]["ims"].pop(),
+            "ims 1: must name one image for each of the 4 cameras, got 3",
+        ),
         (lambda a: a["ims"][1].update(ims=[1, 2, 3, 4]), "ims 1: must name one image"),
         (lambda a: a["ims"][1].update(ims=["a.jpg"] * 4), "no frame number in the name 'a.jpg'"),
         (lambda a: a.update(ims=[]), "lists no images"),
     ],
 )
-def test_bad_annotations(tmp_path: Path, change: Callable[[dict[str, Any]], object], line: str) -> None:
+def test_bad_annotations(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], line: str
+) -> None:
     annots = write_annots(tmp_path)
     change(annots)
     save(tmp_path / "annots.npy", annots)
@@ -279,14 +343,34 @@ def test_bad_pickles_of_one_camera(tmp_path: Path) -> None:
     short = {name: own for name, own in meshes.items() if name != "frame_000001"}
     first = dict(meshes["frame_000000"])
     cases = [
-        (cameras, short, r"mesh_infos\.pkl: no body parameters for 1 frames that have images \(1\)"),
+        (
+            cameras,
+            short,
+            r"mesh_infos\.pkl: no body parameters for 1 frames that have images \(1\)",
+        ),
         (cameras, {}, r"mesh_infos\.pkl: must be a dictionary from image names"),
         (cameras, [meshes], r"mesh_infos\.pkl: must be a dictionary from image names"),
-        ({"../x_1": cameras["frame_000000"]}, meshes, r"cameras\.pkl: '\.\./x_1' is no name of an image"),
+        (
+            {"../x_1": cameras["frame_000000"]},
+            meshes,
+            r"cameras\.pkl: '\.\./x_1' is no name of an image",
+        ),
         ({"a_1": {"intrinsics": K}}, meshes, r"cameras\.pkl, a_1: the key 'extrinsics' is missing"),
-        (cameras, {**meshes, "frame_000000": {}}, r"mesh_infos\.pkl, frame_000000: the key 'poses' is missing"),
-        (cameras, {**meshes, "frame_0": first}, r"mesh_infos\.pkl: frame 0 has body parameters twice"),
-        (cameras, {**meshes, "frame_000000": {**first, "tpose_joints": 0}}, "'tpose_joints' must hold 72 finite"),
+        (
+            cameras,
+            {**meshes, "frame_000000": {}},
+            r"mesh_infos\.pkl, frame_000000: the key 'poses' is missing",
+        ),
+        (
+            cameras,
+            {**meshes, "frame_0": first},
+            r"mesh_infos\.pkl: frame 0 has body parameters twice",
+        ),
+        (
+            cameras,
+            {**meshes, "frame_000000": {**first, "tpose_joints": 0}},
+            "'tpose_joints' must hold 72 finite",
+        ),
     ]
     for bad_cameras, bad_meshes, line in cases:
         dump(tmp_path, bad_cameras, bad_meshes)
@@ -308,7 +392,9 @@ def test_one_camera_is_trained_on_and_all_others_tested(tmp_path: Path) -> None:
     """As published for one training camera, with new poses held out."""
     write_annots(tmp_path)
     capture = read_capture(DataConfig(root=tmp_path, train_cameras=(0,), pose_frames="2::"))
-    found = {name: {(v.camera_id, v.frame) for v in views} for name, views in capture.splits.items()}
+    found = {
+        name: {(v.camera_id, v.frame) for v in views} for name, views in capture.splits.items()
+    }
     others = {(camera, frame) for camera in (1, 2, 3) for frame in (0, 1)}
     held = {(camera, 2) for camera in (1, 2, 3)}
     assert found == {"train": {(0, 0), (0, 1)}, "val": set(), "test": others, "pose": held}

@@ -75,17 +75,21 @@ def test_capture_has_blender_layout_and_repeats_bytewise(tmp_path: Path) -> None
 
 
 def test_cameras_differ_by_seed_only_in_azimuth() -> None:
-    a, b = hemisphere_cameras(7, 4.0, 0), hemisphere_cameras(7, 4.0, 1)
+    a = hemisphere_cameras(7, 4.0, 0)
+    b = hemisphere_cameras(7, 4.0, 1)
     assert not np.allclose(a, b)
     np.testing.assert_allclose(a[:, 2, 3], b[:, 2, 3])
     assert (a[:, 2, 3] > 0).all()
 
 
-# ------------------------------------------------------------------------------------------------ scenes that move
+# ------------------------------------------------------------------------------------------------
+# scenes that move
 
 
 @pytest.mark.parametrize("name", ["spin", "room"])  # a camera per time, and fixed ones
-def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(name: SceneName, tmp_path: Path) -> None:
+def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(
+    name: SceneName, tmp_path: Path
+) -> None:
     first, second = (write_dynamic_capture(name, tmp_path / part, TINY) for part in ("a", "b"))
     assert _files(first) == _files(second)
     other = write_dynamic_capture(name, tmp_path / "c", replace(TINY, seed=1))
@@ -94,7 +98,9 @@ def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(name: Scene
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "room"])
-def test_one_camera_per_time_is_read_back_as_it_was_written(name: SceneName, tmp_path: Path) -> None:
+def test_one_camera_per_time_is_read_back_as_it_was_written(
+    name: SceneName, tmp_path: Path
+) -> None:
     capture = _read(write_dynamic_capture(name, tmp_path / "out", TINY))
     assert capture.has_alpha
     assert capture.warnings == ()
@@ -103,7 +109,10 @@ def test_one_camera_per_time_is_read_back_as_it_was_written(name: SceneName, tmp
     assert times["val"] == [0.0, 1.0]
     assert set(times["test"]) <= {0.125, 0.375, 0.625, 0.875}, "midway between training times"
     assert times["test"] == sorted(set(times["test"]))
-    centers = {s: np.array([camera_center(v.cam_from_world) for v in views]) for s, views in capture.splits.items()}
+    centers = {
+        s: np.array([camera_center(v.cam_from_world) for v in views])
+        for s, views in capture.splits.items()
+    }
     for kept in centers.values():
         np.testing.assert_allclose(np.linalg.norm(kept, axis=1), 4.0)
     np.testing.assert_array_equal(centers["val"][0], centers["val"][1])
@@ -116,7 +125,9 @@ def test_the_room_is_filmed_by_fixed_cameras_of_which_one_is_for_testing(tmp_pat
     capture = _read(write_dynamic_capture("room", tmp_path / "out", TINY))
     assert not capture.has_alpha
     assert capture.warnings == ()
-    seen = {split: {(v.camera_id, v.time) for v in views} for split, views in capture.splits.items()}
+    seen = {
+        split: {(v.camera_id, v.time) for v in views} for split, views in capture.splits.items()
+    }
     assert seen["train"] == {(camera, i / 4) for camera in range(3) for i in range(5)}
     assert seen["test"] == {(3, i / 4) for i in range(5)}
     assert seen["val"] == {(4, i / 4) for i in range(5)}
@@ -130,7 +141,9 @@ def test_the_room_is_filmed_by_fixed_cameras_of_which_one_is_for_testing(tmp_pat
     for camera, kept in poses.items():
         x, y, _ = camera_center(np.frombuffer(next(iter(kept))).reshape(4, 4))
         azimuths[camera] = np.degrees(np.arctan2(y, x))
-    assert azimuths[0] < azimuths[3] < azimuths[2], "the test camera stands between training cameras"
+    assert azimuths[0] < azimuths[3] < azimuths[2], (
+        "the test camera stands between training cameras"
+    )
     assert min(abs(azimuths[3] - azimuths[camera]) for camera in range(3)) > 5
 
 
@@ -139,7 +152,9 @@ def test_each_image_shows_its_scene_at_its_time(name: SceneName, tmp_path: Path)
     root = write_dynamic_capture(name, tmp_path / "out", TINY)
     for split in ("train", "val", "test"):
         frame = json.loads((root / f"transforms_{split}.json").read_text())["frames"][-1]
-        expected = render_scene(scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1)
+        expected = render_scene(
+            scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1
+        )
         found = _pixels(root / (frame["file_path"] + ".png"))
         np.testing.assert_array_equal(found, expected[..., : found.shape[2]])
         assert found.shape[2] == (3 if name == "room" else 4)
@@ -153,7 +168,9 @@ def test_held_out_images_have_masks_of_what_moves(name: SceneName, tmp_path: Pat
         assert all(("instance_mask_path" in frame) == (split != "train") for frame in frames)
         for frame in frames:
             things = _pixels(root / "things" / (frame["file_path"] + ".png"))
-            expected = render_things(scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1)
+            expected = render_things(
+                scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1
+            )
             np.testing.assert_array_equal(things[..., 0], expected)
             assert (expected > 0).mean() < 0.6
             assert expected.any()
@@ -161,8 +178,11 @@ def test_held_out_images_have_masks_of_what_moves(name: SceneName, tmp_path: Pat
 
 @pytest.mark.parametrize("name", NAMES)
 def test_inspection_finds_nothing_suspicious(name: SceneName, tmp_path: Path) -> None:
-    """But that so few images, each of a time of its own, show what moves from one side only; the room has cameras."""
-    problems = inspect_capture(write_dynamic_capture(name, tmp_path / "out", TINY), deep=True).problems
+    """But that so few images, each of a time of its own, show what moves from one side only; the
+    room has cameras."""
+    problems = inspect_capture(
+        write_dynamic_capture(name, tmp_path / "out", TINY), deep=True
+    ).problems
     assert len(problems) == (name != "room")
     assert all(line.endswith("expect a static result") for line in problems)
 
@@ -171,7 +191,8 @@ def test_one_time_and_many_test_images_are_allowed(tmp_path: Path) -> None:
     options = DynamicOptions(size=4, num_times=1, num_test=4, samples=1)
     capture = _read(write_dynamic_capture("spin", tmp_path / "out", options))
     assert [view.time for view in capture.splits["train"]] == [0.0]
-    assert [view.time for view in capture.splits["test"]] == [1.0] * 4  # 0.5 in the files: the end of the clip
+    # 0.5 in the files: the end of the clip
+    assert [view.time for view in capture.splits["test"]] == [1.0] * 4
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path) -> None:
@@ -187,15 +208,27 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path) ->
     assert [p.name for p in tmp_path.rglob("*")] == ["used", "mine.txt"]
 
 
-# ------------------------------------------------------------------------------------------------ dyngs data synth
+# ------------------------------------------------------------------------------------------------
+# dyngs data synth
 
 
-@pytest.mark.parametrize("scene", ["still", "polyhedra", "spin", "human", "people"])  # one of each writer
+# one of each writer
+@pytest.mark.parametrize("scene", ["still", "polyhedra", "spin", "human", "people"])
 def test_an_interrupted_command_leaves_nothing_and_may_be_repeated(
     scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of people, those that are finished stay, to be added to."""
-    words = ["data", "synth", scene, str(tmp_path / "out"), "--size", "8", "--views", "2", *SHORT.get(scene, ())]
+    words = [
+        "data",
+        "synth",
+        scene,
+        str(tmp_path / "out"),
+        "--size",
+        "8",
+        "--views",
+        "2",
+        *SHORT.get(scene, ()),
+    ]
     calls: list[Path] = []
 
     def interrupted(path: Path, pixels: np.ndarray) -> None:
@@ -232,7 +265,9 @@ def test_command_writes_and_says_what_is_next(
 ) -> None:
     name, *options = words
     assert main(["data", "synth", name, str(tmp_path / "new"), "--size", "8", *options]) == 0
-    assert f"dyngs train configs/{preset}.yaml data.root={tmp_path / 'new'}" in capsys.readouterr().out
+    assert (
+        f"dyngs train configs/{preset}.yaml data.root={tmp_path / 'new'}" in capsys.readouterr().out
+    )
     capture = _read(tmp_path / "new")
     assert len(capture.splits["train"]) == images
     assert {(view.width, view.height) for view in capture.splits["train"]} == {(8, 8)}
@@ -254,7 +289,11 @@ def test_command_writes_and_says_what_is_next(
     ],
 )
 def test_command_refuses_in_one_line(
-    words: str, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str,
+    part: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("used").mkdir()
@@ -283,7 +322,10 @@ def projected(points: np.ndarray, pose: np.ndarray, size: int = SIZE) -> np.ndar
 def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> None:
     poses = [orbit_cameras(1, 4.0, elevation, azimuth)[0] for elevation, azimuth in CAMERAS]
     times = np.linspace(0, 1, 5)
-    shots = [(f"v{i}", float(time), pose) for i, (time, pose) in enumerate(zip(times, poses, strict=True))]
+    shots = [
+        (f"v{i}", float(time), pose)
+        for i, (time, pose) in enumerate(zip(times, poses, strict=True))
+    ]
     tracks = true_tracks(lambda time: scene_at(name, time), shots)
     things = len(scene_at(name, 1.0).movers)
     assert tracks.points.shape == (5, POINTS_PER_THING * things, 3)
@@ -293,7 +335,9 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     for k, (_, time, pose) in enumerate(shots):
         seen = tracks.visible[k]
         assert seen.mean() > 0.1
-        assert seen.mean() < 0.9 or name == "wave", "others are on the far side or hidden, but not of a cloth"
+        assert seen.mean() < 0.9 or name == "wave", (
+            "others are on the far side or hidden, but not of a cloth"
+        )
         labels = np.pad(render_things(scene_at(name, time), pose, SIZE), 1)
         x, y = projected(tracks.points[k][seen], pose).astype(int).T
         own = 1 + np.flatnonzero(seen) // POINTS_PER_THING
@@ -305,18 +349,25 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
 def test_a_track_keeps_the_colour_that_its_point_has_at_the_start(
     name: SceneName, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In grey light and without highlights, a pixel is a grey times the paint that its point had at time 0."""
+    """In grey light and without highlights, a pixel is a grey times the paint that its point had at
+    time 0."""
     for light in ("_SKY", "_GROUND", "_LAMPLIGHT"):
         monkeypatch.setattr(raytrace, light, (0.4, 0.4, 0.4))
-    pose, times = orbit_cameras(1, 4.0, 28.0, -45.0)[0], (0.0, 0.3, 0.7)
+    pose = orbit_cameras(1, 4.0, 28.0, -45.0)[0]
+    times = (0.0, 0.3, 0.7)
     scenes = {t: scene_at(name, t) for t in times}
     tracks = true_tracks(scenes.__getitem__, [(f"v{t}", t, pose) for t in times])
     movers = [scenes[0.0].primitives[i] for i in scenes[0.0].movers]
     starts = tracks.points[0].reshape(len(movers), POINTS_PER_THING, 3)
-    paint = np.concatenate([thing.paint(thing.local(own)) for thing, own in zip(movers, starts, strict=True)])
+    paint = np.concatenate(
+        [thing.paint(thing.local(own)) for thing, own in zip(movers, starts, strict=True)]
+    )
     for k in (1, 2):
-        seen, scene = tracks.visible[k], scenes[times[k]]
-        dull = replace(scene, primitives=tuple(replace(thing, gloss=0.0) for thing in scene.primitives))
+        seen = tracks.visible[k]
+        scene = scenes[times[k]]
+        dull = replace(
+            scene, primitives=tuple(replace(thing, gloss=0.0) for thing in scene.primitives)
+        )
         x, y = projected(tracks.points[k][seen], pose, 8 * SIZE).astype(int).T
         pixels = render_scene(dull, pose, 8 * SIZE, 1)[y, x, :3] / 255
         linear = np.where(pixels < 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
@@ -326,17 +377,29 @@ def test_a_track_keeps_the_colour_that_its_point_has_at_the_start(
             return float((np.abs(shown - light * own).max(axis=1) < 0.02).mean())
 
         assert fitting(paint[seen]) > 0.85, "all but those at edges of the texture"
-        assert fitting(np.roll(paint[seen], 7, axis=0)) < 0.45, "the texture tells points from others"
+        assert fitting(np.roll(paint[seen], 7, axis=0)) < 0.45, (
+            "the texture tells points from others"
+        )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_labels_are_of_the_thing_that_the_ray_of_a_pixel_hits_first(name: SceneName) -> None:
-    scene, pose = scene_at(name, 0.6), orbit_cameras(1, 4.0, 28.0, -45.0)[0]
+    scene = scene_at(name, 0.6)
+    pose = orbit_cameras(1, 4.0, 28.0, -45.0)[0]
     rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
     focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
-    local = np.stack([columns - 0.5 * SIZE, 0.5 * SIZE - rows, np.full_like(rows, -focal)], axis=-1).reshape(-1, 3)
-    directions = (local / np.linalg.norm(local, axis=1, keepdims=True) @ pose[:3, :3].T).astype(np.float32)
-    hits = np.stack([thing.intersect(pose[None, :3, 3].astype(np.float32), directions) for thing in scene.primitives])
+    local = np.stack(
+        [columns - 0.5 * SIZE, 0.5 * SIZE - rows, np.full_like(rows, -focal)], axis=-1
+    ).reshape(-1, 3)
+    directions = (local / np.linalg.norm(local, axis=1, keepdims=True) @ pose[:3, :3].T).astype(
+        np.float32
+    )
+    hits = np.stack(
+        [
+            thing.intersect(pose[None, :3, 3].astype(np.float32), directions)
+            for thing in scene.primitives
+        ]
+    )
     first = np.where(np.isfinite(hits.min(axis=0)), hits.argmin(axis=0), -1)
     expected = np.maximum(first - scene.movers.start + 1, 0).reshape(SIZE, SIZE)
     labels = render_things(scene, pose, SIZE, 1)
@@ -345,31 +408,57 @@ def test_labels_are_of_the_thing_that_the_ray_of_a_pixel_hits_first(name: SceneN
 
 
 @pytest.mark.parametrize("name", ["roll", "room"])
-def test_a_moving_camera_goes_along_a_smooth_arc_and_a_fixed_one_tests_it(name: SceneName, tmp_path: Path) -> None:
+def test_a_moving_camera_goes_along_a_smooth_arc_and_a_fixed_one_tests_it(
+    name: SceneName, tmp_path: Path
+) -> None:
     options = replace(TINY, size=4, num_times=30, num_test=6, style="moving")
     capture = _read(write_dynamic_capture(name, tmp_path / "out", options))
-    train, test = (np.array([camera_center(v.cam_from_world) for v in capture.splits[s]]) for s in ("train", "test"))
+    train, test = (
+        np.array([camera_center(v.cam_from_world) for v in capture.splits[s]])
+        for s in ("train", "test")
+    )
     assert [view.time for view in capture.splits["train"]] == pytest.approx(np.linspace(0, 1, 30))
     steps_deg = np.degrees(np.arccos((train[1:] * train[:-1]).sum(axis=1) / 16.0))
     assert 1.0 < steps_deg.min() < steps_deg.max() < 4.0, "no teleport"
     assert np.degrees(np.arccos((train[0] * train[-1]).sum() / 16.0)) > 50.0
     assert len(test) == 6
     assert (test == test[0]).all()
-    assert not {view.time for view in capture.splits["test"]} & {view.time for view in capture.splits["train"]}
+    assert not {view.time for view in capture.splits["test"]} & {
+        view.time for view in capture.splits["train"]
+    }
     assert capture.warnings == ()
     assert capture.has_alpha == (name == "roll")
 
 
 @pytest.mark.parametrize(("name", "count"), [("roll", 4), ("room", 9)])
-def test_fixed_cameras_each_see_all_times_of_any_scene(name: SceneName, count: int, tmp_path: Path) -> None:
+def test_fixed_cameras_each_see_all_times_of_any_scene(
+    name: SceneName, count: int, tmp_path: Path
+) -> None:
     root = tmp_path / "out"
-    words = ["data", "synth", name, str(root), "--size", "4", "--views", "3", "--cameras", str(count)]
+    words = [
+        "data",
+        "synth",
+        name,
+        str(root),
+        "--size",
+        "4",
+        "--views",
+        "3",
+        "--cameras",
+        str(count),
+    ]
     assert main(words) == 0
     capture = _read(root)
     seen = [(v.camera_id, v.time, v.cam_from_world.tobytes()) for v in capture.splits["train"]]
-    assert {(camera, time) for camera, time, _ in seen} == {(c, t) for c in range(count) for t in (0.0, 0.5, 1.0)}
+    assert {(camera, time) for camera, time, _ in seen} == {
+        (c, t) for c in range(count) for t in (0.0, 0.5, 1.0)
+    }
     assert len(seen) == 3 * count
-    assert len({pose for _, _, pose in seen}) == len({(camera, pose) for camera, _, pose in seen}) == count
+    assert (
+        len({pose for _, _, pose in seen})
+        == len({(camera, pose) for camera, _, pose in seen})
+        == count
+    )
     assert {view.camera_id for view in capture.splits["test"]} == {count}
     assert capture.has_alpha == (name == "roll")
     assert inspect_capture(root, deep=True).problems == ()

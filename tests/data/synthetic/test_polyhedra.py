@@ -31,7 +31,9 @@ def test_a_solid_cube_is_a_box() -> None:
 
 
 def test_faces_have_their_colours() -> None:
-    ahead = np.array([[0.6, 0.2, 0.0], [0.1, 0.7, 0.0], [0.1, 0.2, 0.5], [-0.4, 0.2, 0.0]], np.float32)
+    ahead = np.array(
+        [[0.6, 0.2, 0.0], [0.1, 0.7, 0.0], [0.1, 0.2, 0.5], [-0.4, 0.2, 0.0]], np.float32
+    )
     assert cube().face(ahead).tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(cube().paint(cube().local(ahead)), [*COLOURS, COLOURS[0]])
 
@@ -50,5 +52,7 @@ def test_edges_of_a_cube_from_ahead_are_a_square() -> None:
 
 def test_every_shape_is_seen() -> None:
     scene = polyhedra()
-    ids = np.concatenate([face_ids(scene, pose, 64, 1).ravel() for pose in orbit_cameras(4, 4.0, 35.0, 20.0)])
+    ids = np.concatenate(
+        [face_ids(scene, pose, 64, 1).ravel() for pose in orbit_cameras(4, 4.0, 35.0, 20.0)]
+    )
     assert set(np.unique(ids[ids >= 0] // 64)) == set(range(len(scene.primitives)))

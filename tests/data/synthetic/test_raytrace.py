@@ -1,4 +1,5 @@
-"""The ray tracer against closed forms: disks, projected points, faces, the surface of a waving sheet."""
+"""The ray tracer against closed forms: disks, projected points, faces, the surface of a waving
+sheet."""
 
 from __future__ import annotations
 
@@ -9,7 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.data.synthetic.captures import hemisphere_cameras, orbit_cameras
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Box, Scene, Sheet, Sphere, Wave, render_scene
+from dyngs.data.synthetic.raytrace import (
+    CAMERA_ANGLE_X,
+    Box,
+    Scene,
+    Sheet,
+    Sphere,
+    Wave,
+    render_scene,
+)
 
 SHEET = Sheet(
     (0.1, -0.2, 0.3),
@@ -26,7 +35,10 @@ def _grey(local: np.ndarray) -> np.ndarray:
 def test_sphere_covers_the_disk_that_perspective_predicts() -> None:
     size, distance, radius = 96, 4.0, 0.8
     pose = orbit_cameras(1, distance, elevation_deg=30.0, start_deg=20.0)[0]
-    alpha = render_scene(Scene((Sphere((0, 0, 0), radius, _grey),)), pose, size, samples=4)[..., 3] / 255.0
+    alpha = (
+        render_scene(Scene((Sphere((0, 0, 0), radius, _grey),)), pose, size, samples=4)[..., 3]
+        / 255.0
+    )
     focal_px = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
     disk_px = np.pi * (focal_px * radius / np.sqrt(distance**2 - radius**2)) ** 2
     assert abs(alpha.sum() / disk_px - 1) < 0.005
@@ -37,9 +49,12 @@ def test_sphere_covers_the_disk_that_perspective_predicts() -> None:
 
 
 def test_a_point_is_drawn_where_its_camera_sees_it() -> None:
-    size, point = 128, np.array([0.5, -0.3, 0.4])
+    size = 128
+    point = np.array([0.5, -0.3, 0.4])
     pose = hemisphere_cameras(5, 4.0, seed=3)[2]
-    alpha = render_scene(Scene((Sphere(tuple(point), 0.05, _grey),)), pose, size)[..., 3].astype(float)
+    alpha = render_scene(Scene((Sphere(tuple(point), 0.05, _grey),)), pose, size)[..., 3].astype(
+        float
+    )
     local = np.linalg.inv(pose) @ [*point, 1.0]
     focal_px = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
     expected = 0.5 * size + focal_px * np.array([local[0], -local[1]]) / -local[2]
@@ -61,9 +76,12 @@ def test_box_faces_are_hit_with_their_normals() -> None:
 
 
 def test_paint_turns_with_the_ball() -> None:
-    """The paint of a turned ball at a turned point is the paint of the ball as it was at the point as it was."""
+    """The paint of a turned ball at a turned point is the paint of the ball as it was at the point
+    as it was."""
     angle = 0.8
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
     still = Sphere((1.0, -2.0, 0.5), 0.7, _grey)
     turned = replace(still, turn=turn)
     directions = _unit(np.random.default_rng(1).normal(size=(50, 3)))
@@ -82,11 +100,14 @@ def test_lamp_side_is_brighter_and_shadow_is_darker() -> None:
     alone = render_scene(Scene((plate,)), pose, 64)
     with_ball = render_scene(Scene((plate, ball)), pose, 64)
     both_plate = (alone[..., 3] == 255) & (np.abs(with_ball.astype(int) - alone).max(axis=2) > 0)
-    assert with_ball[both_plate].astype(int)[:, :3].sum() < alone[both_plate].astype(int)[:, :3].sum()
+    assert (
+        with_ball[both_plate].astype(int)[:, :3].sum() < alone[both_plate].astype(int)[:, :3].sum()
+    )
 
 
 def test_a_faint_neighbour_changes_nothing_far_from_it() -> None:
-    """With ``faint`` a ball darkens its surroundings, of which the form factor is above it, and nothing else."""
+    """With ``faint`` a ball darkens its surroundings, of which the form factor is above it, and
+    nothing else."""
     plate = Box((0, 0, -0.5), (3.0, 3.0, 0.05), _grey, gloss=0.0)
     ball = Sphere((0.0, 0.0, -0.25), 0.2, _grey)
     above = orbit_cameras(1, 8.0, elevation_deg=90.0, start_deg=0.0)[0]
@@ -106,7 +127,8 @@ def test_a_faint_neighbour_changes_nothing_far_from_it() -> None:
 
 
 def test_rays_through_a_sheet_end_on_its_surface() -> None:
-    """``z = height(u, v)`` inside the rectangle; and no point before it lies on the other side (dense, float64)."""
+    """``z = height(u, v)`` inside the rectangle; and no point before it lies on the other side
+    (dense, float64)."""
     rng = np.random.default_rng(2)
     center = np.array(SHEET.center)
     origins = (center + 3 * _unit(rng.normal(size=(300, 3)))).astype(np.float32)
@@ -134,18 +156,29 @@ def _first_crossing(start: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return np.where(crossing.any(axis=1), distance[crossing.argmax(axis=1)], np.inf)
 
 
-@given(u=st.floats(-0.7, 0.7), v=st.floats(-0.5, 0.5), phase=st.floats(0, 6.3), amplitude=st.floats(0.0, 0.2))
+@given(
+    u=st.floats(-0.7, 0.7),
+    v=st.floats(-0.5, 0.5),
+    phase=st.floats(0, 6.3),
+    amplitude=st.floats(0.0, 0.2),
+)
 @settings(max_examples=40, deadline=None)
-def test_a_ray_from_above_meets_the_material_point_below_it(u: float, v: float, phase: float, amplitude: float) -> None:
-    """However the sheet waves, (u, v) stays what it is, its height is the sine, its normal that of the gradient."""
+def test_a_ray_from_above_meets_the_material_point_below_it(
+    u: float, v: float, phase: float, amplitude: float
+) -> None:
+    """However the sheet waves, (u, v) stays what it is, its height is the sine, its normal that of
+    the gradient."""
     sheet = replace(SHEET, center=(0.0, 0.0, 0.0), waves=(Wave(amplitude, (4.0, 3.0), phase),))
-    origin, down = np.array([[u, v, 2.0]], np.float32), np.array([[0.0, 0.0, -1.0]], np.float32)
+    origin = np.array([[u, v, 2.0]], np.float32)
+    down = np.array([[0.0, 0.0, -1.0]], np.float32)
     point = origin + sheet.intersect(origin, down)[:, None] * down
     angle = 4.0 * u + 3.0 * v + phase
     np.testing.assert_allclose(point[0], [u, v, amplitude * np.sin(angle)], atol=3e-6)
     np.testing.assert_allclose(sheet.local(point)[0], [u / 0.8, v / 0.6, 0.0], atol=1e-6)
     gradient = amplitude * np.cos(angle) * np.array([4.0, 3.0])
-    np.testing.assert_allclose(sheet.normals(point)[0], _unit(np.array([*-gradient, 1.0])), atol=3e-6)
+    np.testing.assert_allclose(
+        sheet.normals(point)[0], _unit(np.array([*-gradient, 1.0])), atol=3e-6
+    )
 
 
 def test_a_sheet_is_seen_from_both_sides_and_throws_a_shadow() -> None:
@@ -158,7 +191,9 @@ def test_a_sheet_is_seen_from_both_sides_and_throws_a_shadow() -> None:
     lit, dark = (image[image[..., 3] == 255][:, :3].mean() for image in (top, bottom))
     assert lit > dark + 40, "the lamp is above"
     plate = Box((0.0, 0.0, -0.9), (1.5, 1.5, 0.1), _grey)
-    free, under = (render_scene(Scene(things), above, 48, 2)[..., :3] for things in ((plate,), (plate, sheet)))
+    free, under = (
+        render_scene(Scene(things), above, 48, 2)[..., :3] for things in ((plate,), (plate, sheet))
+    )
     assert (under.astype(int) - free).min() < -40
 
 

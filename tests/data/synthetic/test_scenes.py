@@ -1,4 +1,5 @@
-"""The embedded scenes: what moves is where its formula says, what is still is still, paint sticks to its surface."""
+"""The embedded scenes: what moves is where its formula says, what is still is still, paint sticks
+to its surface."""
 
 from __future__ import annotations
 
@@ -11,7 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.data.synthetic.captures import hemisphere_cameras, orbit_cameras
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Box, Paint, Scene, Sheet, Sphere, render_scene
+from dyngs.data.synthetic.raytrace import (
+    CAMERA_ANGLE_X,
+    Box,
+    Paint,
+    Scene,
+    Sheet,
+    Sphere,
+    render_scene,
+)
 from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
 from dyngs.errors import DyngsError
 
@@ -49,7 +58,9 @@ def test_the_room_is_opaque_in_all_directions() -> None:
 
 
 def test_unknown_scene_is_refused_with_the_names_there_are() -> None:
-    with pytest.raises(DyngsError, match="no moving scene 'nosuch'; choose one of spin, wave, room, roll"):
+    with pytest.raises(
+        DyngsError, match="no moving scene 'nosuch'; choose one of spin, wave, room, roll"
+    ):
         scene_at("nosuch", 0.0)  # type: ignore[arg-type]
 
 
@@ -57,7 +68,8 @@ def test_unknown_scene_is_refused_with_the_names_there_are() -> None:
 def test_still_primitives_come_first_and_stay(name: SceneName) -> None:
     """Where they are and how they are painted; of the others each changes."""
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3)).astype(np.float32)
-    first, second = scene_at(name, 0.35).primitives, scene_at(name, 0.72).primitives
+    first = scene_at(name, 0.35).primitives
+    second = scene_at(name, 0.72).primitives
     still = NUM_STILL[name]
     for a, b in zip(first[:still], second[:still], strict=True):
         assert repr(a).split("paint")[0] == repr(b).split("paint")[0]
@@ -70,7 +82,8 @@ def test_still_primitives_come_first_and_stay(name: SceneName) -> None:
 
 @pytest.mark.parametrize("name", ["spin", "room"])
 def test_far_from_the_mover_nothing_changes(name: SceneName) -> None:
-    """From a fixed camera, exactly: neither light nor sky of what is far from the moving thing depends on it."""
+    """From a fixed camera, exactly: neither light nor sky of what is far from the moving thing
+    depends on it."""
     pose = orbit_cameras(1, 4.0, elevation_deg=28.0, start_deg=-45.0)[0]
     first, second = (render_scene(scene_at(name, time), pose, 64, 2) for time in (0.0, 1.0))
     same = (first == second).all(axis=-1)
@@ -85,11 +98,15 @@ def test_far_from_the_mover_nothing_changes(name: SceneName) -> None:
 
 @given(time=times, azimuth_deg=st.floats(0, 360), elevation_deg=st.floats(5, 80))
 @settings(max_examples=12, deadline=None)
-def test_the_rolling_ball_is_seen_where_its_path_says(time: float, azimuth_deg: float, elevation_deg: float) -> None:
-    """A ball's outline is an ellipse whose middle lies between the projections of its two tangent rays."""
+def test_the_rolling_ball_is_seen_where_its_path_says(
+    time: float, azimuth_deg: float, elevation_deg: float
+) -> None:
+    """A ball's outline is an ellipse whose middle lies between the projections of its two tangent
+    rays."""
     size = 96
     angle = np.radians(-130.0 + 130.0 * time)
-    center, radius = np.array([0.70 * np.cos(angle), 0.70 * np.sin(angle), -0.10]), 0.24
+    center = np.array([0.70 * np.cos(angle), 0.70 * np.sin(angle), -0.10])
+    radius = 0.24
     ball = scene_at("spin", time).primitives[-1]
     pose = orbit_cameras(1, 4.0, elevation_deg, azimuth_deg)[0]
     alpha = render_scene(Scene((ball,)), pose, size, samples=4)[..., 3].astype(float)
@@ -97,7 +114,8 @@ def test_the_rolling_ball_is_seen_where_its_path_says(time: float, azimuth_deg: 
     found = np.array([(alpha * columns).sum(), (alpha * rows).sum()]) / alpha.sum()
     local = np.linalg.inv(pose) @ [*center, 1.0]
     off_axis = np.array([local[0], -local[1]]) / -local[2]
-    tilt, half = np.arctan(np.linalg.norm(off_axis)), np.arcsin(radius / np.linalg.norm(local[:3]))
+    tilt = np.arctan(np.linalg.norm(off_axis))
+    half = np.arcsin(radius / np.linalg.norm(local[:3]))
     middle = 0.5 * (np.tan(tilt + half) + np.tan(tilt - half))
     expected = 0.5 * size + FOCAL * size * middle * off_axis / np.linalg.norm(off_axis)
     np.testing.assert_allclose(found, expected, atol=0.12)  # 1/4 pixel samples
@@ -108,7 +126,9 @@ def test_the_rolling_ball_is_seen_where_its_path_says(time: float, azimuth_deg: 
 @settings(max_examples=10, deadline=None)
 def test_balls_roll_without_slipping(name: SceneName, index: int, time: float) -> None:
     """The material point that touches the plate is at rest, while the centre is not."""
-    before, now, after = (scene_at(name, time + step).primitives[index] for step in (-1e-4, 0.0, 1e-4))
+    before, now, after = (
+        scene_at(name, time + step).primitives[index] for step in (-1e-4, 0.0, 1e-4)
+    )
     assert isinstance(before, Sphere)
     assert isinstance(now, Sphere)
     assert isinstance(after, Sphere)
@@ -128,7 +148,8 @@ def test_spinning_things_never_touch(time: float) -> None:
     assert isinstance(ball, Sphere)
     assert isinstance(other, Sphere)
     assert die.center[2] - die.half_extents[2] == pytest.approx(-0.34)
-    c, s = np.cos(die.yaw), np.sin(die.yaw)
+    c = np.cos(die.yaw)
+    s = np.sin(die.yaw)
     across = np.abs(np.array([[c, s], [-s, c]]) @ ball.center[:2])
     gap = np.maximum(across - die.half_extents[:2], 0.0)
     assert np.linalg.norm(gap) > ball.radius
@@ -142,7 +163,9 @@ def test_faces_of_the_die_hold_one_to_six_pips_and_opposite_ones_seven() -> None
     for axis in range(3):
         for side in range(2):
             local = np.empty((len(a), 3), np.float32)
-            local[:, axis], local[:, axis - 1], local[:, axis - 2] = 2 * side - 1, a, b
+            local[:, axis] = 2 * side - 1
+            local[:, axis - 1] = a
+            local[:, axis - 2] = b
             is_pip = (paint(local) == np.array([0.96, 0.94, 0.88], np.float32)).all(axis=1)
             counts[axis, side] = is_pip.mean() * 4 / (np.pi * 0.19**2)
     np.testing.assert_allclose(counts, counts.round(), atol=0.1)
@@ -162,8 +185,11 @@ def test_the_cloth_closes_its_cycle_and_bends_in_between() -> None:
 
 @pytest.mark.parametrize("time", [0.0, 0.2, 0.55, 0.9])
 def test_a_mark_on_the_cloth_is_seen_where_its_material_point_is(time: float) -> None:
-    """Texture moves with the cloth: a painted spot is drawn at the projection of (u, v, height(u, v))."""
-    size, u, v = 128, 0.31, -0.22
+    """Texture moves with the cloth: a painted spot is drawn at the projection of (u, v, height(u,
+    v))."""
+    size = 128
+    u = 0.31
+    v = -0.22
     sheet = replace(_cloth(time), paint=_spot(u / 0.74, v / 0.56))
     pose = orbit_cameras(1, 4.0, elevation_deg=50.0, start_deg=-60.0)[0]
     image = render_scene(Scene((sheet,)), pose, size, samples=3).astype(float)

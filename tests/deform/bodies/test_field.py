@@ -1,4 +1,5 @@
-"""Bodies within another field: they move rigidly, all else as it did, and nothing is lost when they are stored."""
+"""Bodies within another field: they move rigidly, all else as it did, and nothing is lost when they
+are stored."""
 
 from __future__ import annotations
 
@@ -28,18 +29,22 @@ def field_of(kind: str = "control_nodes", points: int = 7) -> BodyField:
     quats = torch.tensor([1.0, 0, 0, 0]) + 0.5 * torch.randn(2, points, 4, generator=generator)
     rest = BodyRest(CENTERS, RADII, LABELS)
     return BodyField(
-        stirred_field(kind), rest, {"places": places, "quats": quats, "albedo": torch.ones(len(LABELS), 3)}
+        stirred_field(kind),
+        rest,
+        {"places": places, "quats": quats, "albedo": torch.ones(len(LABELS), 3)},
     )
 
 
 @pytest.mark.parametrize("kind", ["control_nodes", "hexplane"])
 def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
     """x' = R (x - c) + p in float64; the Gaussians turn with their body, and keep their size."""
-    field, gaussians = field_of(kind), cloud()
+    field = field_of(kind)
+    gaussians = cloud()
     for time in TIMES:
         places, quats = (x.detach().double().numpy() for x in field.poses(time))
         turns = Rotation.from_quat(quats[:, [1, 2, 3, 0]])
-        offsets, alone = field.offsets(gaussians.means, time), field.others.offsets(gaussians.means, time)
+        offsets = field.offsets(gaussians.means, time)
+        alone = field.others.offsets(gaussians.means, time)
         moved = deformed(gaussians, offsets).detach()
         for body in range(2):
             own = torch.tensor([i for i, label in enumerate(LABELS.tolist()) if label == body])
@@ -47,7 +52,8 @@ def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
             expected = turns[body].apply(arms) + places[body]
             np.testing.assert_allclose(moved.means[own].numpy(), expected, atol=2e-6)
             before, after = (
-                Rotation.from_quat(x[own].double().numpy()[:, [1, 2, 3, 0]]) for x in (gaussians.quats, moved.quats)
+                Rotation.from_quat(x[own].double().numpy()[:, [1, 2, 3, 0]])
+                for x in (gaussians.quats, moved.quats)
             )
             assert (after * (turns[body] * before).inv()).magnitude().max() < 1e-5
             assert torch.equal(moved.log_scales[own], gaussians.log_scales[own])
@@ -60,12 +66,15 @@ def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
 
 
 def test_bodies_turn_into_the_light_and_out_of_it() -> None:
-    """Light from +x: a Gaussian is lit by how far along x it lies from its body's centre, by now."""
-    field, means = field_of(), cloud().means
+    """Light from +x: a Gaussian is lit by how far along x it lies from its body's centre, by
+    now."""
+    field = field_of()
+    means = cloud().means
     field.parameters["light"].data[0] = torch.tensor([0.5, 0.25, 0.0])
     field.parameters["albedo"].data[:] = torch.arange(1.0, 10.0)[:, None]
     for time in TIMES:
-        found, alone = field.offsets(means, time), field.others.offsets(means, time)
+        found = field.offsets(means, time)
+        alone = field.others.offsets(means, time)
         assert found.colors is not None
         assert alone.colors is not None
         arms = means + found.means - field.poses(time)[0][LABELS.clamp_min(0)]
@@ -75,21 +84,29 @@ def test_bodies_turn_into_the_light_and_out_of_it() -> None:
 
 
 def test_rows_alone_are_computed_alike() -> None:
-    field, means, rows = field_of(), cloud().means, torch.tensor([8, 0, 3])
-    some, every = field.offsets(means, 0.37, rows), field.offsets(means, 0.37).select(rows)
+    field = field_of()
+    means = cloud().means
+    rows = torch.tensor([8, 0, 3])
+    some = field.offsets(means, 0.37, rows)
+    every = field.offsets(means, 0.37).select(rows)
     for name, x in vars(some).items():
         torch.testing.assert_close(x, getattr(every, name), rtol=0, atol=1e-6)
 
 
 def test_gradients_reach_the_motion_and_the_gaussians() -> None:
-    field, means = field_of(), cloud().means.requires_grad_()
+    field = field_of()
+    means = cloud().means.requires_grad_()
     field.parameters["light"].data[:] = 0.1
     out = field.offsets(means, 0.37)
     assert out.quats is not None
     assert out.colors is not None
     lit = field.shaded(cloud(), torch.arange(len(LABELS)), None, 0.37).sh.sum()
     (
-        lit + out.means.square().sum() + out.quats.sum() + out.colors.sum() + sum(field.penalties(0.37).values())
+        lit
+        + out.means.square().sum()
+        + out.quats.sum()
+        + out.colors.sum()
+        + sum(field.penalties(0.37).values())
     ).backward()
     assert all(x.grad is not None and bool(x.grad.any()) for x in field.parameters.leaves)
     assert means.grad is not None
@@ -100,7 +117,9 @@ def test_gradients_reach_the_motion_and_the_gaussians() -> None:
 
 
 def test_what_is_born_belongs_to_its_parents_body() -> None:
-    edited = field_of().edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
+    edited = field_of().edited(
+        TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False]))
+    )
     assert edited.rest.labels.tolist() == [1, 1, -1]
 
 
@@ -109,7 +128,8 @@ def stored(field: BodyField) -> dict[str, Tensor]:
 
 
 def test_a_stored_field_is_the_same_field() -> None:
-    field, means = field_of(), cloud().means
+    field = field_of()
+    means = cloud().means
     again = restored_field(tiny_options("control_nodes"), stored(field), 9)
     assert isinstance(again, BodyField)
     assert stored(again).keys() == stored(field).keys()
@@ -140,15 +160,19 @@ def test_a_forged_state_is_refused(name: str, change: Callable[[Tensor], Tensor 
         restored_field(tiny_options("control_nodes"), tensors, 9)
 
 
-@pytest.mark.parametrize(("window", "learned"), [((0.3, 0.7), (3, 4)), ((0.35, 0.45), (3,)), ((0.0, 1.0), range(8))])
+@pytest.mark.parametrize(
+    ("window", "learned"), [((0.3, 0.7), (3, 4)), ((0.35, 0.45), (3,)), ((0.0, 1.0), range(8))]
+)
 def test_what_the_window_of_times_hardly_shows_stays_as_it_was_found(
     window: tuple[float, float], learned: tuple[int, ...] | range
 ) -> None:
     """Of 8 control points, that is 5 pieces, those that peak in the window are learned.
 
-    Adam, which makes steps of one size however weak the gradients are, once took paths a ball's width away.
+    Adam, which makes steps of one size however weak the gradients are, once took paths a ball's
+    width away.
     """
-    field, means = field_of(points=8), cloud().means
+    field = field_of(points=8)
+    means = cloud().means
     before = {name: x.detach().clone() for name, x in field.parameters.values().items()}
     for step in range(1, 4):
         for time in torch.linspace(*window, 7).tolist():

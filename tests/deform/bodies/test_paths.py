@@ -1,4 +1,5 @@
-"""Paths of what moves before one moving camera: a ball is found where it is, and nothing where nothing moves."""
+"""Paths of what moves before one moving camera: a ball is found where it is, and nothing where
+nothing moves."""
 
 from __future__ import annotations
 
@@ -44,6 +45,8 @@ def test_a_disc_stands_out_most_at_its_own_size() -> None:
     x, y, radius = discs.peaks(0)[0]
     assert (x, y) == pytest.approx((24, 30), abs=1)
     assert radius == pytest.approx(8, rel=0.25)
-    inside, outside = discs.at(np.array([0, 0]), np.array([[24.0, 30.0], [-5.0, 30.0]]), np.array([8.0, 8.0]))
+    inside, outside = discs.at(
+        np.array([0, 0]), np.array([[24.0, 30.0], [-5.0, 30.0]]), np.array([8.0, 8.0])
+    )
     assert inside > 0.9
     assert outside == pytest.approx(-0.2)

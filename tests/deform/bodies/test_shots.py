@@ -1,4 +1,5 @@
-"""What one moving camera shows: pixels, rays, the pixels on a ball, and what differs from the static model."""
+"""What one moving camera shows: pixels, rays, the pixels on a ball, and what differs from the
+static model."""
 
 from __future__ import annotations
 
@@ -56,7 +57,9 @@ def test_shifts_by_a_pixel_and_shadows_hardly_differ() -> None:
 
 def test_white_before_white_differs_in_alpha() -> None:
     shots, _, _ = rolling()
-    values = {name: x for name, x in vars(shots).items() if name != "centers"} | {"images": shots.still}
+    values = {name: x for name, x in vars(shots).items() if name != "centers"} | {
+        "images": shots.still
+    }
     assert Shots(**values).differences().max() == 0
     alphas = np.zeros_like(shots.alphas)
     alphas[:, 20:30, 20:30] = 1
@@ -67,7 +70,10 @@ def test_white_before_white_differs_in_alpha() -> None:
 def test_one_camera_shows_each_time_once() -> None:
     view = View("a", Path("a.png"), np.eye(4), np.eye(3), 4, 4)
     poses = [np.eye(4) + 0.1 * i * np.eye(4, k=3) for i in range(3)]
-    views = [replace(view, time=time, cam_from_world=pose) for time, pose in zip((0.5, 0.0, 1.0), poses, strict=True)]
+    views = [
+        replace(view, time=time, cam_from_world=pose)
+        for time, pose in zip((0.5, 0.0, 1.0), poses, strict=True)
+    ]
     assert one_camera(views) == [1, 0, 2]
     assert one_camera([*views, views[0]]) is None
     assert one_camera([replace(view, time=None)]) is None
@@ -75,8 +81,10 @@ def test_one_camera_shows_each_time_once() -> None:
 
 
 def test_masked_pixels_are_as_the_static_model_has_them() -> None:
-    gaussians, camera = cloud(), one_camera_of(8)
-    rgb, mask = torch.rand(8, 8, 3), torch.zeros(8, 8)
+    gaussians = cloud()
+    camera = one_camera_of(8)
+    rgb = torch.rand(8, 8, 3)
+    mask = torch.zeros(8, 8)
     mask[:4] = 1
     image = Image("a", camera, rgb, torch.ones(8, 8), mask, 0.5)
     shots = shots_of([image], gaussians, RenderOptions(), torch.ones(3))

@@ -1,4 +1,5 @@
-"""Bodies to begin motion with: those that turn are taken, with Gaussians on them that follow their true motion."""
+"""Bodies to begin motion with: those that turn are taken, with Gaussians on them that follow their
+true motion."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from dyngs.deform.fields import new_field
 
 
 def test_a_rolling_ball_begins_on_its_way() -> None:
-    """The seeds lie on the ball in the middle of the clip, and the field takes them along the true motion."""
+    """The seeds lie on the ball in the middle of the clip, and the field takes them along the true
+    motion."""
     shots, centers, turns = rolling()
     found = found_bodies(shots, 400, 4)
     assert found is not None
@@ -35,11 +37,15 @@ def test_a_rolling_ball_begins_on_its_way() -> None:
             moved = (means + field.offsets(means, float(shots.times[t])).means)[others:].numpy()
         expected = arms @ (turns[t] @ turns[middle].T).T + centers[t]
         # At the ends of the clip, which have neighbours on one side only, more.
-        assert np.linalg.norm(moved - expected, axis=1).mean() < (0.4 if t in (0, len(shots) - 1) else 0.25) * 0.28
+        assert (
+            np.linalg.norm(moved - expected, axis=1).mean()
+            < (0.4 if t in (0, len(shots) - 1) else 0.25) * 0.28
+        )
 
 
 def test_what_slides_is_not_made_to_turn() -> None:
-    """It is left to others, or a body with hardly any turn: its path, too, is found from the images."""
+    """It is left to others, or a body with hardly any turn: its path, too, is found from the
+    images."""
     shots, _, _ = rolling(turns=False)
     found = found_bodies(shots, 400, 4)
     assert found is None or angles_deg(found.bodies[0].turning.rotations).max() < 12

@@ -8,7 +8,14 @@ from rolling_ball import hopping, rolling
 from scipy.spatial.transform import Rotation
 
 from dyngs.deform.bodies.paths import Path
-from dyngs.deform.bodies.turning import angles_deg, cells, disagreements, found_turning, rotations_by, without_light
+from dyngs.deform.bodies.turning import (
+    angles_deg,
+    cells,
+    disagreements,
+    found_turning,
+    rotations_by,
+    without_light,
+)
 
 RADIUS = 0.28
 
@@ -21,7 +28,8 @@ def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
-    """It turns by more than a full turn; of its turn from image to image nothing is known beforehand."""
+    """It turns by more than a full turn; of its turn from image to image nothing is known
+    beforehand."""
     shots, centers, truth = rolling()
     turning = found_turning(shots, Path(centers, RADIUS, 1.0))
     errors = errors_deg(turning.rotations, truth)
@@ -61,7 +69,9 @@ def test_the_true_rotations_disagree_least() -> None:
         rows, columns, normals = shots.on_ball(t, center, RADIUS)
         frames.append((normals, shots.images[t, rows, columns]))
     none = np.broadcast_to(np.eye(3), truth.shape)
-    right, still, wrong = disagreements(without_light(frames), np.stack([truth, none, np.swapaxes(truth, 1, 2)]))
+    right, still, wrong = disagreements(
+        without_light(frames), np.stack([truth, none, np.swapaxes(truth, 1, 2)])
+    )
     assert right < 0.3 * min(still, wrong)
 
 
@@ -76,5 +86,9 @@ def test_rotation_vectors_are_those_of_scipy() -> None:
     vectors = np.random.default_rng(1).normal(size=(5, 2, 3))
     vectors[0, 0] = 0
     expected = Rotation.from_rotvec(vectors.reshape(-1, 3))
-    np.testing.assert_allclose(rotations_by(vectors).reshape(-1, 3, 3), expected.as_matrix(), atol=1e-12)
-    assert angles_deg(rotations_by(vectors)).ravel() == pytest.approx(np.degrees(expected.magnitude()), abs=1e-4)
+    np.testing.assert_allclose(
+        rotations_by(vectors).reshape(-1, 3, 3), expected.as_matrix(), atol=1e-12
+    )
+    assert angles_deg(rotations_by(vectors)).ravel() == pytest.approx(
+        np.degrees(expected.magnitude()), abs=1e-4
+    )

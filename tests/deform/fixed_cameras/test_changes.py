@@ -1,4 +1,5 @@
-"""Changes in the images of a camera that stands still: what moves, but neither noise nor shadows."""
+"""Changes in the images of a camera that stands still: what moves, but neither noise nor
+shadows."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ def still(noise: float = 0.0, count: int = 9) -> np.ndarray:
 def with_patch(factor: tuple[float, float, float], at: int = 0) -> np.ndarray:
     """The same with the light in a square changed in the image ``at``."""
     images = still().copy()
-    images[at, 20:40, 20:40] = (images[at, 20:40, 20:40] * np.array(factor)).clip(0, 255).astype(np.uint8)
+    images[at, 20:40, 20:40] = (
+        (images[at, 20:40, 20:40] * np.array(factor)).clip(0, 255).astype(np.uint8)
+    )
     return images
 
 
@@ -45,7 +48,8 @@ def test_a_ball_is_found_where_it_is(noise: float) -> None:
 
 
 def test_a_shadow_is_none_of_it() -> None:
-    """All channels darker alike; but a coloured or a brighter patch is a thing, and so is a black one."""
+    """All channels darker alike; but a coloured or a brighter patch is a thing, and so is a black
+    one."""
     assert not changes(with_patch((0.6, 0.62, 0.65))).any()
     for factor in ((0.9, 0.4, 0.4), (1.4, 1.4, 1.4), (0.05, 0.05, 0.05)):
         found = changes(with_patch(factor, 3))
@@ -68,7 +72,10 @@ def test_large_images_are_shrunk_and_masks_kept() -> None:
     large = type(camera)(camera.cam_from_world, camera.intrinsics, width, 10)
     mask = torch.ones(10, width)
     mask[:, :20] = 0
-    images = [Image("view", large, torch.full((10, width, 3), 0.1 * i), None, mask, i / 2) for i in range(3)]
+    images = [
+        Image("view", large, torch.full((10, width, 3), 0.1 * i), None, mask, i / 2)
+        for i in range(3)
+    ]
     one = footage_of(images, BLACK)
     assert one.images.shape == (3, 5, LONGEST_SIDE, 3)
     assert not one.counted[:, :, :10].any()

@@ -8,7 +8,8 @@ from static_balls import Ball, filmed
 
 from dyngs.deform.fixed_cameras.hulls import Blob, blobs_in, silhouettes_at
 
-LOW, HIGH = np.full(3, -3.0), np.full(3, 3.0)
+LOW = np.full(3, -3.0)
+HIGH = np.full(3, 3.0)
 MOMENTS = 5
 
 
@@ -19,7 +20,8 @@ def hulls(*balls: Ball, count: int = 8) -> list[Blob]:
     return sorted(blobs_in(silhouettes_at(footage, 1.0), LOW, HIGH), key=lambda blob: -blob.radius)
 
 
-@pytest.mark.parametrize(("count", "fraction"), [(4, 0.3), (8, 0.1)])  # of four, three suffice: their hull has corners
+# of four, three suffice: their hull has corners
+@pytest.mark.parametrize(("count", "fraction"), [(4, 0.3), (8, 0.1)])
 def test_a_ball_is_found(count: int, fraction: float) -> None:
     """Its centre to a fraction of its radius, its radius to a fifth."""
     ball = Ball((0.31, -0.22, 0.13))

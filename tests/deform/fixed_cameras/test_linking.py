@@ -11,11 +11,14 @@ from dyngs.deform.fixed_cameras.hulls import Blob
 from dyngs.deform.fixed_cameras.linking import FEWEST_TIMES, MAX_GAP, linked
 
 TIMES = tuple(i / 19 for i in range(20))
-RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
+RED = (0.9, 0.1, 0.1)
+BLUE = (0.1, 0.1, 0.9)
 Path = Callable[[float], tuple[float, float, float]]
 
 
-def blob(center: Sequence[float] | np.ndarray, radius: float = 0.2, color: Sequence[float] = RED) -> Blob:
+def blob(
+    center: Sequence[float] | np.ndarray, radius: float = 0.2, color: Sequence[float] = RED
+) -> Blob:
     place = np.array(center)
     return Blob(place, radius, place[None], 0.1, np.array(color))
 
@@ -43,10 +46,15 @@ def test_one_thing_is_one_track(path: Path) -> None:
 
 def test_it_may_be_lost_for_a_while() -> None:
     gone = TIMES[8 : 8 + MAX_GAP]
-    (track,) = linked(TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone]))
+    (track,) = linked(
+        TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone])
+    )
     assert len(track.times) == len(TIMES) - MAX_GAP
     gone = TIMES[8 : 9 + MAX_GAP]
-    assert len(linked(TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone]))) == 2
+    assert (
+        len(linked(TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone])))
+        == 2
+    )
 
 
 def test_short_ones_are_dropped() -> None:
@@ -89,7 +97,9 @@ def test_what_stays_does_not_travel() -> None:
 
 def test_what_jumps_to_and_fro_does_not_travel() -> None:
     """As parts of a thing that turns in place seem to do."""
-    found = [[blob((0.9 * (i % 3 == 0), 0.0, 0.0), 0.1 + 0.1 * (i == 5))] for i in range(len(TIMES))]
+    found = [
+        [blob((0.9 * (i % 3 == 0), 0.0, 0.0), 0.1 + 0.1 * (i == 5))] for i in range(len(TIMES))
+    ]
     assert not any(track.travels for track in linked(TIMES, found))
     once = [[blob((0.9 * (i > 9), 0.0, 0.0))] for i in range(len(TIMES))]
     assert not any(track.travels for track in linked(TIMES, once))

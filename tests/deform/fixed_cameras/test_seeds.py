@@ -1,4 +1,5 @@
-"""Gaussians at single times: where the ball is then, in the colours of then, with the velocity of its track."""
+"""Gaussians at single times: where the ball is then, in the colours of then, with the velocity of
+its track."""
 
 from __future__ import annotations
 
@@ -16,7 +17,11 @@ BOX = np.full(3, -2.0), np.full(3, 2.0)
 
 def ball_at(time: float) -> Ball:
     """It travels along z, and is of another red in the second half of the clip."""
-    return Ball((0.1, 0.2, 1.8 * time - 0.9), BALL.radius, (0.9, 0.2, 0.1) if time < 0.5 else (0.7, 0.4, 0.2))
+    return Ball(
+        (0.1, 0.2, 1.8 * time - 0.9),
+        BALL.radius,
+        (0.9, 0.2, 0.1) if time < 0.5 else (0.7, 0.4, 0.2),
+    )
 
 
 def test_seeds_cover_a_ball_at_each_time_and_pay() -> None:
@@ -26,9 +31,12 @@ def test_seeds_cover_a_ball_at_each_time_and_pay() -> None:
     moments = moments_of(track, footage, 4.0, num_terms=4)
     assert [one.time for one in moments] == list(TIMES)
     for one in moments:
-        now, ball = one.gaussians, ball_at(one.time)
+        now = one.gaussians
+        ball = ball_at(one.time)
         apart = (now.means - torch.tensor(ball.center)).norm(dim=1)
-        assert ((apart - BALL.radius).abs() < 0.5 * BALL.radius).float().mean() > 0.8, "a hull has corners"
+        assert ((apart - BALL.radius).abs() < 0.5 * BALL.radius).float().mean() > 0.8, (
+            "a hull has corners"
+        )
         assert (now.base_rgb.mean(0) - torch.tensor(ball.color)).abs().max() < 0.1
         assert now.sh.shape == (len(now), 4, 3)
         torch.testing.assert_close(one.velocity, torch.tensor([0.0, 0.0, 1.8]), rtol=0, atol=0.2)
@@ -40,6 +48,10 @@ def test_seeds_cover_a_ball_at_each_time_and_pay() -> None:
 def test_fewer_seeds_are_larger() -> None:
     footage = filmed(lambda t: [ball_at(t)], TIMES, 7)
     (track,) = found_tracks(footage, *BOX)
-    many, few = (moments_of(track, footage, thinned, num_terms=1)[3].gaussians for thinned in (2.0, 18.0))
+    many, few = (
+        moments_of(track, footage, thinned, num_terms=1)[3].gaussians for thinned in (2.0, 18.0)
+    )
     assert 8 < len(many) / len(few) < 10
-    torch.testing.assert_close(few.scales[0, 0] / many.scales[0, 0], torch.tensor(3.0), rtol=0.05, atol=0)
+    torch.testing.assert_close(
+        few.scales[0, 0] / many.scales[0, 0], torch.tensor(3.0), rtol=0.05, atol=0
+    )

@@ -1,4 +1,5 @@
-"""Surfaces that look different at a time: found in their colour of then, and not what something else hides."""
+"""Surfaces that look different at a time: found in their colour of then, and not what something
+else hides."""
 
 from __future__ import annotations
 
@@ -10,25 +11,34 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 
 TIMES = tuple(i / 5 for i in range(6))
-CENTER, RADIUS, RED, GREEN = torch.tensor([0.0, 0.1, 0.1]), 0.4, (0.9, 0.2, 0.1), (0.1, 0.9, 0.2)
+CENTER = torch.tensor([0.0, 0.1, 0.1])
+RADIUS = 0.4
+RED = (0.9, 0.2, 0.1)
+GREEN = (0.1, 0.9, 0.2)
 INSIDE = 0.35  # Radius of the Gaussians, which are blurred: none shows what is beside the ball
 
 
 def shell(count: int = 400) -> Gaussians:
     """Flat red Gaussians all over a ball."""
     i = torch.arange(count)
-    z, turn = 1 - (2 * i + 1) / count, 2.39996 * i
+    z = 1 - (2 * i + 1) / count
+    turn = 2.39996 * i
     flat = (1 - z**2).sqrt()
     out = torch.stack([flat * turn.cos(), flat * turn.sin(), z], 1)
-    quats = torch.cat([1 + out[:, 2:], -out[:, 1:2], out[:, :1], torch.zeros(count, 1)], 1)  # z to the outward normal
+    # z to the outward normal
+    quats = torch.cat([1 + out[:, 2:], -out[:, 1:2], out[:, :1], torch.zeros(count, 1)], 1)
     scales = torch.tensor([0.04, 0.04, 0.004]).log().expand(count, 3)
     sh = ((torch.tensor(RED) - 0.5) / 0.28209479).expand(count, 1, 3)
-    return Gaussians(CENTER + INSIDE * out, quats, scales.clone(), torch.full((count,), 4.0), sh.clone())
+    return Gaussians(
+        CENTER + INSIDE * out, quats, scales.clone(), torch.full((count,), 4.0), sh.clone()
+    )
 
 
 def test_a_ball_that_is_blue_at_a_time_gets_blue_gaussians_then_just_before_its_own() -> None:
     footage = filmed(
-        lambda t: [Ball((0.0, 0.1, 0.1), RADIUS, (0.1, 0.2, 0.9) if t == TIMES[2] else RED)], TIMES, noise=0.0
+        lambda t: [Ball((0.0, 0.1, 0.1), RADIUS, (0.1, 0.2, 0.9) if t == TIMES[2] else RED)],
+        TIMES,
+        noise=0.0,
     )
     (found,) = surface_changes(footage, shell(), RenderOptions(), 1000)
     assert found.time == TIMES[2]
@@ -45,7 +55,10 @@ def test_a_ball_that_is_blue_at_a_time_gets_blue_gaussians_then_just_before_its_
 def test_what_a_passing_ball_hides_has_not_changed() -> None:
     """Another place is hidden from each camera: the median over cameras is still."""
     footage = filmed(
-        lambda t: [Ball((0.0, 0.1, 0.1), RADIUS, RED)] + [Ball((0.0, 0.1, 1.0), 0.2, GREEN)] * (t == TIMES[3]),
+        lambda t: (
+            [Ball((0.0, 0.1, 0.1), RADIUS, RED)]
+            + [Ball((0.0, 0.1, 1.0), 0.2, GREEN)] * (t == TIMES[3])
+        ),
         TIMES,
         noise=0.0,
     )

@@ -28,8 +28,12 @@ def test_every_gaussian_has_its_own_driver_without_nodes(kind: str) -> None:
     assert len(curves.heads) == 1 + len(HEADS)
     scale = float(field.offsets(means, 0.3).means.detach().norm(dim=1).max())
     for time in (0.0, 0.31, 0.77, 1.0):
-        truth, found = field.offsets(means, time), played(curves, time)
-        assert float((found["means"] - truth.means.detach()).norm(dim=1).median()) < 0.05 * scale + curves.error
+        truth = field.offsets(means, time)
+        found = played(curves, time)
+        assert (
+            float((found["means"] - truth.means.detach()).norm(dim=1).median())
+            < 0.05 * scale + curves.error
+        )
 
 
 def test_nodes_are_exact() -> None:
@@ -46,7 +50,8 @@ def test_nodes_are_exact() -> None:
     for time in (0.0, 0.31, 1.0):
         heads = played(curves, time)
         heads["logit_opacities"] = heads["logit_opacities"][:, 0]
-        truth, found = field.offsets(means, time), followed(nodes, means, Offsets(**heads))
+        truth = field.offsets(means, time)
+        found = followed(nodes, means, Offsets(**heads))
         for name, x in vars(truth).items():
             torch.testing.assert_close(getattr(found, name), x.detach(), atol=1e-5, rtol=1e-4)
 

@@ -41,11 +41,15 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
     (tmp_path / ELEMENT).write_text(element_script(), encoding="utf-8")
-    (tmp_path / "site.css").write_text("dyngs-scene { width: 200px; height: 100px; } body { margin: 0 }", "utf-8")
+    (tmp_path / "site.css").write_text(
+        "dyngs-scene { width: 200px; height: 100px; } body { margin: 0 }", "utf-8"
+    )
     return tmp_path
 
 
-def page_with(browser: Browser, server: Server, site: Path, *elements: str, policy: str = POLICY) -> Page:
+def page_with(
+    browser: Browser, server: Server, site: Path, *elements: str, policy: str = POLICY
+) -> Page:
     """Open a page of a site with these elements."""
     head = f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
     head += f'<link rel="stylesheet" href="site.css"><script src="{ELEMENT}"></script><script src="{ELEMENT}"></script>'
@@ -73,13 +77,18 @@ def test_several_scenes_stand_in_a_page_of_a_strict_site(browser: Browser, site:
             truth = scene.render(seen, 0.4, background=far.intrinsics.new_ones(3)).rgb[0].detach()
             assert psnr(shown(page, seen, 0.4, which), truth) > 38
         assert page.errors == []
-        assert page.evaluate("[...document.querySelectorAll('dyngs-scene')].map((x) => x.clientWidth)") == [200] * 3
+        assert (
+            page.evaluate("[...document.querySelectorAll('dyngs-scene')].map((x) => x.clientWidth)")
+            == [200] * 3
+        )
         moving = "document.querySelectorAll('dyngs-scene')[1]"
         assert not page.evaluate(f"{moving}.player.playing")
         page.evaluate(f"{moving}.release(), {moving}.play()")
         page.wait_for(f"{moving}.player.playing && {moving}.player.time > 0.42")
         page.evaluate(f"{moving}.remove()")
-        assert page.evaluate("Object.keys(window).filter((name) => /dyngs|scene/i.test(name))") == []
+        assert (
+            page.evaluate("Object.keys(window).filter((name) => /dyngs|scene/i.test(name))") == []
+        )
         page.close()
 
 
@@ -90,9 +99,12 @@ SOURCES = (("still.html", ""), ("./moving.html", ""), ("town", ""))
 def test_backgrounds_are_colours_of_the_site(browser: Browser, site: Path) -> None:
     write(still_scene(), site / "still.html", large(camera()))
     elements = [
-        f'<dyngs-scene src="still.html" background="{x}"></dyngs-scene>' for x in ("teal", "transparent", "x y")
+        f'<dyngs-scene src="still.html" background="{x}"></dyngs-scene>'
+        for x in ("teal", "transparent", "x y")
     ]
-    (site / "site.css").write_text("body { margin: 0; background: #102030 } dyngs-scene { height: 70px }", "utf-8")
+    (site / "site.css").write_text(
+        "body { margin: 0; background: #102030 } dyngs-scene { height: 70px }", "utf-8"
+    )
     with served(site) as server:
         page = page_with(browser, server, site, *elements)
         for which in (0, 1):
@@ -118,13 +130,22 @@ def test_what_cannot_be_shown_is_one_line_in_its_element(browser: Browser, site:
     broken = {
         "other.html": ("<h1>Not here</h1>", "is no page that"),
         "half.html": (head + 'id="numbers">' + numbers[:48], "ends too early"),
-        "short.html": (head + 'id="numbers">' + numbers[:48] + "</script>" + tail, "its numbers are damaged"),
+        "short.html": (
+            head + 'id="numbers">' + numbers[:48] + "</script>" + tail,
+            "its numbers are damaged",
+        ),
         "noise.html": (head + 'id="numbers">' + "%" * 40 + "</script>" + tail, "cannot be shown"),
         "header.html": (good.replace('id="header">{', 'id="header">{{'), "its header is damaged"),
-        "views.html": (good.replace('"views": [{', '"views": [], "x": [{'), "its header is damaged"),
+        "views.html": (
+            good.replace('"views": [{', '"views": [], "x": [{'),
+            "its header is damaged",
+        ),
         "huge.html": (good.replace('"rows": 5', '"rows": 5e15'), "cannot be shown"),
         "long.html": (good.replace('"rows": 5', '"rows": 4'), "its numbers are damaged"),
-        "shader.html": (re.sub(r'"degree": \d', '"degree": "0\\\\n#error no"', good), "cannot be shown"),
+        "shader.html": (
+            re.sub(r'"degree": \d', '"degree": "0\\\\n#error no"', good),
+            "cannot be shown",
+        ),
     }
     for name, (text, _) in broken.items():
         assert text != good
@@ -145,7 +166,9 @@ def test_what_cannot_be_shown_is_one_line_in_its_element(browser: Browser, site:
 
 @needs_browser
 @pytest.mark.parametrize("failure", ["cut", "503", "silent"])
-def test_a_page_that_did_not_arrive_is_asked_for_again(failure: str, browser: Browser, site: Path) -> None:
+def test_a_page_that_did_not_arrive_is_asked_for_again(
+    failure: str, browser: Browser, site: Path
+) -> None:
     write(still_scene(), site / "still.html", camera())
     impatient = element_script().replace("SILENCE = 30000", "SILENCE = 400")
     assert impatient != element_script()
@@ -166,7 +189,9 @@ def test_lost_parts_hold_up_no_others_and_are_asked_for_again(browser: Browser, 
         server.failing["town/1-0.bin"] = ["503", "damaged"]
         server.failing["town/0-2.bin"] = ["404", "cut", "404"]
         page = page_with(browser, server, site, '<dyngs-scene src="town/"></dyngs-scene>')
-        assert "/town/1-0.bin has not arrived (the server answered 503" in wait_for_line(page, "trying again")
+        assert "/town/1-0.bin has not arrived (the server answered 503" in wait_for_line(
+            page, "trying again"
+        )
         wait_for_line(page, "its numbers are damaged")
         page.wait_for("document.querySelector('dyngs-scene').renderer")
         line = wait_for_line(page, "/town/0-2.bin has not arrived")
@@ -177,7 +202,11 @@ def test_lost_parts_hold_up_no_others_and_are_asked_for_again(browser: Browser, 
         assert psnr(shown(page, view, 0.0), scene.render(view).rgb[0]) > 38
         page.evaluate("document.querySelector('dyngs-scene').release()")
         wait_for_scene(page)
-        assert [server.asked.count(f"town/{name}.bin") for name in ("1-0", "0-0", "0-2")] == [3, 1, 4]
+        assert [server.asked.count(f"town/{name}.bin") for name in ("1-0", "0-0", "0-2")] == [
+            3,
+            1,
+            4,
+        ]
         page.close()
 
 
@@ -186,7 +215,9 @@ def test_a_scene_out_of_sight_is_not_asked_for(browser: Browser, site: Path) -> 
     write(still_scene(), site / "still.html", camera())
     shutil.copy(site / "still.html", site / "below.html")
     with served(site) as server:
-        (site / "site.css").write_text("dyngs-scene { height: 200px } div { height: 2000px }", "utf-8")
+        (site / "site.css").write_text(
+            "dyngs-scene { height: 200px } div { height: 2000px }", "utf-8"
+        )
         elements = (
             '<dyngs-scene src="still.html"></dyngs-scene><div></div>',
             '<dyngs-scene src="below.html"></dyngs-scene>',
@@ -211,7 +242,9 @@ def test_a_scene_out_of_sight_is_not_asked_for(browser: Browser, site: Path) -> 
 def test_a_page_need_not_say_that_it_is_utf_8(browser: Browser, site: Path) -> None:
     write(sliding_scene(), site / "moving.html", large(camera()))
     element = '<dyngs-scene src="moving.html" style="width: 320px; height: 200px"></dyngs-scene>'
-    (site / "old.html").write_bytes(f'<!DOCTYPE html><script src="{ELEMENT}"></script>{element}'.encode("ascii"))
+    (site / "old.html").write_bytes(
+        f'<!DOCTYPE html><script src="{ELEMENT}"></script>{element}'.encode("ascii")
+    )
     with served(site) as server:
         page = browser.open(server.address + "old.html", 400, 300)
         wait_for_scene(page)

@@ -20,11 +20,18 @@ from dyngs.ops.quaternions import rotation_matrices
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_has_the_lists_that_it_needs(kind: str) -> None:
-    scene, lists = scene_of_kind(kind), Lists()
+    scene = scene_of_kind(kind)
+    lists = Lists()
     told = add_scene(scene, lists, 0.01)
     layout = lists.layout
     assert (told["count"], told["moves"]) == (len(scene), not scene.is_static)
-    for name, columns in {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "base": 3}.items():
+    for name, columns in {
+        "means": 3,
+        "quats": 4,
+        "log_scales": 3,
+        "logit_opacities": 1,
+        "base": 3,
+    }.items():
         assert (layout[name]["rows"], layout[name]["columns"]) == (len(scene), columns)
     assert ("boned" in layout, "bones" in told) == (kind == "human",) * 2
     assert ("masks" in layout) == (kind == "masked")
@@ -48,11 +55,16 @@ def read(lists: Lists, name: str) -> NDArray[Any]:
     """A list as ``data.js`` reads it."""
     told = lists.layout[name]
     data = zlib.decompress(base64.b64decode(lists.text()))[told["at"] :]
-    rows, columns = told["rows"], told["columns"]
+    rows = told["rows"]
+    columns = told["columns"]
     if told["kind"] != "quantised":
         return np.frombuffer(data, told["kind"], rows * columns).reshape(rows, columns)
     count = -(-rows // told["chunk"])
-    ranges = np.frombuffer(data, "<f4", 2 * count * columns).reshape(count, columns, 2).repeat(told["chunk"], axis=0)
+    ranges = (
+        np.frombuffer(data, "<f4", 2 * count * columns)
+        .reshape(count, columns, 2)
+        .repeat(told["chunk"], axis=0)
+    )
     planes = told["bits"] // 8
     steps = np.frombuffer(data, np.uint8, planes * rows * columns, ranges.nbytes // told["chunk"])
     steps = steps.reshape(columns, planes, rows).astype(int)
@@ -61,7 +73,8 @@ def read(lists: Lists, name: str) -> NDArray[Any]:
 
 
 def test_rotations_of_a_clip_begin_with_their_scalar_part() -> None:
-    scene, lists = scene_of_kind("human"), Lists()
+    scene = scene_of_kind("human")
+    lists = Lists()
     add_scene(scene, lists, 0.01)
     found = torch.from_numpy(read(lists, "clip_quats").reshape(-1, 4))
     person = avatar_of(scene)
@@ -84,7 +97,9 @@ def test_quantised_lists_err_by_half_a_step(bits: Literal[8, 16], rows: int) -> 
     for start in range(0, rows, CHUNK):
         part = slice(start, start + CHUNK)
         spread = np.ptp(values[part].astype(np.float64), axis=0)
-        assert (np.abs(found[part] - values[part]) <= 0.501 * spread / (2**bits - 1) + 1e-4 * 2.0**-bits).all()
+        assert (
+            np.abs(found[part] - values[part]) <= 0.501 * spread / (2**bits - 1) + 1e-4 * 2.0**-bits
+        ).all()
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])

@@ -17,7 +17,16 @@ from moving_scene import camera, still_scene, write_moving_run
 from numpy.typing import NDArray
 from scaled_files import FACTORS, scaled
 from scene_kinds import KINDS, onlooker, scene_of_kind
-from scene_pages import from_afar, large, levels_of_a_cloud, served, shown, sliding_scene, wait_for_line, write
+from scene_pages import (
+    from_afar,
+    large,
+    levels_of_a_cloud,
+    served,
+    shown,
+    sliding_scene,
+    wait_for_line,
+    write,
+)
 from small_triangles import bent
 from small_triangles import camera as before_triangles
 
@@ -49,7 +58,9 @@ def opened(browser: Browser, path: Path, width: int = 320, height: int = 240) ->
     return page
 
 
-def assert_alike(page: Page, scene: GaussianScene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:
+def assert_alike(
+    page: Page, scene: GaussianScene, view: Cameras, options: RenderOptions, least: float = 38.0
+) -> None:
     for time in (0.0, 0.4, 1.0):
         truth = scene.render(view, time, options=options, background=torch.ones(3)).rgb[0].detach()
         found = shown(page, view, time)
@@ -60,7 +71,8 @@ def assert_alike(page: Page, scene: GaussianScene, view: Cameras, options: Rende
 @needs_browser
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_page_shows_what_dyngs_draws(kind: str, browser: Browser, tmp_path: Path) -> None:
-    scene, view = scene_of_kind(kind), large(onlooker())
+    scene = scene_of_kind(kind)
+    view = large(onlooker())
     write(scene, tmp_path / "page.html", view)
     page = opened(browser, tmp_path / "page.html")
     assert_alike(page, scene, view, scene.options)
@@ -74,9 +86,13 @@ def test_a_page_shows_what_dyngs_draws(kind: str, browser: Browser, tmp_path: Pa
 def test_triangles(texture: int, degree: int, browser: Browser, tmp_path: Path) -> None:
     patches = bent(12, seed=1, degree=degree)
     patches = patches.textured(texture) if texture else patches
-    varied = patches.colours + 0.2 * torch.randn(patches.colours.shape, generator=torch.Generator().manual_seed(2))
+    varied = patches.colours + 0.2 * torch.randn(
+        patches.colours.shape, generator=torch.Generator().manual_seed(2)
+    )
     options = TriangleOptions(near=0.1, segments=16, supersampling=4)
-    scene = TriangleScene(replace(patches, colours=varied), 1.0, options, torch.tensor([1.0, 0.9, 0.8]))
+    scene = TriangleScene(
+        replace(patches, colours=varied), 1.0, options, torch.tensor([1.0, 0.9, 0.8])
+    )
     view = before_triangles(192, distance=5.0)
     write_page(opened_triangles(scene), tmp_path / "page.html", title="triangles", views=(view,))
     page = opened(browser, tmp_path / "page.html")
@@ -105,7 +121,8 @@ def test_harmonics_and_modes(mode: RasterizeMode, browser: Browser, tmp_path: Pa
         torch.randn(count, generator=generator) * 2,
         torch.randn(count, 25, 3, generator=generator) * 0.3,
     )
-    scene, options = StaticScene(gaussians=gaussians), RenderOptions(mode=mode, eps2d=0.5)
+    scene = StaticScene(gaussians=gaussians)
+    options = RenderOptions(mode=mode, eps2d=0.5)
     view = large(camera(), 6)
     write(scene, tmp_path / "page.html", view, options=options)
     page = opened(browser, tmp_path / "page.html")
@@ -115,18 +132,23 @@ def test_harmonics_and_modes(mode: RasterizeMode, browser: Browser, tmp_path: Pa
 
 @needs_browser
 def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
-    scene, path = sliding_scene(), tmp_path / "page.html"
+    scene = sliding_scene()
+    path = tmp_path / "page.html"
     write(scene, path, large(camera(), 6), title="</script><b>& a 'scene' \"")
     page = opened(browser, path)
     assert page.evaluate("document.title") == "</script><b>& a 'scene' \""
-    assert page.evaluate("document.querySelector('#about h1').textContent") == "</script><b>& a 'scene' \""
+    assert (
+        page.evaluate("document.querySelector('#about h1').textContent")
+        == "</script><b>& a 'scene' \""
+    )
     page.evaluate("dyngs.player.seek(0)")
     first = settled(page)
     page.driven.fill("#time", "0.5")
     later = settled(page)
     assert changed(first, later)
     page.press("ArrowLeft")
-    assert page.evaluate("dyngs.player.time") == pytest.approx(0.25)  # five training times: one frame back
+    # five training times: one frame back
+    assert page.evaluate("dyngs.player.time") == pytest.approx(0.25)
     page.press("ArrowRight")
     page.drag((160, 120), (220, 120))
     assert changed(later, turned := settled(page))
@@ -208,7 +230,9 @@ def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_pa
             assert psnr(shown(page, one, 0.0), scene.render(one).rgb[0]) > 38
             drawn = sum(scene.levels.count(block) for block in scene.levels.cut(one, most))
             assert drawn == (14_000 if most is None and factor == 1 else 3_500)
-            cut = page.evaluate("[...dyngs.renderer.motion.drawn].map((row) => dyngs.renderer.tree.countOf(row))")
+            cut = page.evaluate(
+                "[...dyngs.renderer.motion.drawn].map((row) => dyngs.renderer.tree.countOf(row))"
+            )
             assert sum(cut) == drawn
         assert page.errors == []
         assert all(request.startswith(server.address) for request in page.requests)
@@ -238,7 +262,9 @@ def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> Non
 def test_a_page_names_no_host_and_allows_none(tmp_path: Path) -> None:
     write(still_scene(), tmp_path / "page.html", camera())
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert not re.findall(r"(?:https?:)?//[\w.-]+\.\w+|<(?!dyngs-scene )\w+[^<>]*\bsrc=|@import|\burl\(", text)
+    assert not re.findall(
+        r"(?:https?:)?//[\w.-]+\.\w+|<(?!dyngs-scene )\w+[^<>]*\bsrc=|@import|\burl\(", text
+    )
     policy = re.findall(r'Content-Security-Policy" content="([^"]+)"', text)[0]
     assert policy.startswith("default-src 'none'; script-src 'sha256-")
     assert "unsafe" not in policy
@@ -263,7 +289,11 @@ def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
 @pytest.mark.parametrize(("kind", "count"), [("control_nodes", 0), ("hexplane", 1)])
 def test_a_page_says_where_splines_are_fitted(kind: str, count: int, tmp_path: Path) -> None:
     """Control nodes move along splines already."""
-    notes = [x for x in write(scene_of_kind(kind), tmp_path / "a.html", onlooker()).notes if "splines are fitted" in x]
+    notes = [
+        x
+        for x in write(scene_of_kind(kind), tmp_path / "a.html", onlooker()).notes
+        if "splines are fitted" in x
+    ]
     assert len(notes) == count
 
 
@@ -300,7 +330,10 @@ def test_a_page_begins_with_the_same_view_in_any_unit(factor: float, tmp_path: P
 def test_the_offset_of_a_far_scene_is_told(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, moves=False, offset=(500_000.0, 4_600_000.0, 0.0))
     (note,) = write_page(open_run(run), tmp_path / "a.html").notes
-    assert note == "the scene is far from the origin: 500000 4600000 0 is subtracted from its positions"
+    assert (
+        note
+        == "the scene is far from the origin: 500000 4600000 0 is subtracted from its positions"
+    )
 
 
 def test_without_the_capture_a_page_begins_outside(tmp_path: Path) -> None:
@@ -333,10 +366,13 @@ def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
 def test_a_long_clip_is_fetched_as_it_is_played(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene, view = scene_of_kind("hexplane"), large(onlooker())
+    scene = scene_of_kind("hexplane")
+    view = large(onlooker())
     monkeypatch.setattr(numbers, "CHUNK_BYTES", 60)
     scene = replace(scene, background=torch.ones(3))
-    written = write_folder(replace(opened_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,))
+    written = write_folder(
+        replace(opened_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,)
+    )
     curves = written.header["curves"]
     count = -(-(curves["points"] - 3) // curves["chunk"])
     assert count == 8

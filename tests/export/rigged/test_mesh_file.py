@@ -25,7 +25,10 @@ def test_another_reader_finds_mesh_and_texture(tmp_path: Path) -> None:
     run = bare_run()
     written = write_mesh(run, tmp_path / "ann.glb")
     assert written.notes[0].startswith("texture of 256 x 256; ")
-    assert "silhouettes agree" in written.notes[1] or "the template, whose silhouettes agree best" in written.notes[1]
+    assert (
+        "silhouettes agree" in written.notes[1]
+        or "the template, whose silhouettes agree best" in written.notes[1]
+    )
     loaded = trimesh.load(tmp_path / "ann.glb", process=False)
     (mesh,) = loaded.geometry.values()  # pyright: ignore[reportAttributeAccessIssue]
     body = template()
@@ -34,7 +37,9 @@ def test_another_reader_finds_mesh_and_texture(tmp_path: Path) -> None:
     image = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
     assert image.shape == (256, 256, 3)
     u, v = mesh.visual.uv.T  # v upwards, as trimesh has it
-    colours = image[((1 - v) * 256).astype(int).clip(0, 255), (u * 256).astype(int).clip(0, 255)] / 255
+    colours = (
+        image[((1 - v) * 256).astype(int).clip(0, 255), (u * 256).astype(int).clip(0, 255)] / 255
+    )
     error = np.abs(colours - bands(body.vertices)[source].numpy()).max(axis=1)
     assert np.quantile(error, 0.9) < 0.08
     assert np.median(error) < 0.02
@@ -50,7 +55,9 @@ def test_a_motion_becomes_an_animation(tmp_path: Path) -> None:
     found = SkinnedGlb(tmp_path / "ann.glb")
     animation = found.json["animations"][0]
     assert animation["name"] == "dance"
-    np.testing.assert_allclose(found.numbers(animation["samplers"][0]["input"])[:, 0], [0, 0.1, 0.2, 0.3], atol=1e-6)
+    np.testing.assert_allclose(
+        found.numbers(animation["samplers"][0]["input"])[:, 0], [0, 0.1, 0.2, 0.3], atol=1e-6
+    )
     assert abs(min(found.posed(frame)[:, 1].min() for frame in range(4))) < 1e-5
     assert found.image().shape == (96, 96, 3)
     assert found.json["extensionsUsed"] == ["KHR_materials_unlit"]
@@ -62,6 +69,8 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"x\.ply: a mesh is written as \.glb; give --out x\.glb"):
         write_mesh(bare_run(), tmp_path / "x.ply")
     run = load_run(write_moving_run(tmp_path / "run"))
-    with pytest.raises(DyngsError, match=r"--format mesh needs the run of a person \(model\.kind=human\)"):
+    with pytest.raises(
+        DyngsError, match=r"--format mesh needs the run of a person \(model\.kind=human\)"
+    ):
         write_mesh(run, tmp_path / "x.glb")
     assert not list(tmp_path.glob("x*"))

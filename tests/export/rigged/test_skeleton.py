@@ -29,7 +29,12 @@ from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.gltf import read_gltf
 from dyngs.human.motion.placement import upright
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.pose.skinning import (
+    apply_transforms,
+    axis_angle_to_matrix,
+    blend_transforms,
+    joint_transforms,
+)
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import apply_shape
 from dyngs.human.template.body_reader import read_body
@@ -56,15 +61,21 @@ def written(path: Path, scene: HumanScene) -> SkinnedGlb:
 @pytest.mark.parametrize("scale", [1.0, 0.4])
 def test_the_skin_moves_vertices_as_our_own_skinning_does(tmp_path: Path, scale: float) -> None:
     """At every key, up to a shift along the floor; the lowest vertex of the clip is at y = 0."""
-    scene, body = scene_of(scale), template()
+    scene = scene_of(scale)
+    body = template()
     found = written(tmp_path / "x.glb", scene)
     source = body_mesh(scene, body, body.vertices).source
     skeleton = scene.learned_skeleton
     clip = upright(scene.moves_as, scene.clip, skeleton.joints)
-    lowest, shifts = [], []
+    lowest = []
+    shifts = []
     for frame in range(4):
-        joints = joint_transforms(skeleton.joints, skeleton.parents, axis_angle_to_matrix(clip.poses[frame]))
-        ours = clip.scale[frame] * apply_transforms(blend_transforms(body.weights, joints), body.vertices)
+        joints = joint_transforms(
+            skeleton.joints, skeleton.parents, axis_angle_to_matrix(clip.poses[frame])
+        )
+        ours = clip.scale[frame] * apply_transforms(
+            blend_transforms(body.weights, joints), body.vertices
+        )
         theirs = found.posed(frame)
         shift = theirs - (ours + clip.trans[frame])[source].double().numpy()
         np.testing.assert_allclose(shift, shift[:1].repeat(len(shift), 0), atol=5e-6)
@@ -91,7 +102,9 @@ def test_our_reader_of_motions_finds_the_same_motion(tmp_path: Path) -> None:
     clip = upright(scene.moves_as, scene.clip, scene.learned_skeleton.joints)
     skeleton = scene.learned_skeleton
     for frame in range(4):
-        world = joint_transforms(skeleton.joints, skeleton.parents, axis_angle_to_matrix(clip.poses[frame]))
+        world = joint_transforms(
+            skeleton.joints, skeleton.parents, axis_angle_to_matrix(clip.poses[frame])
+        )
         np.testing.assert_allclose(found.rotations[frame], world[:, :, :3].numpy(), atol=1e-5)
 
 
@@ -126,18 +139,23 @@ def test_weights_are_complete_and_unused_joints_are_the_first(tmp_path: Path) ->
 
 def test_vertices_are_doubled_at_seams_only() -> None:
     """Each corner keeps its place and its texture coordinate; copies share weights and normals."""
-    body, scene = template(), bare_scene()
+    body = template()
+    scene = bare_scene()
     mesh = body_mesh(scene, body, body.vertices)
     assert body.uv is not None
     assert body.uv_faces is not None
-    assert len(mesh.vertices) == len(torch.unique(torch.stack([body.faces, body.uv_faces], -1).reshape(-1, 2), dim=0))
+    assert len(mesh.vertices) == len(
+        torch.unique(torch.stack([body.faces, body.uv_faces], -1).reshape(-1, 2), dim=0)
+    )
     assert torch.equal(mesh.vertices[mesh.faces], body.vertices[body.faces])
     assert torch.equal(mesh.uv[mesh.faces], body.uv[body.uv_faces])
     assert torch.equal(mesh.weights, body.weights[mesh.source])
     outward = ((mesh.vertices - torch.tensor([0.0, 0.2, 0.0])) * mesh.normals).sum(1)
     trunk = mesh.weights[:, [3, 6, 9]].sum(1) > 0.9
     assert float((outward[trunk] > 0).float().mean()) > 0.95
-    torch.testing.assert_close(mesh.normals.norm(dim=1), torch.ones(len(mesh.normals)), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        mesh.normals.norm(dim=1), torch.ones(len(mesh.normals)), atol=1e-5, rtol=0
+    )
 
 
 def test_the_shape_follows_from_what_a_run_holds(tmp_path: Path) -> None:
@@ -147,15 +165,22 @@ def test_the_shape_follows_from_what_a_run_holds(tmp_path: Path) -> None:
     vertices, joints = apply_shape(body, betas)
     texels = atlas_texels(body, 32, vertices)
     gaussians, anchors = texel_gaussians(texels, [0.0, 0.02], 0)
-    scene = replace(bare_scene(), gaussians=gaussians, anchors=anchors, skeleton=Skeleton(joints, body.parents))
+    scene = replace(
+        bare_scene(), gaussians=gaussians, anchors=anchors, skeleton=Skeleton(joints, body.parents)
+    )
     torch.testing.assert_close(rest_vertices(scene, body), vertices, atol=1e-4, rtol=0)
-    np.testing.assert_allclose(anchor_normals(anchors, body, vertices).norm(dim=1).numpy(), 1, atol=1e-5)
+    np.testing.assert_allclose(
+        anchor_normals(anchors, body, vertices).norm(dim=1).numpy(), 1, atol=1e-5
+    )
 
 
 def test_templates_that_do_not_fit() -> None:
-    scene, body = bare_scene(), template()
+    scene = bare_scene()
+    body = template()
     torch.testing.assert_close(rest_vertices(scene, body), body.vertices, atol=1e-4, rtol=0)
     with pytest.raises(DyngsError, match="is not the one that this person was trained on"):
         rest_vertices(scene, replace(body, faces=body.faces[:100], uv_faces=None, uv=None))
-    with pytest.raises(DyngsError, match=r"has no texture coordinates; train with model\.uv=FILE\.obj"):
+    with pytest.raises(
+        DyngsError, match=r"has no texture coordinates; train with model\.uv=FILE\.obj"
+    ):
         body_mesh(scene, replace(body, uv=None, uv_faces=None), body.vertices)

@@ -1,4 +1,5 @@
-"""Gaussians with joints: other readers open them, ours sees plain Gaussians, and the skin moves them as we do."""
+"""Gaussians with joints: other readers open them, ours sees plain Gaussians, and the skin moves
+them as we do."""
 
 from __future__ import annotations
 
@@ -36,14 +37,20 @@ def test_the_columns_and_comments_suffice_to_pose_the_person(tmp_path: Path) -> 
     assert lines[1][2:4] == ["left_hip", "0"]
     parents = tuple(int(line[3]) for line in lines)
     places = torch.tensor([[float(x) for x in line[4:]] for line in lines])
-    pose = axis_angle_to_matrix(0.4 * torch.randn(55, 3, generator=torch.Generator().manual_seed(1)))
+    pose = axis_angle_to_matrix(
+        0.4 * torch.randn(55, 3, generator=torch.Generator().manual_seed(1))
+    )
     moves = joint_transforms(places, parents, pose).numpy()[joints]
     means = np.stack([rows[axis] for axis in "xyz"], axis=1)
     blend = (weights[..., None, None] * moves).sum(axis=1)
     found = np.einsum("nab,nb->na", blend[..., :3], means) + blend[..., 3]
     skeleton = scene.learned_skeleton
-    own = torch.einsum("nj,jab->nab", scene.weights, joint_transforms(skeleton.joints, skeleton.parents, pose))
-    wanted = float(np.exp(0.1)) * ((own[..., :3] @ scene.gaussians.means[..., None])[..., 0] + own[..., 3])
+    own = torch.einsum(
+        "nj,jab->nab", scene.weights, joint_transforms(skeleton.joints, skeleton.parents, pose)
+    )
+    wanted = float(np.exp(0.1)) * (
+        (own[..., :3] @ scene.gaussians.means[..., None])[..., 0] + own[..., 3]
+    )
     rise = (found - wanted.numpy()).mean(axis=0)
     np.testing.assert_allclose(found, wanted.numpy() + rise, atol=2e-5)
     np.testing.assert_allclose(rise[[0, 2]], 0, atol=1e-5)

@@ -19,11 +19,14 @@ NORMALS = anchor_normals(bare_scene().anchors, BODY, BODY.vertices)
 def fitted(gaussians: Gaussians) -> FittedSurface:
     scene = bare_scene().with_gaussians(gaussians)
     samples = atlas(2 * RESOLUTION)
-    return fitted_surface(gaussians, BODY, BODY.vertices, samples, bake_texels(scene, samples, NORMALS))
+    return fitted_surface(
+        gaussians, BODY, BODY.vertices, samples, bake_texels(scene, samples, NORMALS)
+    )
 
 
 def test_trousers_move_the_thighs_and_nothing_else() -> None:
-    """Gaussians 3 cm above the thighs: there the surface rises by about as much, and silhouettes agree better."""
+    """Gaussians 3 cm above the thighs: there the surface rises by about as much, and silhouettes
+    agree better."""
     gaussians = bare_scene().gaussians
     thighs = atlas().weights[:, [1, 2]].sum(1).clamp(0, 1)
     found = fitted(gaussians.replace(means=gaussians.means + 0.03 * thighs[:, None] * NORMALS))
@@ -43,14 +46,20 @@ def test_fingers_swell_less() -> None:
     gaussians = bare_scene().gaussians
     found = fitted(gaussians.replace(means=gaussians.means + 0.02 * NORMALS))
     moved = (found.vertices - BODY.vertices).norm(dim=1)
-    tips = [i for i, name in enumerate(JOINT_NAMES) if name.endswith(("index3", "middle3", "ring3"))]
+    tips = [
+        i for i, name in enumerate(JOINT_NAMES) if name.endswith(("index3", "middle3", "ring3"))
+    ]
     trunk = BODY.weights[:, [0, 3, 6, 9]].sum(1) > 0.95
-    assert float(moved[BODY.weights[:, tips].sum(1) > 0.9].median()) < 0.75 * float(moved[trunk].median())
+    assert float(moved[BODY.weights[:, tips].sum(1) > 0.9].median()) < 0.75 * float(
+        moved[trunk].median()
+    )
 
 
 def test_the_template_stays_where_nothing_is_seen() -> None:
     gaussians = bare_scene().gaussians
-    found = fitted(gaussians.replace(logit_opacities=torch.full_like(gaussians.logit_opacities, -9.0)))
+    found = fitted(
+        gaussians.replace(logit_opacities=torch.full_like(gaussians.logit_opacities, -9.0))
+    )
     assert found.margin is None
     assert torch.equal(found.vertices, BODY.vertices)
     assert found.agreement == found.plain

@@ -1,4 +1,5 @@
-"""Affine colours of images: found again from what they did, and backgrounds are not in front of the camera."""
+"""Affine colours of images: found again from what they did, and backgrounds are not in front of the
+camera."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ def image_and_rendering() -> tuple[Image, Rendering]:
 def test_an_affine_is_found_again() -> None:
     image, rendering = image_and_rendering()
     found = fitted_affine([(image, rendering)], BLACK)
-    torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)  # the ridge pulls a little to the identity
+    # the ridge pulls a little to the identity
+    torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)
     shown = recoloured(found, image, rendering, BLACK)
     assert float((shown - image.rgb_premultiplied).abs().mean()) < 3e-3
 
@@ -40,9 +42,12 @@ def test_masked_pixels_and_those_of_weight_0_do_not_count() -> None:
     image, rendering = image_and_rendering()
     spoilt = image.rgb_premultiplied.clone()
     spoilt[:10], spoilt[50:] = 1.0, 0.0
-    mask, counts = torch.ones(60, 80), torch.ones(60, 80)
+    mask = torch.ones(60, 80)
+    counts = torch.ones(60, 80)
     mask[:10], counts[50:] = 0, 0
-    found = fitted_affine([(replace(image, rgb_premultiplied=spoilt, mask=mask), rendering)], BLACK, counts)
+    found = fitted_affine(
+        [(replace(image, rgb_premultiplied=spoilt, mask=mask), rendering)], BLACK, counts
+    )
     torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)
 
 
@@ -53,29 +58,38 @@ def test_without_pixels_it_is_the_identity() -> None:
 
 
 def test_saturated_pixels_do_not_darken() -> None:
-    """A third of the pixels would be brighter than white after twice the exposure, and were cut off."""
+    """A third of the pixels would be brighter than white after twice the exposure, and were cut
+    off."""
     image, rendering = image_and_rendering()
     twice = 2 * rendering.rgb[0]
-    found = fitted_affine([(replace(image, rgb_premultiplied=(1.15 * twice).clamp_max(1.0)), rendering)], BLACK)
+    found = fitted_affine(
+        [(replace(image, rgb_premultiplied=(1.15 * twice).clamp_max(1.0)), rendering)], BLACK
+    )
     gain = found[:, :3].sum(1) + found[:, 3] / 0.4
     assert bool((twice * 1.15 > 1).any())
     torch.testing.assert_close(gain, torch.full((3,), 2.3), atol=0.12, rtol=0)
 
 
 def test_channels_that_are_brighter_than_white_are_left_out_one_by_one() -> None:
-    """As least squares over the pixels of each channel that are kept, with the ridge as two more equations."""
+    """As least squares over the pixels of each channel that are kept, with the ridge as two more
+    equations."""
     image, rendering = image_and_rendering()
     target = (1.5 * rendering.rgb[0] * torch.tensor([1.0, 1.2, 0.9])).clamp_max(1.0)
     seen = torch.cat([rendering.rgb[0], torch.ones(60, 80, 1)], -1).reshape(-1, 4).double()
-    affine, kept = torch.eye(3, 4, dtype=torch.float64), torch.zeros(0)
+    affine = torch.eye(3, 4, dtype=torch.float64)
+    kept = torch.zeros(0)
     for _ in range(3):
-        kept, rows = ~((target.reshape(-1, 3) >= 254.5 / 255) & (seen @ affine.T > 1)), []
+        kept = ~((target.reshape(-1, 3) >= 254.5 / 255) & (seen @ affine.T > 1))
+        rows = []
         for channel in range(3):
             weights = torch.full((4,), 1e-2 * len(seen), dtype=torch.float64)
             weights[channel] = 1e-5 * len(seen)
-            ridge, of_identity = weights.sqrt().diag(), weights.sqrt() * torch.eye(3, 4).double()[channel]
+            ridge = weights.sqrt().diag()
+            of_identity = weights.sqrt() * torch.eye(3, 4).double()[channel]
             left = torch.cat([seen[kept[:, channel]], ridge])
-            right = torch.cat([target.reshape(-1, 3)[kept[:, channel], channel].double(), of_identity])
+            right = torch.cat(
+                [target.reshape(-1, 3)[kept[:, channel], channel].double(), of_identity]
+            )
             rows.append(torch.linalg.lstsq(left, right[:, None]).solution[:, 0])
         affine = torch.stack(rows)
     assert 0.05 < float((~kept).double().mean()) < 0.5

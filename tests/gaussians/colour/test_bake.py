@@ -30,7 +30,10 @@ def test_harmonics_are_found_again(degree: int) -> None:
     # the eye is 1e4 times farther than the Gaussians, not infinitely far
     torch.testing.assert_close(baked.gaussians.sh[:, : sh.shape[1]], sh, rtol=0, atol=1e-4)
     torch.testing.assert_close(
-        baked.gaussians.sh[:, sh.shape[1] :], torch.zeros_like(baked.gaussians.sh[:, sh.shape[1] :]), rtol=0, atol=1e-4
+        baked.gaussians.sh[:, sh.shape[1] :],
+        torch.zeros_like(baked.gaussians.sh[:, sh.shape[1] :]),
+        rtol=0,
+        atol=1e-4,
     )
     assert baked.error < 1e-4
     assert torch.equal(baked.gaussians.means, gaussians.means)
@@ -45,7 +48,9 @@ def test_the_error_is_what_cannot_be_fitted() -> None:
         return white[:, None, None].expand(len(cameras), len(gaussians), 3)
 
     baked = with_harmonics(gaussians, half, 0)
-    torch.testing.assert_close(baked.gaussians.base_rgb, torch.full((3, 3), 0.5, dtype=torch.float64))
+    torch.testing.assert_close(
+        baked.gaussians.base_rgb, torch.full((3, 3), 0.5, dtype=torch.float64)
+    )
     assert baked.error == pytest.approx(0.5)
     assert with_harmonics(gaussians, half, 3).error < 0.25
 

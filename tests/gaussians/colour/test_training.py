@@ -1,4 +1,5 @@
-"""What is learned of colours beside harmonics, its rates, when harmonics are measured, and the entropy of opacities."""
+"""What is learned of colours beside harmonics, its rates, when harmonics are measured, and the
+entropy of opacities."""
 
 from __future__ import annotations
 
@@ -47,12 +48,16 @@ def gaussians() -> Gaussians:
 def colours(seed: int = 0, **options: object) -> NetworkTraining:
     box = torch.tensor([[0.0] * 3, [2.0] * 3])
     generator = torch.Generator().manual_seed(seed)
-    return NetworkTraining(NetworkColour.model_validate(options), 60, box, generator, sees_time=True)
+    return NetworkTraining(
+        NetworkColour.model_validate(options), 60, box, generator, sees_time=True
+    )
 
 
 def stored(learner: NetworkTraining) -> dict[str, Tensor]:
     """What a checkpoint has of colours: of the scene, and of its training."""
-    return {name: x.clone() for name, x in tensors_of(learner.network.state() | learner.state()).items()}
+    return {
+        name: x.clone() for name, x in tensors_of(learner.network.state() | learner.state()).items()
+    }
 
 
 def test_plain_colours_do_nothing() -> None:
@@ -67,8 +72,11 @@ def test_plain_colours_do_nothing() -> None:
 
 def test_an_untrained_network_shows_the_base_colours() -> None:
     camera = random_scene(views=1).to(torch.float32).cameras
-    drawn = [render(gaussians(), camera, shader=s).rgb for s in (None, colours().network.shader(0.4))]
-    torch.testing.assert_close(drawn[0], drawn[1], rtol=0, atol=1e-6)  # base + 0 in another order of float32 sums
+    drawn = [
+        render(gaussians(), camera, shader=s).rgb for s in (None, colours().network.shader(0.4))
+    ]
+    # base + 0 in another order of float32 sums
+    torch.testing.assert_close(drawn[0], drawn[1], rtol=0, atol=1e-6)
 
 
 def test_it_learns_what_depends_on_the_view() -> None:
@@ -76,7 +84,8 @@ def test_it_learns_what_depends_on_the_view() -> None:
     cameras = random_scene(views=2).to(torch.float32).cameras
     shown = torch.ones(2, 30, 2, dtype=torch.int32)
     target = torch.tensor([0.2, 0.8])[:, None, None]
-    learner, drawn = colours(lr=0.1), gaussians()
+    learner = colours(lr=0.1)
+    drawn = gaussians()
     losses = []
     for step in range(1, 61):
         error = (learner.network.shader(0.5)(drawn, cameras, shown) - target).square().mean()
@@ -111,10 +120,13 @@ def test_state_goes_round_and_training_goes_on_alike() -> None:
 
     def train(learner: NetworkTraining, first: int, last: int) -> None:
         for step in range(first, last + 1):
-            (learner.network.shader(0.1)(gaussians(), cameras, shown) - 0.3).square().mean().backward()
+            (
+                learner.network.shader(0.1)(gaussians(), cameras, shown) - 0.3
+            ).square().mean().backward()
             learner.optimize(step)
 
-    whole, resumed = colours(), colours(seed=5)
+    whole = colours()
+    resumed = colours(seed=5)
     train(whole, 1, 5)
     resumed.restore(stored(whole), 30)
     train(whole, 6, 10)
@@ -165,7 +177,9 @@ def test_the_frozen_follow_the_set_and_go_round() -> None:
     with pytest.raises(ValueError, match="frozen"):
         other.restore(tensors_of(colours.state()), 4)
     colours.freeze(torch.ones(3, dtype=torch.bool))
-    assert colours.frozen_rest() is None, "where no harmonics are stored none need to be kept at zero"
+    assert colours.frozen_rest() is None, (
+        "where no harmonics are stored none need to be kept at zero"
+    )
 
 
 @given(st.floats(-1e4, 1e4))
@@ -184,7 +198,9 @@ def test_the_entropy_pushes_away_from_one_over_e() -> None:
     logits = torch.tensor([0.2, 0.3, 0.45, 0.6]).logit().requires_grad_()
     opacity_entropy(logits).backward()
     assert logits.grad is not None
-    assert (logits.grad > 0).tolist() == [True, True, False, False], "a step down the gradient makes the faint fainter"
+    assert (logits.grad > 0).tolist() == [True, True, False, False], (
+        "a step down the gradient makes the faint fainter"
+    )
 
 
 def test_the_entropy_is_weighted_and_of_nothing_zero() -> None:
@@ -240,17 +256,23 @@ def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name
         if step > 20:
             resumed.step()
     assert sum(losses[-7:]) < sum(losses[:7])
-    wanted, found = whole.checkpoint().tensors, resumed.checkpoint().tensors
+    wanted = whole.checkpoint().tensors
+    found = resumed.checkpoint().tensors
     assert wanted.keys() == found.keys()
     assert all(torch.equal(x, found[key]) for key, x in wanted.items())
 
 
 @pytest.mark.parametrize("name", ["none pays", "some pay"])
 def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> None:
-    """For good: they stay zero while the set changes; the view that tells is not trained on before."""
-    busy = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000)
+    """For good: they stay zero while the set changes; the view that tells is not trained on
+    before."""
+    busy = DefaultStrategy(
+        start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000
+    )
     trainer = _coloured(seven_views, COLOURS[name], busy)
-    seen, findings, counts = set(), {}, set()
+    seen = set()
+    findings = {}
+    counts = set()
     for step in range(1, 41):
         report = trainer.step()
         counts.add(len(trainer.model.scene.gaussians))
@@ -262,7 +284,8 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
     assert len(seen) == 6
     assert list(findings) == [MEASURED_AFTER]
     assert len(counts) > 4
-    sh, frozen = trainer.model.scene.gaussians.sh, trainer.model.colours.frozen_rest()
+    sh = trainer.model.scene.gaussians.sh
+    frozen = trainer.model.colours.frozen_rest()
     if name == "none pays":
         assert "does not pay" in findings[MEASURED_AFTER]
         assert sh.shape[1] == 1
@@ -279,10 +302,12 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
     for _ in range(30):
         trainer.step()
     assert trainer.model.scene.gaussians.sh_degree == 0
-    scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.model.colours.network
+    scene = restored_scene(trainer.checkpoint(), trainer.config.model)
+    network = trainer.model.colours.network
     assert network is not None
     camera = trainer.images[0].cameras
-    gaussians, shader = trainer.model.scene.gaussians.detach(), network.shader(None, None)
+    gaussians = trainer.model.scene.gaussians.detach()
+    shader = network.shader(None, None)
     drawn = scene.render(camera, options=RenderOptions(), background=torch.zeros(3)).rgb
     assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
     assert not torch.equal(drawn, render(gaussians, camera).rgb)

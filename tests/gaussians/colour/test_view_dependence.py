@@ -12,7 +12,12 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.view_dependence import MeasuredView, ViewDependence, find_view_dependent, first_worthwhile
+from dyngs.gaussians.colour.view_dependence import (
+    MeasuredView,
+    ViewDependence,
+    find_view_dependent,
+    first_worthwhile,
+)
 from dyngs.gaussians.rendering import RenderOptions, render
 
 BLACK = torch.zeros(3)
@@ -21,7 +26,8 @@ GLOSSY = torch.arange(24) < 6
 
 def camera(angle: float) -> Cameras:
     """3 from the origin, which it looks at, turned about y."""
-    c, s = math.cos(angle), math.sin(angle)
+    c = math.cos(angle)
+    s = math.sin(angle)
     pose = torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 3], [0, 0, 0, 1]])
     intrinsics = torch.tensor([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]])
     return Cameras(pose[None], intrinsics[None], 32, 32)
@@ -32,18 +38,28 @@ def balls(rest: Tensor) -> Gaussians:
     angle = torch.arange(24) * (2 * math.pi / 24)
     means = torch.stack([angle.cos(), 0.7 * (3 * angle).sin(), angle.sin()], dim=1)
     sh = torch.cat([torch.full((24, 1, 3), 0.3), rest], dim=1)
-    return Gaussians(means, torch.tensor([[1.0, 0, 0, 0]]).expand(24, 4), torch.full((24, 3), -2.2), torch.ones(24), sh)
+    return Gaussians(
+        means,
+        torch.tensor([[1.0, 0, 0, 0]]).expand(24, 4),
+        torch.full((24, 3), -2.2),
+        torch.ones(24),
+        sh,
+    )
 
 
 def noise(seed: int) -> Tensor:
     return torch.randn(24, 3, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def looks(angles: list[float], model: Gaussians, truth: Gaussians, mask: Tensor | None = None) -> list[MeasuredView]:
+def looks(
+    angles: list[float], model: Gaussians, truth: Gaussians, mask: Tensor | None = None
+) -> list[MeasuredView]:
     return [MeasuredView(model, camera(a), render(truth, camera(a)).rgb[0], mask) for a in angles]
 
 
-def find(model: Gaussians, truth: Gaussians, tolerance: float = 0.05, mask: Tensor | None = None) -> ViewDependence:
+def find(
+    model: Gaussians, truth: Gaussians, tolerance: float = 0.05, mask: Tensor | None = None
+) -> ViewDependence:
     seen = looks([0.37 * i for i in range(17)], model, truth)
     held_out = looks([0.1 + 0.9 * i for i in range(7)], model, truth, mask)
     return find_view_dependent(seen, held_out, RenderOptions(), BLACK, tolerance)
@@ -61,7 +77,9 @@ def test_a_matte_scene_keeps_none() -> None:
 def test_only_the_glossy_part_keeps_them() -> None:
     rest = 0.3 * noise(1) * GLOSSY[:, None, None]
     found = find(balls(rest + 0.01 * noise(2)), balls(rest))
-    assert found.keeps[GLOSSY].float().mean() > 0.8, "all but those that are hardly seen or hardly glossy"
+    assert found.keeps[GLOSSY].float().mean() > 0.8, (
+        "all but those that are hardly seen or hardly glossy"
+    )
     assert not found.keeps[~GLOSSY].any()
     assert found.worth_kept > 3
     assert "pays for 2" in str(found)
@@ -83,8 +101,12 @@ def test_the_mean_of_what_is_seen_takes_their_place() -> None:
     seen = looks([0.0], lone, lone)
     found = find_view_dependent(seen, looks([0.01], lone, lone), RenderOptions(), BLACK, 300.0)
     assert not found.keeps.any(), "300 dB may be given away"
-    plain = model.replace(sh=torch.cat([lone.sh[:, :1] + found.offsets[:, None] / SH_C0, rest], dim=1))
-    torch.testing.assert_close(render(plain, camera(0.0)).rgb, render(lone, camera(0.0)).rgb, rtol=0, atol=2e-5)
+    plain = model.replace(
+        sh=torch.cat([lone.sh[:, :1] + found.offsets[:, None] / SH_C0, rest], dim=1)
+    )
+    torch.testing.assert_close(
+        render(plain, camera(0.0)).rgb, render(lone, camera(0.0)).rgb, rtol=0, atol=2e-5
+    )
 
 
 def test_masked_pixels_do_not_count() -> None:
@@ -95,9 +117,12 @@ def test_masked_pixels_do_not_count() -> None:
 
 @settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 40), st.floats(0, 3))
-def test_the_fewest_that_are_worth_nearly_everything(seed: int, count: int, tolerance: float) -> None:
+def test_the_fewest_that_are_worth_nearly_everything(
+    seed: int, count: int, tolerance: float
+) -> None:
     g = torch.Generator().manual_seed(seed)
-    changes, worths = torch.rand(count, generator=g), torch.randn(count, generator=g)
+    changes = torch.rand(count, generator=g)
+    worths = torch.randn(count, generator=g)
     without = float(worths.clamp_min(0).sum()) + 1
     keeps = first_worthwhile(changes, worths, without, tolerance)
     order = changes.argsort(descending=True, stable=True)
@@ -116,8 +141,13 @@ def test_in_words() -> None:
         "view dependence pays for 12% of the Gaussians: +0.31 dB on held-out training views (for all of them: +0.35 dB)"
     )
     none = ViewDependence(keeps & False, torch.zeros(100, 3), -0.1, 0.0)
-    assert str(none) == "view dependence does not pay (-0.10 dB on held-out training views): none is stored"
-    assert "does not pay" in str(ViewDependence(torch.zeros(0, dtype=torch.bool), torch.zeros(0, 3), 0.0, 0.0))
+    assert (
+        str(none)
+        == "view dependence does not pay (-0.10 dB on held-out training views): none is stored"
+    )
+    assert "does not pay" in str(
+        ViewDependence(torch.zeros(0, dtype=torch.bool), torch.zeros(0, 3), 0.0, 0.0)
+    )
 
 
 def test_it_does_not_touch_what_it_looks_at() -> None:

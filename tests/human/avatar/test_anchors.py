@@ -63,11 +63,17 @@ def test_gradients_by_corrections_are_those_of_the_formula() -> None:
     points = torch.zeros(2, 3, dtype=torch.float64)
     joints = torch.tensor([[2, 0, 1], [1, 1, 3]])
     weights = torch.tensor([[0.5, 0.3, 0.2], [0.7, 0.3, 0.0]], dtype=torch.float64)
-    anchors = Anchors(points, points[:, 0], joints, weights, joints[:, 0], points, points[:, :2], points[:, 0])
-    corrections = torch.tensor([[0.3, -1.0, 0.2], [0.5, 0.0, 2.0]], dtype=torch.float64, requires_grad=True)
+    anchors = Anchors(
+        points, points[:, 0], joints, weights, joints[:, 0], points, points[:, :2], points[:, 0]
+    )
+    corrections = torch.tensor(
+        [[0.3, -1.0, 0.2], [0.5, 0.0, 2.0]], dtype=torch.float64, requires_grad=True
+    )
     found = skinning_weights(anchors, 4, corrections).detach()
     parts = torch.softmax(weights.log() + corrections.detach(), 1)
-    torch.testing.assert_close(found[0], torch.stack([parts[0, 1], parts[0, 2], parts[0, 0], torch.zeros(())]))
+    torch.testing.assert_close(
+        found[0], torch.stack([parts[0, 1], parts[0, 2], parts[0, 0], torch.zeros(())])
+    )
     torch.testing.assert_close(found[1].tolist(), [0.0, 1.0, 0.0, 0.0])
     assert torch.autograd.gradcheck(lambda c: skinning_weights(anchors, 4, c), corrections)
 
@@ -86,7 +92,9 @@ def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:
     texels = atlas_texels(default_template(), RESOLUTION)
     gaussians, anchors = texel_gaussians(texels, (0.0, 0.03), 1)
     assert len(gaussians) == len(anchors) == 2 * len(texels)
-    torch.testing.assert_close(gaussians.means[len(texels) :], texels.points + 0.03 * texels.normals)
+    torch.testing.assert_close(
+        gaussians.means[len(texels) :], texels.points + 0.03 * texels.normals
+    )
     thin = rotation_matrices(gaussians.quats)[:, :, 2]
     torch.testing.assert_close(thin[: len(texels)], texels.normals, rtol=0, atol=1e-5)
     assert gaussians.log_scales.argmin(1).eq(2).all()
@@ -120,7 +128,9 @@ def test_hands_and_feet_have_smaller_texels_of_the_same_surface_where_pixels_are
     assert {"left_wrist", "right_index3", "left_foot", "right_ankle"} <= parts
     assert not parts & {"head", "spine3", "left_elbow", "left_knee", "left_eye"}
     assert len(coarse) < len(plain)
-    areas = [float(sum(texels.size.square().sum() for texels in x)) for x in ((plain,), (coarse, fine))]
+    areas = [
+        float(sum(texels.size.square().sum() for texels in x)) for x in ((plain,), (coarse, fine))
+    ]
     assert areas[1] == pytest.approx(areas[0], rel=0.03)
     gaussians, anchors, normals = surface_gaussians([coarse, fine], 0)
     assert len(gaussians) == len(anchors) == len(normals) == len(coarse) + len(fine)
@@ -135,18 +145,24 @@ def test_nothing_is_finer_where_a_texel_is_hardly_wider_than_a_pixel() -> None:
 
 
 def test_a_pixel_is_as_large_on_the_person_as_the_camera_is_far() -> None:
-    pose, clip = (
-        torch.eye(4),
-        MotionClip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 55, 3), torch.zeros(1, 3), torch.tensor([2.0])),
+    pose = torch.eye(4)
+    clip = MotionClip(
+        torch.zeros(1, dtype=torch.float64),
+        torch.zeros(1, 55, 3),
+        torch.zeros(1, 3),
+        torch.tensor([2.0]),
     )
     pose[2, 3] = 8.0
-    camera = Cameras(pose[None], torch.tensor([[[400.0, 0, 50], [0, 400.0, 50], [0, 0, 1]]]), 100, 100)
+    camera = Cameras(
+        pose[None], torch.tensor([[[400.0, 0, 50], [0, 400.0, 50], [0, 0, 1]]]), 100, 100
+    )
     assert pixel_size([camera], clip, torch.zeros(3)) == pytest.approx(8.0 / 400 / 2)
     assert pixel_size([], clip, torch.zeros(3)) == torch.inf
 
 
 def test_scaffolds_are_displaced_by_exactly_their_height() -> None:
-    body, heights = default_template(), (0.0, 0.01, 0.04)
+    body = default_template()
+    heights = (0.0, 0.01, 0.04)
     texels = atlas_texels(body, 64, body.vertices)
     _, anchors = texel_gaussians(texels, heights, 0)
     for k, height in enumerate(heights):

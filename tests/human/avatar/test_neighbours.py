@@ -34,7 +34,10 @@ from dyngs.human.template.joints import JOINT_NAMES
 
 
 @settings(max_examples=40, deadline=None)
-@given(arrays(np.float64, st.tuples(st.integers(0, 12), st.just(3)), elements=st.integers(0, 3)), st.integers(1, 5))
+@given(
+    arrays(np.float64, st.tuples(st.integers(0, 12), st.just(3)), elements=st.integers(0, 3)),
+    st.integers(1, 5),
+)
 def test_neighbours_are_the_nearest_others(positions: np.ndarray, count: int) -> None:
     """By all distances; on a grid, so that many points coincide and are equally far."""
     points = torch.from_numpy(positions)
@@ -75,9 +78,17 @@ def test_neighbours_that_follow_other_joints_are_not_linked() -> None:
 def test_no_gaussian_of_an_arm_is_linked_to_the_trunk_or_of_a_finger_to_another() -> None:
     body = load_template(HumanModel())
     texels = atlas_texels(body, 96)
-    near, first = linked_neighbours(texels.points, texels.weights), texels.weights.argmax(1)
+    near = linked_neighbours(texels.points, texels.weights)
+    first = texels.weights.argmax(1)
     names = JOINT_NAMES[: len(body.parents)]
-    part = {"left_elbow": 1, "left_wrist": 1, "spine1": 2, "spine2": 2, "left_knee": 3, "right_knee": 4}
+    part = {
+        "left_elbow": 1,
+        "left_wrist": 1,
+        "spine1": 2,
+        "spine2": 2,
+        "left_knee": 3,
+        "right_knee": 4,
+    }
     fingers = ("index", "middle", "pinky", "ring", "thumb")
     part |= {f"left_{name}{i}": 5 + k for k, name in enumerate(fingers) for i in (2, 3)}
     parts = torch.tensor([part.get(name, 0) for name in names])[first]
@@ -85,7 +96,9 @@ def test_no_gaussian_of_an_arm_is_linked_to_the_trunk_or_of_a_finger_to_another(
     known = parts > 0
     linked = parts[near[known]]
     assert bool(((linked == parts[known, None]) | (linked == 0)).all())
-    assert float((near == torch.arange(len(near))[:, None]).float().mean()) < 0.02, "few lack neighbours"
+    assert float((near == torch.arange(len(near))[:, None]).float().mean()) < 0.02, (
+        "few lack neighbours"
+    )
 
 
 def sheet(width: int = 12, height: int = 10) -> tuple[Gaussians, Anchors]:
@@ -93,7 +106,8 @@ def sheet(width: int = 12, height: int = 10) -> tuple[Gaussians, Anchors]:
     x = (torch.arange(width) - (width - 1) / 2) * 0.01
     points = torch.cartesian_prod(x, torch.arange(height) * 0.01, torch.zeros(1))
     count = len(points)
-    size, joints = torch.full((count,), 0.01), torch.zeros(count, 1, dtype=torch.long)
+    size = torch.full((count,), 0.01)
+    joints = torch.zeros(count, 1, dtype=torch.long)
     anchors = Anchors(
         points=points,
         size=size,
@@ -122,7 +136,9 @@ def camera(distance: float = 1.0, size: int = 60, focal: float = 300.0) -> Camer
     pose = torch.eye(4)
     pose[2, 3] = distance
     half = size / 2
-    return Cameras(pose[None], torch.tensor([[[focal, 0, half], [0, focal, half], [0, 0, 1]]]), size, size)
+    return Cameras(
+        pose[None], torch.tensor([[[focal, 0, half], [0, focal, half], [0, 0, 1]]]), size, size
+    )
 
 
 def test_a_view_counts_as_about_one_whatever_its_size_and_what_is_behind_counts_nothing() -> None:
@@ -130,16 +146,24 @@ def test_a_view_counts_as_about_one_whatever_its_size_and_what_is_behind_counts_
     behind = gaussians.replace(means=gaussians.means + torch.tensor([0.0, 0.0, 0.05]))
     rows = torch.arange(len(anchors)).repeat(2)
     opaque = gaussians.select(rows).replace(
-        means=torch.cat([gaussians.means, behind.means]), logit_opacities=torch.full((len(rows),), 5.0)
+        means=torch.cat([gaussians.means, behind.means]),
+        logit_opacities=torch.full((len(rows),), 5.0),
     )
-    sizes, count = anchors.size.repeat(2), len(anchors)
-    inner = (anchors.points[:, 0].abs() < 0.04) & (anchors.points[:, 1] > 0.02) & (anchors.points[:, 1] < 0.07)
+    sizes = anchors.size.repeat(2)
+    count = len(anchors)
+    inner = (
+        (anchors.points[:, 0].abs() < 0.04)
+        & (anchors.points[:, 1] > 0.02)
+        & (anchors.points[:, 1] < 0.07)
+    )
     for size, focal in ((60, 300.0), (240, 1200.0)):
         seen = sightings([(opaque, camera(1.0, size, focal))], sizes, 1.0, RenderOptions())
         assert 0.3 < float(seen[:count][inner].mean()) < 2.5
         assert float(seen[count:][inner].max()) < 0.02
     twice = sightings([(opaque, camera())] * 2, sizes, 1.0, RenderOptions())
-    torch.testing.assert_close(twice, 2 * sightings([(opaque, camera())], sizes, 1.0, RenderOptions()))
+    torch.testing.assert_close(
+        twice, 2 * sightings([(opaque, camera())], sizes, 1.0, RenderOptions())
+    )
 
 
 def test_what_was_made_too_faint_to_be_drawn_is_left_as_it_is() -> None:
@@ -163,26 +187,36 @@ def test_the_unseen_half_of_a_symmetric_body_is_that_of_the_other_side() -> None
     gaussians, anchors = sheet()
     torch.manual_seed(0)
     right = anchors.points[:, 0] < 0
-    smooth = torch.stack([anchors.points[:, 1] * 5, anchors.points[:, 0].abs() * 8, 0 * right], dim=1)[:, None]
-    bulge = torch.stack([torch.sign(anchors.points[:, 0]), torch.ones_like(right), 2.0 * torch.ones_like(right)], dim=1)
+    smooth = torch.stack(
+        [anchors.points[:, 1] * 5, anchors.points[:, 0].abs() * 8, 0 * right], dim=1
+    )[:, None]
+    bulge = torch.stack(
+        [torch.sign(anchors.points[:, 0]), torch.ones_like(right), 2.0 * torch.ones_like(right)],
+        dim=1,
+    )
     true = gaussians.replace(sh=smooth, means=anchors.points + 0.004 * bulge)
     spoilt = true.replace(
         sh=torch.where(right[:, None, None], torch.randn(len(anchors), 1, 3), true.sh),
-        means=torch.where(right[:, None], anchors.points + 0.02 * torch.randn(len(anchors), 3), true.means),
+        means=torch.where(
+            right[:, None], anchors.points + 0.02 * torch.randn(len(anchors), 3), true.means
+        ),
         logit_opacities=torch.where(right, -3.0, true.logit_opacities),
     )
     weights = torch.stack([right, ~right], dim=1).float()
     new = filled(spoilt, anchors, weights, 0.0, (~right).float())
     torch.testing.assert_close(new["means"], true.means)
     torch.testing.assert_close(new["logit_opacities"], true.logit_opacities)
-    assert float((new["sh"] - true.sh).abs().max()) < 0.06, "colours are mixed a little with those around"
+    assert float((new["sh"] - true.sh).abs().max()) < 0.06, (
+        "colours are mixed a little with those around"
+    )
     torch.testing.assert_close(new["sh"][~right], true.sh[~right], rtol=0, atol=2e-3)
 
 
 def test_without_a_seen_mirror_image_a_gap_is_filled_smoothly_and_from_its_own_part_only() -> None:
     gaussians, anchors = sheet()
     torch.manual_seed(0)
-    left, x = anchors.points[:, 0] > 0, anchors.points[:, 0]
+    left = anchors.points[:, 0] > 0
+    x = anchors.points[:, 0]
     gap = (x.abs() < 0.03) & (anchors.points[:, 1] > 0.02) & (anchors.points[:, 1] < 0.07)
     colours = torch.where(left[:, None], torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
     noisy = torch.where(gap[:, None], torch.randn(len(anchors), 3), colours)
@@ -199,11 +233,15 @@ def test_without_a_seen_mirror_image_a_gap_is_filled_smoothly_and_from_its_own_p
 def test_strains_are_those_of_a_loop_and_so_are_their_gradients() -> None:
     generator = torch.Generator().manual_seed(0)
     means, moved, points = torch.randn(3, 7, 3, generator=generator, dtype=torch.float64).unbind(0)
-    near, scale = torch.tensor([1, 2, 0, 0, 5, 4, 6]), torch.tensor(1.5, dtype=torch.float64)  # the last is alone
+    near = torch.tensor([1, 2, 0, 0, 5, 4, 6])
+    scale = torch.tensor(1.5, dtype=torch.float64)  # the last is alone
     found = strains(means, moved, points, near, scale)
-    changes, unlike = [], []
+    changes = []
+    unlike = []
     for i, j in enumerate(near.tolist()):
-        changes.append(float((moved[i] - moved[j]).norm() / 1.5 - (means[i] - means[j]).norm()) ** 2)
+        changes.append(
+            float((moved[i] - moved[j]).norm() / 1.5 - (means[i] - means[j]).norm()) ** 2
+        )
         unlike.append(float(((means - points)[i] - (means - points)[j]).square().sum()))
     torch.testing.assert_close(found[0].item(), sum(changes) / 7, rtol=1e-6, atol=0)
     torch.testing.assert_close(found[1].item(), sum(unlike) / 7)
@@ -213,9 +251,11 @@ def test_strains_are_those_of_a_loop_and_so_are_their_gradients() -> None:
 
 def test_a_rigid_motion_strains_nothing() -> None:
     generator = torch.Generator().manual_seed(1)
-    points, near = torch.randn(9, 3, generator=generator, dtype=torch.float64), torch.arange(9).roll(1)
+    points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
+    near = torch.arange(9).roll(1)
     turned = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
-    moved, offset = 2 * (points + 0.1) @ turned.T + 5, points + torch.tensor([0.1, 0.1, 0.1])
+    moved = 2 * (points + 0.1) @ turned.T + 5
+    offset = points + torch.tensor([0.1, 0.1, 0.1])
     strain, uneven = strains(offset, moved, points, near, torch.tensor(2.0, dtype=torch.float64))
     assert strain < 1e-20
     assert uneven < 1e-20

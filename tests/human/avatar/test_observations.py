@@ -17,8 +17,11 @@ STILL = BodyPose(torch.eye(3)[None], torch.zeros(3), torch.tensor(1.0))
 SKELETON = Skeleton(torch.zeros(1, 3), (-1,))
 
 
-def image(rgb: tuple[float, float, float], half: float, with_alpha: bool = True, turned: bool = False) -> Image:
-    """A disc of colour ``rgb`` and radius ``half`` m around the origin, seen from z = -2 or, ``turned``, from 2."""
+def image(
+    rgb: tuple[float, float, float], half: float, with_alpha: bool = True, turned: bool = False
+) -> Image:
+    """A disc of colour ``rgb`` and radius ``half`` m around the origin, seen from z = -2 or,
+    ``turned``, from 2."""
     pose = torch.eye(4)
     pose[2, 3] = 2.0
     if turned:
@@ -26,16 +29,30 @@ def image(rgb: tuple[float, float, float], half: float, with_alpha: bool = True,
     cameras = Cameras(pose[None], torch.tensor([[[40.0, 0, 20], [0, 40.0, 20], [0, 0, 1]]]), 40, 40)
     grid = (torch.arange(40) + 0.5 - 20) / 20
     alpha = ((grid[:, None] ** 2 + grid**2).sqrt() < half).float()
-    return Image("disc", cameras, alpha[..., None] * torch.tensor(rgb), alpha if with_alpha else None, None, 0.0, 0)
+    return Image(
+        "disc",
+        cameras,
+        alpha[..., None] * torch.tensor(rgb),
+        alpha if with_alpha else None,
+        None,
+        0.0,
+        0,
+    )
 
 
 def colours(
-    points: list[list[float]], *shown: tuple[Image, BodyPose], normal: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    points: list[list[float]],
+    *shown: tuple[Image, BodyPose],
+    normal: tuple[float, float, float] = (0.0, 0.0, -1.0),
 ) -> torch.Tensor:
     """Observed colours of points on a body of one joint that all face one way."""
-    count, at_rest = len(points), torch.tensor(points)
-    normals, weights = torch.tensor([normal]).repeat(count, 1), torch.ones(count, 1)
-    return observed_colours(normals, weights, SKELETON, ((image, pose, at_rest) for image, pose in shown))[0]
+    count = len(points)
+    at_rest = torch.tensor(points)
+    normals = torch.tensor([normal]).repeat(count, 1)
+    weights = torch.ones(count, 1)
+    return observed_colours(
+        normals, weights, SKELETON, ((image, pose, at_rest) for image, pose in shown)
+    )[0]
 
 
 def test_positions_are_looked_up_in_the_pose_of_the_image() -> None:
@@ -45,7 +62,10 @@ def test_positions_are_looked_up_in_the_pose_of_the_image() -> None:
 
 
 def test_colours_are_those_of_the_cameras_in_front() -> None:
-    shown = [(image((1.0, 0.2, 0.0), 0.5), STILL), (image((0.0, 0.0, 1.0), 0.5, turned=True), STILL)]
+    shown = [
+        (image((1.0, 0.2, 0.0), 0.5), STILL),
+        (image((0.0, 0.0, 1.0), 0.5, turned=True), STILL),
+    ]
     torch.testing.assert_close(colours([[0.0, 0, 0]], *shown)[0], torch.tensor([1.0, 0.2, 0.0]))
     back = colours([[0.0, 0, 0]], *shown, normal=(0.0, 0.0, 1.0))
     torch.testing.assert_close(back[0], torch.tensor([0.0, 0.0, 1.0]))
@@ -55,13 +75,15 @@ def test_what_nobody_faces_is_grey_and_without_alpha_the_full_image_counts() -> 
     grey = torch.full((3,), 0.5)
     aside = colours([[0.0, 0, 0]], (image((1, 0, 0), 0.5), STILL), normal=(1.0, 0.0, 0.0))
     torch.testing.assert_close(aside[0], grey)
-    opaque, cut = image((1, 0, 0), 0.5, with_alpha=False), image((1, 0, 0), 0.5)
+    opaque = image((1, 0, 0), 0.5, with_alpha=False)
+    cut = image((1, 0, 0), 0.5)
     torch.testing.assert_close(colours([[0.8, 0, 0]], (opaque, STILL))[0], torch.zeros(3))
     torch.testing.assert_close(colours([[0.8, 0, 0]], (cut, STILL))[0], grey)
 
 
 def test_first_colours_of_what_nobody_faces_are_those_around_it() -> None:
-    """A strip of texels that face a camera, which sees red, or not, and some of another joint, which stay grey."""
+    """A strip of texels that face a camera, which sees red, or not, and some of another joint,
+    which stay grey."""
     count, away, apart = 20, 6, 16
     points = torch.zeros(count, 3)
     points[:, 0] = 0.01 * torch.arange(count)
@@ -79,12 +101,21 @@ def test_first_colours_of_what_nobody_faces_are_those_around_it() -> None:
         uv=points[:, :2],
         height=torch.zeros(count),
     )
-    clip = MotionClip(torch.zeros(1).double(), torch.zeros(1, 2, 3), torch.zeros(1, 3), torch.ones(1))
+    clip = MotionClip(
+        torch.zeros(1).double(), torch.zeros(1, 2, 3), torch.zeros(1, 3), torch.ones(1)
+    )
     # far from the plane of symmetry, so that nothing is a mirror image
-    subject = Subject(Skeleton(torch.full((2, 3), 5.0), (-1, 0)), anchors, CapturedMotion(clip, (0,)))
-    quats, wide = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 3), -5.0)
+    subject = Subject(
+        Skeleton(torch.full((2, 3), 5.0), (-1, 0)), anchors, CapturedMotion(clip, (0,))
+    )
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    wide = torch.full((count, 3), -5.0)
     grey = Gaussians(points, quats, wide, torch.zeros(count), torch.zeros(count, 1, 3))
     coloured = in_colours_of(grey, normals, subject, [image((1.0, 0.0, 0.0), 0.5)] * 20)
     found = coloured.sh[:, 0] * SH_C0 + 0.5
-    torch.testing.assert_close(found[:apart], torch.tensor([[1.0, 0, 0]]).repeat(apart, 1), atol=0.02, rtol=0)
-    torch.testing.assert_close(found[apart:], torch.full((count - apart, 3), 0.5), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        found[:apart], torch.tensor([[1.0, 0, 0]]).repeat(apart, 1), atol=0.02, rtol=0
+    )
+    torch.testing.assert_close(
+        found[apart:], torch.full((count - apart, 3), 0.5), atol=1e-3, rtol=0
+    )

@@ -1,4 +1,5 @@
-"""Colours near the outlines of found masks: what is behind the person is found, and decides instead of the mask."""
+"""Colours near the outlines of found masks: what is behind the person is found, and decides instead
+of the mask."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Look
 from dyngs.models.renderable import Rendering
 
-SIDE, FRAMES, RED = 40, 9, (200.0, 20.0, 20.0)
+SIDE = 40
+FRAMES = 9
+RED = (200.0, 20.0, 20.0)
 GENERATOR = torch.Generator()
 
 
@@ -38,14 +41,17 @@ def person(frame: int, grown: int = 0) -> np.ndarray:
 
 
 def views(folder: Path, grown: int, light: float = 0.0) -> list[View]:
-    """Return views of the square, whose masks are too large by ``grown`` px; ``light`` grey levels come every frame."""
+    """Return views of the square, whose masks are too large by ``grown`` px; ``light`` grey levels
+    come every frame."""
     found = []
     for frame in range(FRAMES):
         photo = np.where(person(frame)[..., None], RED, behind() + light * frame)
-        image, mask = folder / f"{frame}.png", folder / f"m{frame}.png"
+        image = folder / f"{frame}.png"
+        mask = folder / f"m{frame}.png"
         write_image(image, photo.clip(0, 255).round().astype(np.uint8))
         write_image(mask, (255 * person(frame, grown)).astype(np.uint8))
-        pose, intrinsics = np.eye(4), np.array([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
+        pose = np.eye(4)
+        intrinsics = np.array([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
         view = View(f"{frame}", image, pose, intrinsics, SIDE, SIDE, time=frame / 8, frame=frame)
         found.append(replace(view, silhouette=Silhouette(mask, "white")))
     return found
@@ -53,7 +59,8 @@ def views(folder: Path, grown: int, light: float = 0.0) -> list[View]:
 
 def run(seen: list[View], background: str = "white", **train: Any) -> RunStart:
     config = Config(data=DataConfig(root=Path()), model=HumanModel(), train=TrainConfig(**train))
-    capture, images = Capture(Path(), "body_json", {"train": tuple(seen)}, has_alpha=True), ImageLoader(seen)
+    capture = Capture(Path(), "body_json", {"train": tuple(seen)}, has_alpha=True)
+    images = ImageLoader(seen)
     return RunStart(config, config, capture, images, background, 1.0, GENERATOR)
 
 
@@ -62,7 +69,9 @@ def loss_of(loss: OutlineLoss, seen: list[View], frame: int, alpha: Tensor, rgb:
     image = ImageLoader(seen)[frame]
     rendered = alpha[..., None] * rgb + 1 - alpha[..., None]
     drawn = Drawn(Rendering(rendered[None], 1 - alpha[None], None), {}, {}, lambda: None)
-    look = Look(frame, 1, image, drawn, rendered, image.composite(torch.ones(3)), cast(Any, None), GENERATOR)
+    look = Look(
+        frame, 1, image, drawn, rendered, image.composite(torch.ones(3)), cast(Any, None), GENERATOR
+    )
     return loss(look)["image"]
 
 
@@ -71,14 +80,16 @@ def test_the_true_person_costs_least_though_the_mask_is_wrong(tmp_path: Path, gr
     seen = views(tmp_path, grown)
     loss = outline_loss(run(seen))
     assert loss is not None
-    alpha, rgb = torch.from_numpy(person(2)).float(), torch.tensor(RED).expand(SIDE, SIDE, 3) / 255
+    alpha = torch.from_numpy(person(2)).float()
+    rgb = torch.tensor(RED).expand(SIDE, SIDE, 3) / 255
     assert float(loss_of(loss, seen, 2, alpha, rgb)) < 1e-3
     cut_out = torch.from_numpy(person(2, grown)).float()
     assert float(loss_of(loss, seen, 2, cut_out, rgb)) > 5e-3
 
 
 def test_the_opacity_is_moved_towards_the_true_one(tmp_path: Path) -> None:
-    """Of a pixel that the mask has and the person does not, opacity falls; far from the mask nothing is asked."""
+    """Of a pixel that the mask has and the person does not, opacity falls; far from the mask
+    nothing is asked."""
     seen = views(tmp_path, 1)
     loss = outline_loss(run(seen))
     assert loss is not None
@@ -86,7 +97,11 @@ def test_the_opacity_is_moved_towards_the_true_one(tmp_path: Path) -> None:
     loss_of(loss, seen, 2, alpha, torch.tensor(RED).expand(SIDE, SIDE, 3) / 255).backward()
     assert alpha.grad is not None
     rim = torch.from_numpy(person(2, 1) & ~person(2))
-    assert float(alpha.grad[rim].mean()) > 0 > float(alpha.grad[torch.from_numpy(person(2, -2))].mean())
+    assert (
+        float(alpha.grad[rim].mean())
+        > 0
+        > float(alpha.grad[torch.from_numpy(person(2, -2))].mean())
+    )
 
 
 def test_a_line_says_how_much_is_known(tmp_path: Path) -> None:
@@ -95,11 +110,18 @@ def test_a_line_says_how_much_is_known(tmp_path: Path) -> None:
     assert "100% of the pixels at their outlines" in loss.finding
 
 
-@pytest.mark.parametrize("case", ["moving camera", "one frame", "alpha", "light", "random", "exposure", "no mask"])
+@pytest.mark.parametrize(
+    "case", ["moving camera", "one frame", "alpha", "light", "random", "exposure", "no mask"]
+)
 def test_masks_decide_where_nothing_is_known_behind_them(tmp_path: Path, case: str) -> None:
-    seen, background, train = views(tmp_path, 1, light=20.0 if case == "light" else 0.0), "white", {}
+    seen = views(tmp_path, 1, light=20.0 if case == "light" else 0.0)
+    background = "white"
+    train = {}
     if case == "moving camera":
-        seen = [replace(x, cam_from_world=x.cam_from_world + 0.01 * i * np.eye(4)[3]) for i, x in enumerate(seen)]
+        seen = [
+            replace(x, cam_from_world=x.cam_from_world + 0.01 * i * np.eye(4)[3])
+            for i, x in enumerate(seen)
+        ]
     elif case == "one frame":
         seen = seen[:1]
     elif case == "alpha":

@@ -8,7 +8,16 @@ from typing import cast
 
 import pytest
 import torch
-from posed_person import SIZE, WHITE, Shown, disturbed, images_of, joints_of, mean_psnr, person_and_cameras
+from posed_person import (
+    SIZE,
+    WHITE,
+    Shown,
+    disturbed,
+    images_of,
+    joints_of,
+    mean_psnr,
+    person_and_cameras,
+)
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image, ImageLoader
@@ -31,10 +40,13 @@ CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0
 
 def of_squares(shift: int = 0) -> tuple[Rendering, Image]:
     """A square of 4 x 4 px, and a render of it that lies ``shift`` px further to the right."""
-    truth, drawn = torch.zeros(12, 16), torch.zeros(12, 16)
+    truth = torch.zeros(12, 16)
+    drawn = torch.zeros(12, 16)
     truth[4:8, 4:8] = 1
     drawn[4:8, 4 + shift : 8 + shift] = 1
-    image = Image("a", CAMERA, 0.5 * truth[..., None].expand(-1, -1, 3).contiguous(), truth, None, None)
+    image = Image(
+        "a", CAMERA, 0.5 * truth[..., None].expand(-1, -1, 3).contiguous(), truth, None, None
+    )
     rgb = (0.5 * drawn + 1 - drawn)[..., None].expand(-1, -1, 3).contiguous()
     return Rendering(rgb[None], (1 - drawn)[None], None), image
 
@@ -59,7 +71,9 @@ def test_silhouettes_know_no_colours() -> None:
     other = replace(image, rgb_premultiplied=torch.rand(12, 16, 3))
     kept = difference_of_silhouettes(drawn, image, WHITE, 1)
     assert difference_of_silhouettes(drawn, other, WHITE, 1) == kept
-    assert difference_of_images(drawn, other, WHITE, 1) != difference_of_images(drawn, image, WHITE, 1)
+    assert difference_of_images(drawn, other, WHITE, 1) != difference_of_images(
+        drawn, image, WHITE, 1
+    )
 
 
 def test_a_image_without_silhouette_is_refused() -> None:
@@ -102,13 +116,19 @@ def test_disturbed_poses_are_found_again(
     assert fit.scene.learned is start.learned
 
 
-def test_what_fits_already_stays(truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_fits_already_stays(
+    truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
     scene, cameras = truth
     images = images_of(scene, cameras[:1], [0.0])
     fit = fitted(scene, images)
-    torch.testing.assert_close(fit.scene.moves_as.poses, scene.moves_as.poses[:1], rtol=0, atol=1e-5)
-    torch.testing.assert_close(fit.scene.moves_as.trans, scene.moves_as.trans[:1], rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        fit.scene.moves_as.poses, scene.moves_as.poses[:1], rtol=0, atol=1e-5
+    )
+    torch.testing.assert_close(
+        fit.scene.moves_as.trans, scene.moves_as.trans[:1], rtol=0, atol=1e-6
+    )
 
 
 def test_silhouettes_alone_find_poses_again(
@@ -118,7 +138,9 @@ def test_silhouettes_alone_find_poses_again(
     scene, cameras = truth
     images = images_of(scene, cameras, list(scene.times[:1]))
     start = disturbed(scene)
-    without_colours = [replace(x, rgb_premultiplied=torch.rand_like(x.rgb_premultiplied)) for x in images]
+    without_colours = [
+        replace(x, rgb_premultiplied=torch.rand_like(x.rgb_premultiplied)) for x in images
+    ]
     fit = fitted(start, without_colours, SILHOUETTES)
     true = joints_of(scene, scene.moves_as, 0)
     before, after = (joints_of(x, x.moves_as, 0) for x in (start, fit.scene))
@@ -137,7 +159,9 @@ def test_one_silhouette_moves_the_person_and_turns_no_joint(
     sideways = camera[0, :3] * 0.03  # in the image, where one view shows it
     start = scene.playing(replace(scene.clip, trans=scene.clip.trans + sideways))
     fit = fitted(start, images, SILHOUETTES)
-    torch.testing.assert_close(fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-6
+    )
     off = [(x.moves_as.trans[0] - scene.moves_as.trans[0]).norm() for x in (start, fit.scene)]
     assert off[1] < 0.4 * off[0]
 
@@ -150,4 +174,6 @@ def test_masked_pixels_say_nothing_about_the_pose(
     start = disturbed(scene)
     images = images_of(scene, cameras[:1], [0.0], mask=torch.zeros(SIZE, SIZE))
     fit = fitted(start, images)
-    torch.testing.assert_close(fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-5
+    )

@@ -1,4 +1,5 @@
-"""Poses of training fitted again: wrong ones gain and come nearer to the truth, right ones do not gain."""
+"""Poses of training fitted again: wrong ones gain and come nearer to the truth, right ones do not
+gain."""
 
 from __future__ import annotations
 
@@ -22,11 +23,14 @@ def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
 
 
 def refit_to(scene: HumanScene, cameras: list[Cameras]) -> PoseRefit:
-    return PoseRefit(cast(ImageLoader, Shown(images_of(scene, cameras, list(scene.times)))), WHITE, 400)
+    return PoseRefit(
+        cast(ImageLoader, Shown(images_of(scene, cameras, list(scene.times)))), WHITE, 400
+    )
 
 
 def trained_on(scene: HumanScene) -> HumanScene:
-    """The same person whose clip of training is the one with turned joints, and some corrections of it."""
+    """The same person whose clip of training is the one with turned joints, and some corrections of
+    it."""
     clip = disturbed(scene).played
     assert clip is not None
     copied = scene.learned.restored({name: x.tensor for name, x in scene.learned.state().items()})
@@ -45,7 +49,9 @@ def test_views_left_out_gain_from_wrong_poses_only(truth: tuple[HumanScene, list
     assert move > 5 * LEAST_MOVE
 
 
-def test_one_row_comes_nearer_to_the_truth_and_all_else_stays(truth: tuple[HumanScene, list[Cameras]]) -> None:
+def test_one_row_comes_nearer_to_the_truth_and_all_else_stays(
+    truth: tuple[HumanScene, list[Cameras]],
+) -> None:
     scene, cameras = truth
     start = trained_on(scene)
     with torch.no_grad():
@@ -69,4 +75,6 @@ def test_one_view_of_each_time_does_not_suit(truth: tuple[HumanScene, list[Camer
     alone = refit_to(scene, cameras[:1])
     assert not alone.suits(scene)
     assert alone.refitted(scene, 0) is scene
-    assert not refit_to(scene, cameras).suits(replace(scene, clip=scene.clip.select(torch.tensor([0, 1]))))
+    assert not refit_to(scene, cameras).suits(
+        replace(scene, clip=scene.clip.select(torch.tensor([0, 1])))
+    )

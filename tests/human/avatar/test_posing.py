@@ -1,4 +1,5 @@
-"""Posed Gaussians with known answers: rest, a bent elbow, mirrored poses, turned colours, and fractions of joints.
+"""Posed Gaussians with known answers: rest, a bent elbow, mirrored poses, turned colours, and
+fractions of joints.
 
 N Gaussians, J joints.
 """
@@ -42,7 +43,8 @@ from tests.bare_person import atlas, bare_scene
 
 
 def from_the_left() -> Tensor:
-    """Twice as bright as even light where the surface faces +x, black where it faces -x; red only."""
+    """Twice as bright as even light where the surface faces +x, black where it faces -x; red
+    only."""
     factors = torch.zeros(TERMS, 3)
     factors[0, 0] = 1.0
     return factors
@@ -50,7 +52,8 @@ def from_the_left() -> Tensor:
 
 def turned(angle: float) -> Tensor:
     """A rotation about y."""
-    c, s = math.cos(angle), math.sin(angle)
+    c = math.cos(angle)
+    s = math.sin(angle)
     return torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
@@ -86,8 +89,12 @@ def test_higher_harmonics_are_dimmed_with_the_colour() -> None:
 def test_gradients_are_those_of_finite_differences() -> None:
     make = torch.Generator().manual_seed(1)
     shapes = ((3, 1, 3), (3, 3, 3), (3, 3), (TERMS, 3))
-    values = [torch.randn(shape, generator=make, dtype=torch.float64).requires_grad_() for shape in shapes]
-    assert torch.autograd.gradcheck(lambda sh, linear, normals, light: Light(normals, light).on(sh, linear), values)
+    values = [
+        torch.randn(shape, generator=make, dtype=torch.float64).requires_grad_() for shape in shapes
+    ]
+    assert torch.autograd.gradcheck(
+        lambda sh, linear, normals, light: Light(normals, light).on(sh, linear), values
+    )
 
 
 def test_normals_of_the_first_gaussians_point_away_from_the_body() -> None:
@@ -104,7 +111,8 @@ def test_a_person_is_lit_in_the_world() -> None:
     assert torch.equal(lit.means, dark.means)
     ratio = colours(lit.sh) / colours(dark.sh)
     torch.testing.assert_close(ratio[:, 1:], torch.ones_like(ratio[:, 1:]), atol=1e-5, rtol=0)
-    right, left = ratio[:, 0].topk(500, largest=False).indices, ratio[:, 0].topk(500).indices
+    right = ratio[:, 0].topk(500, largest=False).indices
+    left = ratio[:, 0].topk(500).indices
     middle = dark.means[:, 0].median()
     assert dark.means[left, 0].median() > middle > dark.means[right, 0].median()
 
@@ -112,13 +120,15 @@ def test_a_person_is_lit_in_the_world() -> None:
 def test_sides_of_other_colours_differ() -> None:
     gaussians = bare_scene().gaussians.select(torch.arange(4))
     sh = torch.tensor([0.1, 0.4, 0.4, 0.0])[:, None, None].expand(4, 1, 3) / SH_C0
-    images, known = torch.tensor([1, 0, 1, 2]), torch.tensor([True, True, True, False])
+    images = torch.tensor([1, 0, 1, 2])
+    known = torch.tensor([True, True, True, False])
     found = difference_of_sides(gaussians.replace(sh=sh), images, known)
     torch.testing.assert_close(found, torch.tensor(3 * 2 * 0.09 / 4))
 
 
 RESOLUTION = 48
-LEFT_ELBOW, LEFT_WRIST = JOINT_NAMES.index("left_elbow"), JOINT_NAMES.index("left_wrist")
+LEFT_ELBOW = JOINT_NAMES.index("left_elbow")
+LEFT_WRIST = JOINT_NAMES.index("left_wrist")
 
 
 @cache
@@ -131,7 +141,9 @@ def person(sh_degree: int = 0) -> tuple[BodyTemplate, Gaussians, Anchors, Tensor
     return body, gaussians, anchors, skinning_weights(anchors, len(body.joints))
 
 
-def in_pose(turns: dict[int, tuple[float, float, float]], gaussians: Gaussians | None = None) -> Gaussians:
+def in_pose(
+    turns: dict[int, tuple[float, float, float]], gaussians: Gaussians | None = None
+) -> Gaussians:
     """The person with some joints turned by axis-angle vectors, rad."""
     body, rest, _, weights = person()
     poses = torch.zeros(len(body.joints), 3)
@@ -171,7 +183,8 @@ def test_a_bent_elbow_moves_exactly_its_texels() -> None:
     moved = (found.means - rest.means).norm(dim=1)
     assert bool((moved[fraction == 0] < 1e-6).all())
     assert bool((moved[fraction > 0.5] > 0.005).all())
-    elbow, turn = body.joints[LEFT_ELBOW], axis_angle_to_matrix(torch.tensor([0.0, 0.0, math.pi / 2]))
+    elbow = body.joints[LEFT_ELBOW]
+    turn = axis_angle_to_matrix(torch.tensor([0.0, 0.0, math.pi / 2]))
     forearm = fraction > 1 - 1e-6
     assert int(forearm.sum()) > 20
     wanted = (rest.means[forearm] - elbow) @ turn.T + elbow
@@ -203,13 +216,17 @@ def test_a_mirrored_pose_mirrors_the_result() -> None:
     count = 30
     weights = torch.rand(count, len(JOINT_NAMES), generator=generator).pow(4)
     weights = weights / weights.sum(1, keepdim=True)
-    means, quats = torch.randn(count, 3, generator=generator), torch.randn(count, 4, generator=generator)
+    means = torch.randn(count, 3, generator=generator)
+    quats = torch.randn(count, 4, generator=generator)
     log_scales = torch.randn(count, 3, generator=generator) - 3
     rest = Gaussians(means, quats, log_scales, torch.zeros(count), torch.zeros(count, 1, 3))
     flipped = rest.replace(means=mirror * means, quats=quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
-    skeleton, still = Skeleton(joints, body.parents), (torch.zeros(3), torch.tensor(1.0))
+    skeleton = Skeleton(joints, body.parents)
+    still = (torch.zeros(3), torch.tensor(1.0))
     one = pose_gaussians(rest, weights, skeleton, BodyPose(axis_angle_to_matrix(poses), *still))
-    two = pose_gaussians(flipped, weights[:, other], skeleton, BodyPose(axis_angle_to_matrix(mirrored_poses), *still))
+    two = pose_gaussians(
+        flipped, weights[:, other], skeleton, BodyPose(axis_angle_to_matrix(mirrored_poses), *still)
+    )
     torch.testing.assert_close(two.means, mirror * one.means, rtol=0, atol=1e-5)
     wanted = mirror[:, None] * covariances(one) * mirror
     torch.testing.assert_close(covariances(two), wanted, rtol=1e-3, atol=1e-6)
@@ -222,7 +239,8 @@ def test_colours_turn_with_what_they_are_on() -> None:
     turns = axis_angle_to_matrix(2 * torch.randn(7, 3, generator=generator))
     seen = torch.nn.functional.normalize(torch.randn(7, 3, generator=generator), dim=1)
     turned = (turns @ seen[..., None])[..., 0]
-    radii, eye = torch.ones(1, 7, 2, dtype=torch.int32), torch.zeros(1, 3)
+    radii = torch.ones(1, 7, 2, dtype=torch.int32)
+    eye = torch.zeros(1, 3)
     before = evaluate_harmonics(seen, eye, sh, radii, 1)
     after = evaluate_harmonics(turned, eye, rotate_sh(sh, turns), radii, 1)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
@@ -230,23 +248,34 @@ def test_colours_turn_with_what_they_are_on() -> None:
 
 
 def test_blended_rotations_are_those_of_single_joints_and_never_vanish() -> None:
-    """Between two joints they lie on the shorter way, wherever both turn together; opposite turns blend, too."""
+    """Between two joints they lie on the shorter way, wherever both turn together; opposite turns
+    blend, too."""
     generator = torch.Generator().manual_seed(4)
     turns = axis_angle_to_matrix(2 * torch.randn(5, 3, dtype=torch.float64, generator=generator))
-    moves = torch.cat([turns, torch.randn(5, 3, 1, dtype=torch.float64, generator=generator)], dim=-1)
+    moves = torch.cat(
+        [turns, torch.randn(5, 3, 1, dtype=torch.float64, generator=generator)], dim=-1
+    )
     torch.testing.assert_close(blended_rotations(torch.eye(5, dtype=torch.float64), moves), turns)
     weights = torch.rand(40, 5, dtype=torch.float64, generator=generator)
     blended = blended_rotations(weights, moves)
-    torch.testing.assert_close(blended @ blended.mT, torch.eye(3, dtype=torch.float64).expand(40, 3, 3))
+    torch.testing.assert_close(
+        blended @ blended.mT, torch.eye(3, dtype=torch.float64).expand(40, 3, 3)
+    )
     assert bool((torch.linalg.det(blended) > 0).all())
     both = torch.cat([turns[0] @ moves[..., :3], moves[..., 3:]], dim=-1)
     torch.testing.assert_close(blended_rotations(weights, both), turns[0] @ blended)
-    eye, about = torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64)
+    about = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     half = torch.tensor([[0.5, 0.5]], dtype=torch.float64)
     for angle in (0.1, 3.0, torch.pi):
         pair = torch.stack([eye, axis_angle_to_matrix(angle * about)])
-        found = blended_rotations(half, torch.cat([pair, torch.zeros(2, 3, 1, dtype=torch.float64)], dim=-1))[0]
-        way = (found - axis_angle_to_matrix(angle / 2 * about), found - axis_angle_to_matrix(-angle / 2 * about))
+        found = blended_rotations(
+            half, torch.cat([pair, torch.zeros(2, 3, 1, dtype=torch.float64)], dim=-1)
+        )[0]
+        way = (
+            found - axis_angle_to_matrix(angle / 2 * about),
+            found - axis_angle_to_matrix(-angle / 2 * about),
+        )
         assert min(float(x.abs().max()) for x in way) < 1e-9
 
 
@@ -256,13 +285,15 @@ def test_blended_rotations_have_the_gradients_of_differences() -> None:
     poses = torch.randn(3, 3, dtype=torch.float64, generator=generator).requires_grad_()
     rest = torch.zeros(3, 3, 1, dtype=torch.float64)
     assert torch.autograd.gradcheck(
-        lambda w, p: blended_rotations(w, torch.cat([axis_angle_to_matrix(p), rest], dim=-1)), (weights, poses)
+        lambda w, p: blended_rotations(w, torch.cat([axis_angle_to_matrix(p), rest], dim=-1)),
+        (weights, poses),
     )
 
 
 @cache
 def rigid_body() -> BodyTemplate:
-    """A body of random triangles with SMPL's joints and pose blend shapes; each triangle follows one joint alone."""
+    """A body of random triangles with SMPL's joints and pose blend shapes; each triangle follows
+    one joint alone."""
     generator = np.random.default_rng(0)
     arrays = synthetic_bodies.model("smpl")
     groups = torch.arange(len(arrays["v_template"])) // 3
@@ -282,31 +313,40 @@ def rigid_body() -> BodyTemplate:
 
 
 def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
-    """Where a triangle follows one joint alone, texels in any pose are the barycentric points of the posed mesh."""
+    """Where a triangle follows one joint alone, texels in any pose are the barycentric points of
+    the posed mesh."""
     body = rigid_body()
     generator = torch.Generator().manual_seed(0)
     poses = 0.5 * torch.randn(24, 3, generator=generator)
     posing = BodyPose(axis_angle_to_matrix(poses), torch.tensor([1.0, 2.0, 3.0]), torch.tensor(1.5))
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
-    weights, shapes = skinning_weights(anchors, 24), pose_blend_shapes(body)
+    weights = skinning_weights(anchors, 24)
+    shapes = pose_blend_shapes(body)
     assert shapes is not None
     offsets = rest_offsets(anchors, posing, shapes)
-    found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets).means
+    found = pose_gaussians(
+        gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets
+    ).means
     given = (poses[None], posing.trans[None], None, None, posing.scale[None])
     mesh, stiff = (posed_vertices(b, *given)[0] for b in (body, replace(body, pose_dirs=None)))
-    wanted, without = ((anchors.barycentric[..., None] * x[body.faces[anchors.face]]).sum(1) for x in (mesh, stiff))
+    wanted, without = (
+        (anchors.barycentric[..., None] * x[body.faces[anchors.face]]).sum(1) for x in (mesh, stiff)
+    )
     assert float((wanted - without).norm(dim=1).mean()) > 0.1
     # 2^-11 of offsets of half a metre, shared by 207 numbers that round independently
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-4)
     exact = replace(shapes, directions=body.pose_dirs).offsets(anchors, posing.rotations)
-    found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), posing, exact).means
+    found = pose_gaussians(
+        gaussians, weights, Skeleton(body.joints, body.parents), posing, exact
+    ).means
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-6)
 
 
 def test_offsets_of_the_template_reach_the_pose() -> None:
     body = rigid_body()
     _, anchors = texel_gaussians(atlas_texels(body, 16), (0.0, 0.02), 0)
-    shapes, generator = pose_blend_shapes(body), torch.Generator().manual_seed(0)
+    shapes = pose_blend_shapes(body)
+    generator = torch.Generator().manual_seed(0)
     poses = (0.5 * torch.randn(24, 3, generator=generator)).requires_grad_()
     posing = BodyPose(axis_angle_to_matrix(poses), torch.zeros(3), torch.tensor(1.0))
     given = rest_offsets(anchors, posing, shapes)
@@ -326,7 +366,8 @@ def test_posing_is_differentiable_in_everything(sh_degree: int) -> None:
     body, rest, anchors, _ = person(sh_degree)
     leaves = {name: x.clone().requires_grad_() for name, x in rest.tensors().items()}
     poses = torch.zeros(len(body.joints), 3, requires_grad=True)
-    joints, corrections = body.joints.clone().requires_grad_(), torch.zeros_like(anchors.weights).requires_grad_()
+    joints = body.joints.clone().requires_grad_()
+    corrections = torch.zeros_like(anchors.weights).requires_grad_()
     weights = skinning_weights(anchors, len(joints), corrections)
     posing = BodyPose(axis_angle_to_matrix(poses + 0.3), torch.zeros(3), torch.tensor(1.0))
     found = pose_gaussians(Gaussians(**leaves), weights, Skeleton(joints, body.parents), posing)

@@ -1,4 +1,5 @@
-"""An avatar by itself: equal poses give equal images, and corrections that were learned are applied once."""
+"""An avatar by itself: equal poses give equal images, and corrections that were learned are applied
+once."""
 
 from __future__ import annotations
 
@@ -15,7 +16,12 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose, correction_penalties
+from dyngs.human.avatar.corrections import (
+    SharedCorrection,
+    corrected_clip,
+    corrected_pose,
+    correction_penalties,
+)
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
@@ -31,7 +37,12 @@ def random_clip(frames: int, seed: int = 0) -> MotionClip:
     generator = torch.Generator().manual_seed(seed)
     times = torch.linspace(0, 1, frames, dtype=torch.float64)
     trans = torch.randn(frames, 3, generator=generator)
-    return MotionClip(times, 0.3 * torch.randn(frames, 55, 3, generator=generator), 0.1 * trans, torch.ones(frames))
+    return MotionClip(
+        times,
+        0.3 * torch.randn(frames, 55, 3, generator=generator),
+        0.1 * trans,
+        torch.ones(frames),
+    )
 
 
 OPTIONS = HumanModel(sh_degree=0)
@@ -41,8 +52,12 @@ def stirred() -> HumanScene:
     """A person whose corrections are not zero."""
     body = default_template()
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
-    gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1)))
-    subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3)))
+    gaussians = gaussians.replace(
+        sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1))
+    )
+    subject = Subject(
+        Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3))
+    )
     scene = HumanTraining(OPTIONS, subject.motion.frames, Rates(10)).first_scene(gaussians, subject)
     generator = torch.Generator().manual_seed(2)
     for x in scene.learned.values().values():
@@ -64,7 +79,8 @@ def seen(gaussians: Gaussians) -> Tensor:
 
 def test_two_clips_of_the_same_pose_give_the_same_image() -> None:
     scene = reloaded(stirred())
-    one, other = random_clip(3, seed=5), random_clip(6, seed=6)
+    one = random_clip(3, seed=5)
+    other = random_clip(6, seed=6)
     for name in ("poses", "trans", "scale"):
         getattr(other, name)[4] = getattr(one, name)[1]
     first, second = (seen(scene.playing(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
@@ -78,7 +94,9 @@ def test_baked_corrections_are_those_of_training() -> None:
     played = reloaded(trained).moves_as
     for row in range(len(trained.clip)):
         posing = corrected_pose(trained.learned, trained.clip, row)
-        torch.testing.assert_close(axis_angle_to_matrix(played.poses[row]), posing.rotations, rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            axis_angle_to_matrix(played.poses[row]), posing.rotations, rtol=0, atol=1e-5
+        )
         torch.testing.assert_close(played.trans[row], posing.trans)
         torch.testing.assert_close(played.scale[row], posing.scale)
 
@@ -86,10 +104,14 @@ def test_baked_corrections_are_those_of_training() -> None:
 def test_other_clips_get_what_holds_for_all_poses() -> None:
     turns = torch.zeros(2, 3)
     turns[1, 0] = 0.5
-    clip = MotionClip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 2, 3), torch.ones(1, 3), torch.ones(1))
+    clip = MotionClip(
+        torch.zeros(1, dtype=torch.float64), torch.zeros(1, 2, 3), torch.ones(1, 3), torch.ones(1)
+    )
     clip.poses[0, 1, 1] = math.pi / 2
     found = corrected_clip(SharedCorrection(turns, math.log(2)), clip)
-    wanted = (Rotation.from_rotvec([0, math.pi / 2, 0]) * Rotation.from_rotvec([0.5, 0, 0])).as_rotvec()
+    wanted = (
+        Rotation.from_rotvec([0, math.pi / 2, 0]) * Rotation.from_rotvec([0.5, 0, 0])
+    ).as_rotvec()
     assert found.poses[0, 1].tolist() == pytest.approx(wanted.tolist(), abs=1e-6)
     assert float(found.scale[0]) == pytest.approx(2)
     assert torch.equal(found.trans, clip.trans)
@@ -108,7 +130,8 @@ def test_parts_are_all_or_nothing() -> None:
 def test_one_pose_is_posed_once_and_the_same_at_all_times() -> None:
     still = reloaded(stirred()).playing(random_clip(1))
     with torch.no_grad():
-        first, later = still.time_step(0.0), still.time_step(0.7)
+        first = still.time_step(0.0)
+        later = still.time_step(0.7)
         assert first.gaussians is later.gaussians
         assert (first.time, later.time) == (0.0, 0.7)
     fresh = still.time_step(0.7)

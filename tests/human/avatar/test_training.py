@@ -1,4 +1,5 @@
-"""The avatar in training: it learns, repeats to the byte, resumes exactly, follows edits, and plays its clip back."""
+"""The avatar in training: it learns, repeats to the byte, resumes exactly, follows edits, and plays
+its clip back."""
 
 from __future__ import annotations
 
@@ -42,7 +43,9 @@ BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "person"
-    return write_human_capture(folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1))
+    return write_human_capture(
+        folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1)
+    )
 
 
 def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes: object) -> Config:
@@ -88,7 +91,10 @@ def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path) -> N
     assert same(straight, tensors_after(resumed, 4))
     counts = {len(assemble(config).model.scene), len(straight["gaussians.means"])}
     assert len(counts) == 2, "some must be pruned, or this test shows little"
-    learned = [straight[f"model.learned.{name}"] for name in ("poses", "trans", "turns", "joints", "weights")]
+    learned = [
+        straight[f"model.learned.{name}"]
+        for name in ("poses", "trans", "turns", "joints", "weights")
+    ]
     assert all(bool((x != 0).any()) for x in learned)
 
 
@@ -108,7 +114,9 @@ def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("own_body", [False, True])
-def test_what_is_played_back_is_what_was_trained(capture: Path, tmp_path: Path, own_body: bool) -> None:
+def test_what_is_played_back_is_what_was_trained(
+    capture: Path, tmp_path: Path, own_body: bool
+) -> None:
     body = write_npz(tmp_path / "model.npz", model("smplx")) if own_body else None
     trainer = assemble(tiny(capture, body=body))
     assert (human(trainer).shapes is not None) == own_body
@@ -118,7 +126,9 @@ def test_what_is_played_back_is_what_was_trained(capture: Path, tmp_path: Path, 
     scene = restored_scene(trainer.checkpoint(), trainer.config.model)
     played = scene.at(image.time)
     torch.testing.assert_close(played.means, drawn.means.detach(), rtol=0, atol=1e-5)
-    torch.testing.assert_close(played.log_scales.sum(1), drawn.log_scales.detach().sum(1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        played.log_scales.sum(1), drawn.log_scales.detach().sum(1), rtol=0, atol=1e-4
+    )
     assert not scene.is_static
     assert len(scene.rows) == len(scene)
 
@@ -127,7 +137,8 @@ def test_anchors_and_weights_follow_the_set(capture: Path) -> None:
     trainer = assemble(tiny(capture))
     tensors_after(trainer, 3)
     scene = human(trainer)
-    points, weights = scene.anchors.points, scene.learned["weights"].detach().clone()
+    points = scene.anchors.points
+    weights = scene.learned["weights"].detach().clone()
     source = torch.tensor([5, 2, 2, 9])
     edited = scene.edited(TopologyEdit(source, torch.tensor([False, False, True, False])))
     assert torch.equal(edited.anchors.points, points[source])
@@ -157,17 +168,23 @@ def test_colours_of_both_sides_and_light_are_learned(capture: Path) -> None:
 
 def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> None:
     found = tensors_after(assemble(tiny(capture, refine=False)), 6)
-    assert not any(bool(found[f"model.learned.{name}"].any()) for name in ("poses", "trans", "turns", "joints"))
+    assert not any(
+        bool(found[f"model.learned.{name}"].any()) for name in ("poses", "trans", "turns", "joints")
+    )
 
 
 def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) -> None:
     trainer = assemble(tiny(capture))
-    scene, image, options = human(trainer), trainer.images[0], trainer.config.model
+    scene = human(trainer)
+    image = trainer.images[0]
+    options = trainer.config.model
     assert isinstance(options, HumanModel)
     first = trainer.model.training.time_step(scene, image, 1).penalties
     assert first["offset"].item() == 0
     assert first["smoothness"].item() == 0
-    away = scene.gaussians.replace(means=scene.gaussians.means.detach() + torch.tensor([0.01, 0.0, 0.0]))
+    away = scene.gaussians.replace(
+        means=scene.gaussians.means.detach() + torch.tensor([0.01, 0.0, 0.0])
+    )
     later = trainer.model.training.time_step(scene.with_gaussians(away), image, 1).penalties
     assert later["offset"].item() == pytest.approx(options.offset_weight, rel=1e-4)
     assert later["smoothness"].item() == pytest.approx(0, abs=1e-9)
@@ -176,7 +193,9 @@ def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) ->
 def test_a_capture_without_bodies_is_an_error(capture: Path, tmp_path: Path) -> None:
     from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 
-    write_still_capture(tmp_path / "still", StillOptions(size=16, num_train=2, num_test=1, samples=1))
+    write_still_capture(
+        tmp_path / "still", StillOptions(size=16, num_train=2, num_test=1, samples=1)
+    )
     with pytest.raises(DyngsError, match="has no body parameters"):
         assemble(tiny(tmp_path / "still"))
 
@@ -193,7 +212,8 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     run = open_run(tmp_path)
     own = run.in_motion(capture / "body_train.npz")
     assert len(own.scene.times) == 3
-    first, again = run.scene.at(0.0), own.scene.at(0.0)
+    first = run.scene.at(0.0)
+    again = own.scene.at(0.0)
     torch.testing.assert_close(again.log_scales, first.log_scales, rtol=0, atol=1e-4)
     rest = run.at_rest().scene
     assert rest.is_static
@@ -205,19 +225,25 @@ def test_a_fit_far_from_the_origin_is_played_exactly(capture: Path, tmp_path: Pa
     trainer = assemble(tiny(capture))
     save_checkpoint(tmp_path, trainer.checkpoint(), 0.0)
     save_config(trainer.config, tmp_path / RESOLVED_NAME)
-    near, offset = open_run(tmp_path), (500_000.0, 4_600_000.0, 120.0)
+    near = open_run(tmp_path)
+    offset = (500_000.0, 4_600_000.0, 120.0)
     far = replace(near, info=replace(near.info, world_offset=offset))
     with np.load(capture / "body_train.npz") as file:
         fit = dict(file)
     fit["scale"] = 1.01 * np.ones(len(fit["poses"]))
     for name, shift in (("near", np.zeros(3)), ("far", np.array(offset))):
         write_npz(tmp_path / f"{name}.npz", fit | {"trans": fit["trans"] + shift})
-    played = (run.in_motion(tmp_path / f"{name}.npz").scene for run, name in ((near, "near"), (far, "far")))
+    played = (
+        run.in_motion(tmp_path / f"{name}.npz").scene
+        for run, name in ((near, "near"), (far, "far"))
+    )
     there, here = (scene.at(0.5).means for scene in played)
     torch.testing.assert_close(there, here, rtol=0, atol=1e-6)
 
 
-def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_changes(capture: Path) -> None:
+def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_changes(
+    capture: Path,
+) -> None:
     def after(step: int, fill: bool) -> tuple[dict[str, Tensor], str]:
         trainer = assemble(tiny(capture, steps=4, fill_unseen=fill))
         reports = [trainer.step() for _ in range(step)]
@@ -239,12 +265,15 @@ def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_chan
 
 
 def turned(capture: Path, out: Path) -> Path:
-    """The same capture, in whose poses hips, knees, shoulders and elbows are turned by 23 degrees to either side."""
+    """The same capture, in whose poses hips, knees, shoulders and elbows are turned by 23 degrees
+    to either side."""
     shutil.copytree(capture, out)
     with np.load(out / "body_train.npz") as file:
         body = dict(file)
     poses = body["poses"].reshape(len(body["poses"]), -1, 3)
-    poses[:, [1, 2, 4, 5, 16, 17, 18, 19]] += np.random.default_rng(0).choice([-0.4, 0.4], (len(poses), 8, 3))
+    poses[:, [1, 2, 4, 5, 16, 17, 18, 19]] += np.random.default_rng(0).choice(
+        [-0.4, 0.4], (len(poses), 8, 3)
+    )
     np.savez(out / "body_train.npz", **body | {"poses": poses.reshape(len(poses), -1)})
     return out
 
@@ -270,18 +299,26 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
 
 @pytest.mark.parametrize(("refine", "minutes"), [(False, None), (True, 1.0)])
 def test_poses_stay_on_request_and_in_previews(
-    capture: Path, tmp_path: Path, refine: bool, minutes: float | None, monkeypatch: pytest.MonkeyPatch
+    capture: Path,
+    tmp_path: Path,
+    refine: bool,
+    minutes: float | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(pose_refit, "STARTS", (10 / 240,))
     config = tiny(turned(capture, tmp_path / "turned"), steps=240, refine_from=0.1, refine=refine)
-    config = config.model_copy(update={"train": config.train.model_copy(update={"minutes": minutes})})
+    config = config.model_copy(
+        update={"train": config.train.model_copy(update={"minutes": minutes})}
+    )
     trainer = assemble(config)
     given = human(trainer).clip.poses.clone()
     assert all(trainer.step().finding is None for _ in range(12))
     assert torch.equal(human(trainer).clip.poses, given)
 
 
-def test_poses_that_views_gain_nothing_from_stay_for_good(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_that_views_gain_nothing_from_stay_for_good(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pose_refit, "STARTS", (10 / 240, 14 / 240))
     trainer = assemble(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()

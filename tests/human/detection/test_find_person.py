@@ -47,13 +47,16 @@ def clip(tmp_path: Path) -> Path:
     clothes = rng.uniform(0, 255, (HEIGHT // 4, WIDTH // 4, 3)).repeat(4, 0).repeat(4, 1)
     for number in range(COUNT):
         moved = np.roll(clothes, 10 * number, axis=1)
-        image = np.where(truth(number)[..., None], moved, ground) + rng.normal(0, 1.5, (HEIGHT, WIDTH, 3))
+        image = np.where(truth(number)[..., None], moved, ground) + rng.normal(
+            0, 1.5, (HEIGHT, WIDTH, 3)
+        )
         write_image(tmp_path / "clip" / f"f{number}.png", np.clip(image, 0, 255).astype(np.uint8))
     return tmp_path / "clip"
 
 
 class Rough:
-    """Finds the person with outlines that are 1 px off, and nobody in image 4; smaller, somebody who stands apart."""
+    """Finds the person with outlines that are 1 px off, and nobody in image 4; smaller, somebody
+    who stands apart."""
 
     name = "Rough"
 
@@ -70,7 +73,9 @@ class Rough:
     def _people(self, number: int, scale: float) -> list[Detection]:
         grown = (ndimage.binary_dilation, ndimage.binary_erosion)[number % 2](truth(number))
         grown = grown[:: round(1 / scale), :: round(1 / scale)]
-        points = person(30 + 10 * number, 90.0).keypoints * np.array([scale, scale, 1.0], np.float32)
+        points = person(30 + 10 * number, 90.0).keypoints * np.array(
+            [scale, scale, 1.0], np.float32
+        )
         walker = Detection(points.astype(np.float32), (255 * grown).astype(np.uint8))
         small = np.zeros_like(walker.mask)
         small[-8:, -8:] = 255
@@ -92,29 +97,52 @@ def test_masks_and_key_points_of_all_views(
 ) -> None:
     monkeypatch.setattr(module, "SIDE", side)
     said: list[str] = []
-    found = find_person(capture_of(clip), Rough(beside=side == 960), tmp_path / "found", report_nothing, said.append)
+    found = find_person(
+        capture_of(clip), Rough(beside=side == 960), tmp_path / "found", report_nothing, said.append
+    )
     assert found.masks is not None
     assert found.keypoints is not None
     seen = [number for number in range(COUNT) if number != 4]
-    assert min(overlap(found.masks, number) for number in seen) > (0.93 if side == 960 else 0.7)  # at half the size
+    # at half the size
+    assert min(overlap(found.masks, number) for number in seen) > (0.93 if side == 960 else 0.7)
     assert overlap(found.masks, 4) == 0
     points = read_keypoints(found.keypoints, capture_of(clip).splits["train"])
     assert set(points) == {f"f{number}" for number in seen}
     ankle = points["f2"][JOINTS["left_ankle"]].numpy()
     np.testing.assert_allclose(ankle, person(50, 90.0).keypoints[15], atol=1e-3)
     assert any("finds the person" in line and "in 9 of 10 images" in line for line in said)
-    assert any(line.startswith("warning: other people in 9 of 10 images") for line in said) == (side == 960)
-    assert not list((tmp_path / "found" / "frames").iterdir()), "images for the detector only live while it runs"
+    assert any(line.startswith("warning: other people in 9 of 10 images") for line in said) == (
+        side == 960
+    )
+    assert not list((tmp_path / "found" / "frames").iterdir()), (
+        "images for the detector only live while it runs"
+    )
 
 
 def test_another_person_and_nobody(clip: Path, tmp_path: Path) -> None:
-    found = find_person(capture_of(clip), Rough(beside=True), tmp_path / "found", report_nothing, [].append, number=2)
+    found = find_person(
+        capture_of(clip),
+        Rough(beside=True),
+        tmp_path / "found",
+        report_nothing,
+        [].append,
+        number=2,
+    )
     assert found.masks is not None
     assert overlap(found.masks, 2) < 0.1
     with pytest.raises(DyngsError, match="--person 3, but people found: 2"):
-        find_person(capture_of(clip), Rough(beside=True), tmp_path / "found", report_nothing, [].append, number=3)
+        find_person(
+            capture_of(clip),
+            Rough(beside=True),
+            tmp_path / "found",
+            report_nothing,
+            [].append,
+            number=3,
+        )
     with pytest.raises(DyngsError, match="Rough finds nobody in 10 images"):
-        find_person(capture_of(clip), Rough(nobody=True), tmp_path / "found", report_nothing, [].append)
+        find_person(
+            capture_of(clip), Rough(nobody=True), tmp_path / "found", report_nothing, [].append
+        )
 
 
 def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Path) -> None:
@@ -145,12 +173,16 @@ def test_a_capture_of_the_person_comes_out(
     assert capture.body is not None
     assert capture.has_alpha
     assert len(all_views(capture.splits)) == 2, "the image without anybody is left out"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ann", "clip"], "nothing else is left behind"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ann", "clip"], (
+        "nothing else is left behind"
+    )
     with pytest.raises(DyngsError, match=r"exists|not empty"):
         write_found_person(DataConfig(root=clip), out, Rough(), say=[].append)
 
 
-def test_a_clip_is_looked_at_once(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clip_is_looked_at_once(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(module, "MediaPipe", Rough)
     made: list[Path] = []
@@ -170,7 +202,9 @@ def test_a_clip_is_looked_at_once(clip: Path, tmp_path: Path, monkeypatch: pytes
     assert [line for line in said if "found before" in line] == [said[2]]
 
 
-def test_without_a_detector_training_says_what_to_install(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_detector_training_says_what_to_install(
+    clip: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     config = load_config("human", [f"data.root={clip}"])
     with pytest.raises(DyngsError, match="install MediaPipe"):

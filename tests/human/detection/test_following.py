@@ -11,7 +11,8 @@ from dyngs.human.detection.detector import Detection
 from dyngs.human.detection.following import PATIENCE, followed, with_sides
 from tests.detections import person
 
-LEFT, RIGHT = [1, 3, 5, 7, 9, 11, 13, 15], [2, 4, 6, 8, 10, 12, 14, 16]
+LEFT = [1, 3, 5, 7, 9, 11, 13, 15]
+RIGHT = [2, 4, 6, 8, 10, 12, 14, 16]
 ARMS = ([7, 9], [8, 10])
 NOBODY = np.zeros((4, 4), np.uint8)
 
@@ -22,7 +23,9 @@ def columns_of(track: list[Detection | None]) -> list[float | None]:
 
 @given(st.permutations([0, 1, 2]), st.floats(-12, 12))
 @settings(max_examples=20, deadline=None)
-def test_people_are_followed_whatever_the_order_of_detections(order: list[int], speed: float) -> None:
+def test_people_are_followed_whatever_the_order_of_detections(
+    order: list[int], speed: float
+) -> None:
     ways = [(100.0, speed, 200.0), (300.0, -speed, 190.0), (700.0, 5.0, 120.0)]
     images = []
     for t in range(12):
@@ -31,8 +34,12 @@ def test_people_are_followed_whatever_the_order_of_detections(order: list[int], 
     tracks = followed(images)
     assert len(tracks) == 3
     found = {tuple(columns_of(track)) for track in tracks}
-    assert found == {tuple(round(start + velocity * t, 3) for t in range(12)) for start, velocity, _ in ways}
-    assert [max(x.height for x in track if x is not None) for track in tracks] == sorted((200, 190, 120), reverse=True)
+    assert found == {
+        tuple(round(start + velocity * t, 3) for t in range(12)) for start, velocity, _ in ways
+    }
+    assert [max(x.height for x in track if x is not None) for track in tracks] == sorted(
+        (200, 190, 120), reverse=True
+    )
 
 
 def test_who_is_hidden_for_a_while_is_the_same_one() -> None:
@@ -52,13 +59,17 @@ def test_who_jumps_or_grows_is_another_one() -> None:
 def test_nobody() -> None:
     assert followed([[], []]) == []
     unsure = person(100).keypoints * np.array([1, 1, 0], np.float32)
-    assert followed([[Detection(unsure, NOBODY)]]) == [], "where no key point is sure there is no box"
+    assert followed([[Detection(unsure, NOBODY)]]) == [], (
+        "where no key point is sure there is no box"
+    )
 
 
 @pytest.mark.parametrize("sides", [(LEFT, RIGHT), ARMS], ids=["all", "arms"])
 @given(st.sets(st.integers(2, 27), max_size=6))
 @settings(max_examples=20, deadline=None)
-def test_sides_swapped_in_a_few_images_are_put_right(sides: tuple[list[int], list[int]], wrong: set[int]) -> None:
+def test_sides_swapped_in_a_few_images_are_put_right(
+    sides: tuple[list[int], list[int]], wrong: set[int]
+) -> None:
     wrong = {t for t in wrong if not {t - 1, t - 2} & wrong}  # no more than two in a row
     true = [person(100 + 4 * t, swing=12 * np.sin(0.5 * t)) for t in range(30)]
     seen = []
@@ -75,7 +86,9 @@ def test_sides_swapped_in_a_few_images_are_put_right(sides: tuple[list[int], lis
 
 
 def test_who_turns_around_keeps_their_sides() -> None:
-    turning = [person(100, width=float(np.cos(np.pi * min(max(t - 10, 0), 10) / 10))) for t in range(30)]
+    turning = [
+        person(100, width=float(np.cos(np.pi * min(max(t - 10, 0), 10) / 10))) for t in range(30)
+    ]
     found, changed = with_sides([*turning[:5], None, *turning[6:]])
     assert changed == 0
     assert found[5] is None

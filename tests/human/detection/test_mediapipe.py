@@ -44,7 +44,9 @@ def images(tmp_path: Path) -> list[Path]:
     return files
 
 
-@pytest.mark.skipif(os.name != "posix", reason="the interpreter is replaced by a script with a #! line")
+@pytest.mark.skipif(
+    os.name != "posix", reason="the interpreter is replaced by a script with a #! line"
+)
 def test_what_the_process_finds_comes_back(tmp_path: Path, images: list[Path]) -> None:
     first, second, third = MediaPipe(interpreter(tmp_path, FINDS)).detect(images)
     assert second == []
@@ -54,13 +56,18 @@ def test_what_the_process_finds_comes_back(tmp_path: Path, images: list[Path]) -
     assert MediaPipe(interpreter(tmp_path, FINDS)).detect([]) == []
 
 
-@pytest.mark.skipif(os.name != "posix", reason="the interpreter is replaced by a script with a #! line")
+@pytest.mark.skipif(
+    os.name != "posix", reason="the interpreter is replaced by a script with a #! line"
+)
 @pytest.mark.parametrize(
     ("body", "said"),
     [
         ("sys.exit('out of memory')", "MediaPipe failed (1): out of memory"),
         ("sys.exit(7)", "MediaPipe failed (7): nothing was said"),
-        ("for x in Path(images).iterdir(): (Path(out) / f'{x.stem}.npz').write_bytes(b'rubbish')", "damaged"),
+        (
+            "for x in Path(images).iterdir(): (Path(out) / f'{x.stem}.npz').write_bytes(b'rubbish')",
+            "damaged",
+        ),
     ],
 )
 def test_failures_are_one_line(tmp_path: Path, images: list[Path], body: str, said: str) -> None:
@@ -83,7 +90,9 @@ def _has_mediapipe() -> bool:
     return find_spec("mediapipe") is not None and find_spec("cv2") is not None
 
 
-def test_without_an_interpreter_it_says_how_to_get_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_interpreter_it_says_how_to_get_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     with pytest.raises(DyngsError, match="no detector finds the person: install MediaPipe with"):
         MediaPipe()
@@ -93,7 +102,9 @@ def test_without_an_interpreter_it_says_how_to_get_one(tmp_path: Path, monkeypat
     assert MediaPipe().name == "MediaPipe"
 
 
-@pytest.mark.skipif(VARIABLE not in os.environ, reason=f"{VARIABLE} names no environment with MediaPipe")
+@pytest.mark.skipif(
+    VARIABLE not in os.environ, reason=f"{VARIABLE} names no environment with MediaPipe"
+)
 def test_the_real_one_finds_nobody_in_noise(tmp_path: Path) -> None:
     path = tmp_path / "noise" / "000000.png"
     write_image(path, np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8))

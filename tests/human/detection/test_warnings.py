@@ -40,7 +40,9 @@ def test_a_good_clip_has_no_warning() -> None:
         (turning(12, 380), [], "feet are cut off or hidden in 12 of 12 images"),
     ],
 )
-def test_what_is_bad_is_said(people: list[Detection | None], others: list[list[Detection | None]], said: str) -> None:
+def test_what_is_bad_is_said(
+    people: list[Detection | None], others: list[list[Detection | None]], said: str
+) -> None:
     found = warnings_of(clip(people), people, others)
     assert len(found) == 1
     assert said in found[0]
@@ -48,7 +50,9 @@ def test_what_is_bad_is_said(people: list[Detection | None], others: list[list[D
 
 def test_blur_is_said() -> None:
     people = turning(12)
-    assert warnings_of(clip(people, 4), people, []) == ["4 images blurred; more light, or slower motion, helps"]
+    assert warnings_of(clip(people, 4), people, []) == [
+        "4 images blurred; more light, or slower motion, helps"
+    ]
 
 
 def test_who_stands_among_several_cameras_need_not_turn() -> None:

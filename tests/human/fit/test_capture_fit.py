@@ -1,4 +1,5 @@
-"""The fit of whole captures: a person of another shape than the given poses are for is found from silhouettes."""
+"""The fit of whole captures: a person of another shape than the given poses are for is found from
+silhouettes."""
 
 from __future__ import annotations
 
@@ -42,7 +43,9 @@ from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body_reader import default_template, read_body, rest_shape
 
-OPTIONS = HumanOptions(size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5)
+OPTIONS = HumanOptions(
+    size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5
+)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +54,10 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Capture]:
     root = write_human_capture(tmp_path_factory.mktemp("fit") / "person", OPTIONS)
     exact = read_capture(DataConfig(root=root))
     arrays = dict(np.load(root / "body_train.npz"))
-    np.savez(root / "body_train.npz", **(arrays | {"betas": np.zeros(10), "surface_model_type": np.array("smplx")}))
+    np.savez(
+        root / "body_train.npz",
+        **(arrays | {"betas": np.zeros(10), "surface_model_type": np.array("smplx")}),
+    )
     return exact, read_capture(DataConfig(root=root))
 
 
@@ -59,7 +65,9 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Capture]:
 def found(capture_root: Path) -> CaptureFit:
     capture = read_capture(DataConfig(root=capture_root))
     effort = FitEffort(side=64, steps=30, visits=18)
-    return fit_capture(capture, DataConfig(root=capture_root), default_template(), lambda *_: None, effort=effort)
+    return fit_capture(
+        capture, DataConfig(root=capture_root), default_template(), lambda *_: None, effort=effort
+    )
 
 
 def joints_of(capture: Capture, fit: CaptureFit | None) -> torch.Tensor:
@@ -70,7 +78,8 @@ def joints_of(capture: Capture, fit: CaptureFit | None) -> torch.Tensor:
     clip = captured_motion(capture.root, capture.body["train"], capture.splits["train"], rest).clip
     if fit is not None:
         assert body.joint_shape_dirs is not None
-        clip, rest = fit.fit.fitted(clip), body.joints + body.joint_shape_dirs @ fit.fit.betas
+        clip = fit.fit.fitted(clip)
+        rest = body.joints + body.joint_shape_dirs @ fit.fit.betas
     moves = joint_transforms(rest, body.parents, axis_angle_to_matrix(clip.poses))
     posed = (moves[..., :3] @ rest[..., None])[..., 0] + moves[..., 3]
     return (clip.scale[:, None, None] * posed + clip.trans[:, None])[:, :22]
@@ -79,7 +88,9 @@ def joints_of(capture: Capture, fit: CaptureFit | None) -> torch.Tensor:
 def test_the_joints_come_nearer_to_the_truth(wrong: tuple[Capture, Capture]) -> None:
     exact, given = wrong
     truth = joints_of(exact, None)
-    before, after = ((joints_of(given, fit) - truth).norm(dim=-1).mean() for fit in (None, found(given.root)))
+    before, after = (
+        (joints_of(given, fit) - truth).norm(dim=-1).mean() for fit in (None, found(given.root))
+    )
     assert before > 0.03
     assert after < 0.5 * before
 
@@ -90,18 +101,27 @@ def test_a_body_file_finds_its_own_shape(
     """A person of a file of 55 joints, wide as no mean; a file of 24 joints has the same shapes."""
     betas = torch.zeros(10)
     betas[:2] = torch.tensor([2.0, -1.5])
-    options = HumanOptions(size=96, num_frames=3, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1)
-    root = write_capture_of(*write_smpl_like(tmp_path, "smplx"), tmp_path / "person", options, betas, monkeypatch)
-    capture, body = read_capture(DataConfig(root=root)), with_shape(read_body(*smpl_files), None)
+    options = HumanOptions(
+        size=96, num_frames=3, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1
+    )
+    root = write_capture_of(
+        *write_smpl_like(tmp_path, "smplx"), tmp_path / "person", options, betas, monkeypatch
+    )
+    capture = read_capture(DataConfig(root=root))
+    body = with_shape(read_body(*smpl_files), None)
     assert capture.body is not None
     wrong = {split: replace(given, betas=np.zeros(10)) for split, given in capture.body.items()}
     effort = FitEffort(side=64, steps=30, visits=6)
-    fit = fit_capture(capture.replace(body=wrong), DataConfig(root=root), body, lambda *_: None, effort=effort)
+    fit = fit_capture(
+        capture.replace(body=wrong), DataConfig(root=root), body, lambda *_: None, effort=effort
+    )
     assert fit.chosen.iou > fit.tried[0].iou + GAIN
     assert body.shape_dirs is not None
     truth, found = (body.vertices + body.shape_dirs @ x for x in (betas, fit.fit.betas))
     size = fit.fit.shared.log_scale
-    away, before = ((x - x.mean(0)) - (truth - truth.mean(0)) for x in (math.exp(size) * found, body.vertices))
+    away, before = (
+        (x - x.mean(0)) - (truth - truth.mean(0)) for x in (math.exp(size) * found, body.vertices)
+    )
     assert away.norm(dim=1).mean() < 0.5 * before.norm(dim=1).mean()
 
 
@@ -113,26 +133,36 @@ def test_the_fit_is_judged_on_views_that_it_did_not_see(wrong: tuple[Capture, Ca
 
 
 def test_the_same_capture_gives_the_same_fit(wrong: tuple[Capture, Capture]) -> None:
-    options, effort = DataConfig(root=wrong[1].root), FitEffort(side=32, steps=2, visits=0)
+    options = DataConfig(root=wrong[1].root)
+    effort = FitEffort(side=32, steps=2, visits=0)
     body = default_template()
     first, again = (
-        fit_capture(wrong[1], options, body, lambda *_: None, effort=effort).chosen.learned for _ in range(2)
+        fit_capture(wrong[1], options, body, lambda *_: None, effort=effort).chosen.learned
+        for _ in range(2)
     )
     assert torch.equal(first["betas"], again["betas"])
     assert torch.equal(first["trans"], again["trans"])
 
 
-def test_small_images_are_looked_at_by_a_few_cameras_in_turn(wrong: tuple[Capture, Capture]) -> None:
-    capture, body = wrong[1], default_template()
+def test_small_images_are_looked_at_by_a_few_cameras_in_turn(
+    wrong: tuple[Capture, Capture],
+) -> None:
+    capture = wrong[1]
+    body = default_template()
     assert capture.body is not None
-    motion = captured_motion(capture.root, capture.body["train"], capture.splits["train"], body.joints)
+    motion = captured_motion(
+        capture.root, capture.body["train"], capture.splits["train"], body.joints
+    )
     seen = look_at(capture, motion, DataConfig(root=capture.root), FitEffort(side=32), {})
-    look, whole = InTurn(seen.halves), seen.halves[2]
+    look = InTurn(seen.halves)
+    whole = seen.halves[2]
     assert whole is not None
     shown = [part for _ in range(len(whole)) if (part := look(2)) is not None]
     assert [len(part) for part in shown] == [VIEWS] * len(whole)
     alphas = torch.cat([part.alpha for part in shown])
-    assert all(int((alphas == own).all(2).all(1).sum()) == VIEWS for own in whole.alpha), "each as often"
+    assert all(int((alphas == own).all(2).all(1).sum()) == VIEWS for own in whole.alpha), (
+        "each as often"
+    )
     assert InTurn({0: None})(0) is None
 
 
@@ -141,7 +171,8 @@ def test_more_gets_all_its_steps_only_where_a_trial_gains(
     wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch, gain: float, steps: int
 ) -> None:
     monkeypatch.setattr(capture_fit, "GAIN", gain)
-    told, effort = [], FitEffort(side=32, steps=TRIAL, visits=0)
+    told = []
+    effort = FitEffort(side=32, steps=TRIAL, visits=0)
 
     def report(name: str, done: int, total: int) -> None:
         told.append(name)
@@ -151,7 +182,9 @@ def test_more_gets_all_its_steps_only_where_a_trial_gains(
     assert told.count("shape") == 3 * TRIAL
 
 
-@pytest.mark.parametrize(("ious", "wanted"), [((0.8, 0.9, 0.905), 1), ((0.8, 0.9, 0.92), 2), ((0.8, 0.82, 0.81), 0)])
+@pytest.mark.parametrize(
+    ("ious", "wanted"), [((0.8, 0.9, 0.905), 1), ((0.8, 0.9, 0.92), 2), ((0.8, 0.82, 0.81), 0)]
+)
 def test_more_is_learned_only_where_it_pays(
     wrong: tuple[Capture, Capture], ious: tuple[float, ...], wanted: int
 ) -> None:
@@ -160,7 +193,9 @@ def test_more_is_learned_only_where_it_pays(
     assert simplest_of_the_best(tried) is tried[wanted]
 
 
-def test_poses_of_a_person_whose_shape_is_known_are_changed_for_less(wrong: tuple[Capture, Capture]) -> None:
+def test_poses_of_a_person_whose_shape_is_known_are_changed_for_less(
+    wrong: tuple[Capture, Capture],
+) -> None:
     tried = [replace(found(wrong[1].root).tried[0], iou=iou) for iou in (0.9, 0.912)]
     assert simplest_of_the_best(tried) is tried[0]
     assert simplest_of_the_best(tried, GAIN) is tried[1]
@@ -172,7 +207,9 @@ def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> N
     assert capture.body is not None
     motion = captured_motion(capture.root, capture.body["train"], views, default_template().joints)
     used, left_out = split_views(views, motion)
-    assert sorted(i for rows in (*used.values(), *left_out.values()) for i in rows) == list(range(len(views)))
+    assert sorted(i for rows in (*used.values(), *left_out.values()) for i in rows) == list(
+        range(len(views))
+    )
     assert [len(rows) for rows in left_out.values()] == [1, 1, 1, 1]
     assert len({views[rows[0]].name.split("_")[-1] for rows in left_out.values()}) == 4
     few, none = split_views(views[:4], motion)
@@ -185,8 +222,11 @@ def test_without_given_poses_every_frame_has_its_own(
 ) -> None:
     monkeypatch.setattr(start, "STEPS", 1)
     monkeypatch.setattr(start, "ARMS", ())
-    capture, effort = wrong[1].replace(body=None), FitEffort(side=32, steps=1, visits=0)
-    fit = fit_capture(capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort)
+    capture = wrong[1].replace(body=None)
+    effort = FitEffort(side=32, steps=1, visits=0)
+    fit = fit_capture(
+        capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort
+    )
     assert fit.tried[0].name == "poses found frame by frame"
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.fit.fitted(fit.motion.clip).poses
@@ -196,14 +236,19 @@ def test_without_given_poses_every_frame_has_its_own(
     assert torch.equal(clips["train"].clip.poses, poses)
 
 
-def test_masks_of_the_background_are_refused(wrong: tuple[Capture, Capture], tmp_path: Path) -> None:
-    given, views = wrong[0], []
+def test_masks_of_the_background_are_refused(
+    wrong: tuple[Capture, Capture], tmp_path: Path
+) -> None:
+    given = wrong[0]
+    views = []
     for view in given.splits["train"]:
         image = read_image(view.image_path).numpy()
         photo, mask = (tmp_path / name / f"{view.name}.png" for name in ("photos", "masks"))
         write_image(photo, image[..., :3])
         write_image(mask, 255 - image[..., 3:])
-        views.append(replace(view, image_path=photo, silhouette=silhouettes_of(mask.parent, [mask.name])[0]))
+        views.append(
+            replace(view, image_path=photo, silhouette=silhouettes_of(mask.parent, [mask.name])[0])
+        )
     capture = given.replace(splits={**given.splits, "train": tuple(views)})
     with pytest.raises(DyngsError, match="are the masks inverted"):
         fit_capture(capture, DataConfig(root=capture.root), default_template(), print)
@@ -211,24 +256,35 @@ def test_masks_of_the_background_are_refused(wrong: tuple[Capture, Capture], tmp
 
 def test_images_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) -> None:
     with pytest.raises(DyngsError, match="no silhouettes"):
-        fit_capture(wrong[1].replace(has_alpha=False), DataConfig(root=wrong[1].root), default_template(), print)
+        fit_capture(
+            wrong[1].replace(has_alpha=False),
+            DataConfig(root=wrong[1].root),
+            default_template(),
+            print,
+        )
 
 
-TWO_CLIPS = HumanOptions(size=96, num_frames=2, num_new=2, num_cameras=4, num_test=4, seed=0, samples=1)
+TWO_CLIPS = HumanOptions(
+    size=96, num_frames=2, num_new=2, num_cameras=4, num_test=4, seed=0, samples=1
+)
 EFFORT = FitEffort(side=64, steps=40)
 AWAY = np.array([0.03, -0.02, 0.02])
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return read_capture(DataConfig(root=write_human_capture(tmp_path_factory.mktemp("clip") / "ann", TWO_CLIPS)))
+    return read_capture(
+        DataConfig(root=write_human_capture(tmp_path_factory.mktemp("clip") / "ann", TWO_CLIPS))
+    )
 
 
 def as_given(capture: Capture) -> CaptureFit:
     """A fit that took the poses as they are."""
     body = default_template()
     assert capture.body is not None
-    motion = captured_motion(capture.root, capture.body["train"], capture.splits["train"], body.joints)
+    motion = captured_motion(
+        capture.root, capture.body["train"], capture.splits["train"], body.joints
+    )
     learned = new_fit(motion.clip, surface_of(body, RESOLUTION))
     candidate = TriedFit("the poses as given", learned, 0.9, (0.9, 0.9))
     return CaptureFit(body_fit(learned, 55), motion, candidate, (candidate,), 0)
@@ -238,22 +294,34 @@ def moved(capture: Capture, away: np.ndarray) -> Capture:
     """The capture with the poses of its new clip away from where they are."""
     assert capture.body is not None
     given = capture.body["pose"]
-    return capture.replace(body={**capture.body, "pose": replace(given, trans=given.trans + away.astype(np.float32))})
+    return capture.replace(
+        body={**capture.body, "pose": replace(given, trans=given.trans + away.astype(np.float32))}
+    )
 
 
 def test_a_clip_that_stands_elsewhere_is_moved_to_its_silhouettes(capture: Capture) -> None:
-    wrong, fit, body = moved(capture, AWAY), as_given(capture), default_template()
+    wrong = moved(capture, AWAY)
+    fit = as_given(capture)
+    body = default_template()
     found = placed_clip(wrong, DataConfig(root=capture.root), body, fit, lambda *_: None, EFFORT)
     assert found is not None
     assert found.iou_moved is not None
     assert found.iou_moved > found.iou + 0.02
-    assert np.abs(found.shift.numpy() + AWAY).max() < 0.008, "mm that the drawn discs and the mesh differ by"
+    assert np.abs(found.shift.numpy() + AWAY).max() < 0.008, (
+        "mm that the drawn discs and the mesh differ by"
+    )
     assert "moved" in found.summary()
-    clip, given = fitted_clips(wrong, body, fit, found)["pose"].clip, found.motion.clip
-    torch.testing.assert_close(clip.trans - given.trans, found.shift.expand_as(given.trans), atol=1e-6, rtol=0)
+    clip = fitted_clips(wrong, body, fit, found)["pose"].clip
+    given = found.motion.clip
+    torch.testing.assert_close(
+        clip.trans - given.trans, found.shift.expand_as(given.trans), atol=1e-6, rtol=0
+    )
     assert torch.equal(clip.poses, given.poses)
 
 
 def test_without_another_clip_nothing_is_placed(capture: Capture, tmp_path: Path) -> None:
     alone = capture.replace(splits={**capture.splits, "pose": ()})
-    assert placed_clip(alone, DataConfig(root=tmp_path), default_template(), as_given(capture), print) is None
+    assert (
+        placed_clip(alone, DataConfig(root=tmp_path), default_template(), as_given(capture), print)
+        is None
+    )

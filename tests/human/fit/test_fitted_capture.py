@@ -39,7 +39,9 @@ from dyngs.human.template.body_reader import load_template, rest_shape
 @pytest.fixture(scope="module")
 def person_of_zeros(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small capture whose poses are said to be for the mean shape of another template."""
-    options = HumanOptions(size=32, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1, body_seed=3)
+    options = HumanOptions(
+        size=32, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1, body_seed=3
+    )
     root = write_human_capture(tmp_path_factory.mktemp("fit") / "person", options)
     for name in ("train", "pose"):
         arrays = dict(np.load(root / f"body_{name}.npz"))
@@ -73,7 +75,10 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
 
 
 def test_other_cameras_are_another_fit(data: DataConfig) -> None:
-    fits = {with_fitted_body(data.model_copy(update={"train_cameras": x})).body for x in (None, (0,), (0, 1))}
+    fits = {
+        with_fitted_body(data.model_copy(update={"train_cameras": x})).body
+        for x in (None, (0,), (0, 1))
+    }
     assert len(fits) == 3
 
 
@@ -95,19 +100,25 @@ def smpl(smpl_files: tuple[Path, Path]) -> HumanModel:
     return HumanModel(body=smpl_files[0], uv=smpl_files[1])
 
 
-def test_a_template_that_is_named_is_fitted_instead_of_the_free_one(data: DataConfig, smpl: HumanModel) -> None:
+def test_a_template_that_is_named_is_fitted_instead_of_the_free_one(
+    data: DataConfig, smpl: HumanModel
+) -> None:
     said: list[str] = []
     fitted = with_fitted_body(data, smpl, say=said.append)
     assert "smpl (smpl.npz) is fitted to the silhouettes first" in said[0]
     assert fitted.body is not None
-    assert json.loads((fitted.body / "fit_report.json").read_text())["template"] == "smpl (smpl.npz)"
+    assert (
+        json.loads((fitted.body / "fit_report.json").read_text())["template"] == "smpl (smpl.npz)"
+    )
     body = read_capture(fitted).body
     assert body is not None
     assert {frames.poses.shape for frames in body.values()} == {(2, 24, 3)}
     assert {frames.fitted_to for frames in body.values()} == {load_template(smpl).fingerprint}
     assert with_fitted_body(data, smpl, say=said.append) == fitted
     assert "the fit of before" in said[-1]
-    assert with_fitted_body(data, say=said.append).body != fitted.body, "the free template has a fit of its own"
+    assert with_fitted_body(data, say=said.append).body != fitted.body, (
+        "the free template has a fit of its own"
+    )
 
 
 def test_a_capture_without_body_parameters_gets_a_fit_of_the_named_template(
@@ -123,53 +134,75 @@ def test_a_capture_without_body_parameters_gets_a_fit_of_the_named_template(
     assert np.abs(body["train"].betas).max() > 0
 
 
-def test_a_fit_is_fitted_again_only_for_another_template(data: DataConfig, smpl: HumanModel, tmp_path: Path) -> None:
-    out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl)).root
-    given, said = DataConfig(root=out), list[str]()
+def test_a_fit_is_fitted_again_only_for_another_template(
+    data: DataConfig, smpl: HumanModel, tmp_path: Path
+) -> None:
+    out = write_fitted_capture(
+        data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl)
+    ).root
+    given = DataConfig(root=out)
+    said = list[str]()
     assert with_fitted_body(given, smpl, say=pytest.fail) == given
     assert with_fitted_body(given, say=said.append) != given
     assert "fitted to the silhouettes first" in said[0]
-    named, said = data.model_copy(update={"body": out}), []
+    named = data.model_copy(update={"body": out})
+    said = []
     assert with_fitted_body(named, smpl, say=pytest.fail) == named
     assert with_fitted_body(named, say=said.append) == named
     assert "is a fit of another template: its poses are taken, not its shape" in said[0]
 
 
-def test_the_fit_begins_with_a_given_shape_of_the_template(data: DataConfig, smpl: HumanModel, tmp_path: Path) -> None:
+def test_the_fit_begins_with_a_given_shape_of_the_template(
+    data: DataConfig, smpl: HumanModel, tmp_path: Path
+) -> None:
     betas = np.zeros(300)
     betas[:10] = np.linspace(-1, 1, 10)
     for name in ("train", "pose"):
         path = data.root / f"body_{name}.npz"
         np.savez(path, **(dict(np.load(path)) | {"betas": betas}))  # pyright: ignore[reportArgumentType]
-    found = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl))
+    found = write_fitted_capture(
+        data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl)
+    )
     with np.load(tmp_path / "fitted" / "body_train.npz") as file:
         assert np.allclose(file["betas"], betas[:10] + found.found.fit.betas.numpy(), atol=1e-6)
-    body, given = load_template(smpl), read_capture(data).body
+    body = load_template(smpl)
+    given = read_capture(data).body
     assert given is not None
     _, joints = rest_shape(body, given["train"])
-    clip = captured_motion(data.root, given["train"], read_capture(data).splits["train"], joints).clip
+    clip = captured_motion(
+        data.root, given["train"], read_capture(data).splits["train"], joints
+    ).clip
     assert torch.equal(found.found.motion.clip.trans, clip.trans), "of the shaped body"
 
 
-def test_a_template_without_texture_coordinates_is_refused(data: DataConfig, smpl: HumanModel, tmp_path: Path) -> None:
+def test_a_template_without_texture_coordinates_is_refused(
+    data: DataConfig, smpl: HumanModel, tmp_path: Path
+) -> None:
     with pytest.raises(DyngsError, match=r"smpl\.npz: has no texture coordinates.*--uv FILE"):
-        write_fitted_capture(data, tmp_path / "out", lambda *_: None, FitInputs(template=HumanModel(body=smpl.body)))
+        write_fitted_capture(
+            data, tmp_path / "out", lambda *_: None, FitInputs(template=HumanModel(body=smpl.body))
+        )
     assert not list(tmp_path.glob("*out*"))
 
 
 def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path) -> None:
     out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None).root
-    before, after = read_capture(data), read_capture(DataConfig(root=out))
+    before = read_capture(data)
+    after = read_capture(DataConfig(root=out))
     for split in ("train", "test", "pose"):
         assert len(after.splits[split]) == len(before.splits[split])
         ordered = sorted(before.splits[split], key=lambda view: view.frame or 0)
-        for old, new in zip(ordered, sorted(after.splits[split], key=lambda view: view.frame or 0), strict=True):
+        for old, new in zip(
+            ordered, sorted(after.splits[split], key=lambda view: view.frame or 0), strict=True
+        ):
             assert (old.time, old.width) == (new.time, new.width)
             assert np.allclose(old.intrinsics, new.intrinsics)
     assert not list(tmp_path.glob(".fitted*")), "nothing is left beside it"
 
 
-def test_without_silhouettes_poses_are_taken_as_given(data: DataConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_silhouettes_poses_are_taken_as_given(
+    data: DataConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     capture = read_capture(data).replace(has_alpha=False)
     monkeypatch.setattr(fitted_capture, "read_capture", lambda _: capture)
     said: list[str] = []
@@ -182,7 +215,13 @@ def test_without_silhouettes_poses_are_taken_as_given(data: DataConfig, monkeypa
 
 def clip(folder: Path, empty: int = 2, count: int = 12) -> Path:
     """A block that crosses the image; nobody in the first frames."""
-    ground = np.random.default_rng(0).uniform(80, 180, (5, 9, 3)).repeat(10, 0).repeat(10, 1).astype(np.uint8)
+    ground = (
+        np.random.default_rng(0)
+        .uniform(80, 180, (5, 9, 3))
+        .repeat(10, 0)
+        .repeat(10, 1)
+        .astype(np.uint8)
+    )
     for i in range(count):
         image = ground.copy()
         if i >= empty:
@@ -193,17 +232,24 @@ def clip(folder: Path, empty: int = 2, count: int = 12) -> Path:
 
 def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
     said: list[str] = []
-    capture = read_person(DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", said.append)
+    capture = read_person(
+        DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", said.append
+    )
     assert has_guessed_lens(capture)
     assert capture.has_alpha
     assert [view.name for view in capture.splits["train"]] == [f"f{i:02d}" for i in range(2, 12)]
-    assert any("2 frames in which hardly anybody is seen are left out, first f00" in line for line in said)
+    assert any(
+        "2 frames in which hardly anybody is seen are left out, first f00" in line for line in said
+    )
 
 
 def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
-    capture = read_person(DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", lambda _: None)
+    capture = read_person(
+        DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", lambda _: None
+    )
     views = capture.splits["train"]
-    images, photos = ImageLoader(views), ImageLoader([replace(view, silhouette=None) for view in views])
+    images = ImageLoader(views)
+    photos = ImageLoader([replace(view, silhouette=None) for view in views])
     shown = ((view, images[i], photos[i]) for i, view in enumerate(views))
     rows = {view.frame: row for row, view in enumerate(views) if view.frame is not None}
     write_split(tmp_path / "out", "train", shown, rows, capture)
@@ -211,7 +257,8 @@ def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
     assert len(found) == len(views)
     for i, view in enumerate(found.values()):
         assert np.array_equal(read_image(view.image_path), read_image(views[i].image_path))
-        alpha, before = ImageLoader([view])[0].alpha, images[i].alpha
+        alpha = ImageLoader([view])[0].alpha
+        before = images[i].alpha
         assert alpha is not None
         assert before is not None
         assert torch.equal(alpha, before)
@@ -219,7 +266,9 @@ def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
 
 
 def test_a_refined_lens_moves_the_cameras(tmp_path: Path) -> None:
-    capture = read_person(DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", lambda _: None)
+    capture = read_person(
+        DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", lambda _: None
+    )
     lens = LensFit(1.5, 3.0, (0.2, 0.1), True)
     before, after = (c.splits["train"][0] for c in (capture, with_lens(capture, lens)))
     assert after.intrinsics[0, 0] == 1.5 * before.intrinsics[0, 0]
@@ -229,17 +278,23 @@ def test_a_refined_lens_moves_the_cameras(tmp_path: Path) -> None:
 
 
 def test_masks_of_a_folder_replace_those_of_a_capture(tmp_path: Path) -> None:
-    options = HumanOptions(size=32, num_frames=2, num_new=0, num_cameras=2, num_test=0, seed=1, samples=1)
+    options = HumanOptions(
+        size=32, num_frames=2, num_new=0, num_cameras=2, num_test=0, seed=1, samples=1
+    )
     root = write_human_capture(tmp_path / "person", options)
     given = read_capture(DataConfig(root=root, test_every=0))
     for view in given.splits["train"]:
         write_image(tmp_path / "m" / f"{view.name}.png", np.full((32, 32, 1), 255, np.uint8))
-    capture = read_person(DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w")
+    capture = read_person(
+        DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w"
+    )
     assert not has_guessed_lens(capture)
     assert all(view.silhouette is not None for view in capture.splits["train"])
     (tmp_path / "m" / f"{given.splits['train'][0].name}.png").unlink()
     with pytest.raises(DyngsError, match="no mask for 1 of 4 images"):
-        read_person(DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w")
+        read_person(
+            DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w"
+        )
 
 
 def test_no_capture_and_no_clip_is_refused(tmp_path: Path) -> None:
@@ -250,7 +305,8 @@ def test_no_capture_and_no_clip_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_fit_far_from_the_origin_is_written_exactly(data: DataConfig, tmp_path: Path) -> None:
-    capture, body = read_capture(data), load_template(HumanModel())
+    capture = read_capture(data)
+    body = load_template(HumanModel())
     assert capture.body is not None
     clip = captured_motion(data.root, capture.body["train"], capture.splits["train"], body.joints)
     offset = np.array([500_000.0, 4_600_000.0, 120.0])

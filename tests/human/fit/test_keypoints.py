@@ -49,8 +49,12 @@ def test_openpose(tmp_path: Path, count: int, knee: int, wrist: int) -> None:
 
 
 def test_the_most_confident_person_is_taken(tmp_path: Path) -> None:
-    openpose(tmp_path / "k", "a", points(25, 0.2), points(25, 0.9) + np.array([5, 0, 0]), points(25, 0.1))
-    assert read_keypoints(tmp_path / "k", [view("a")])["a"][JOINTS["left_hip"]].tolist() == pytest.approx([17, 24, 0.9])
+    openpose(
+        tmp_path / "k", "a", points(25, 0.2), points(25, 0.9) + np.array([5, 0, 0]), points(25, 0.1)
+    )
+    assert read_keypoints(tmp_path / "k", [view("a")])["a"][
+        JOINTS["left_hip"]
+    ].tolist() == pytest.approx([17, 24, 0.9])
 
 
 @pytest.mark.parametrize("count", [17, 133])
@@ -60,7 +64,10 @@ def test_coco(tmp_path: Path, count: int) -> None:
     file = tmp_path / "coco.json"
     fields = {
         "images": [{"id": 7, "file_name": "images/b.png"}, {"id": 8, "file_name": "elsewhere.png"}],
-        "annotations": [{"image_id": 7, "keypoints": marked.ravel().tolist()}, {"image_id": 8, "keypoints": []}],
+        "annotations": [
+            {"image_id": 7, "keypoints": marked.ravel().tolist()},
+            {"image_id": 8, "keypoints": []},
+        ],
     }
     file.write_text(json.dumps(fields))
     found = read_keypoints(file, [view("a"), view("b")])
@@ -92,7 +99,10 @@ def test_views_of_the_same_name_need_their_folders(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [
-        ('{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "holds 1 points of 3 numbers; known are 17, 18, 25, 133"),
+        (
+            '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}',
+            "holds 1 points of 3 numbers; known are 17, 18, 25, 133",
+        ),
         ('{"people": [{"pose_keypoints_2d": [1, 2, null]}]}', "must hold finite numbers"),
         ('{"people": 3}', "lacks the list 'people'"),
         ("[1]", "must be a JSON object"),
@@ -111,7 +121,8 @@ def test_no_key_points_at_all_are_refused(tmp_path: Path) -> None:
         read_keypoints(tmp_path / "k.json", [view("a")])
 
 
-KNEE, SPINE = JOINT_NAMES.index("left_knee"), JOINT_NAMES.index("spine2")
+KNEE = JOINT_NAMES.index("left_knee")
+SPINE = JOINT_NAMES.index("spine2")
 
 
 def capture(count: int = 3) -> Capture:
@@ -119,7 +130,9 @@ def capture(count: int = 3) -> Capture:
     pose[2, 3] = 4.0
     intrinsics = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
     view = View("", Path(), pose, intrinsics, 100, 80)
-    views = [replace(view, name=f"p{i}", image_path=Path(f"/x/p{i}.png"), frame=i) for i in range(count)]
+    views = [
+        replace(view, name=f"p{i}", image_path=Path(f"/x/p{i}.png"), frame=i) for i in range(count)
+    ]
     return Capture(Path("/x"), "c", {"train": tuple(views)}, world_offset=np.array([0.5, 0.0, 0.0]))
 
 
@@ -134,19 +147,23 @@ def test_all_orders_have_the_knee(tmp_path: Path, order: str) -> None:
     np.savez(tmp_path / "a.npz", joints=joints(order), order=order)
     found = read_joints(tmp_path / "a.npz", capture(), default_template())
     row = ORDERS[order].index("left_knee")
-    assert found[2][KNEE].tolist() == [1.5, row, 2.0 + row, 1.0]  # less the offset of the recentred world
+    # less the offset of the recentred world
+    assert found[2][KNEE].tolist() == [1.5, row, 2.0 + row, 1.0]
 
 
 def test_joints_far_from_the_origin(tmp_path: Path) -> None:
     offset = np.array([500_000.0, 4_600_000.0, 120.0])
     np.savez(tmp_path / "a.npz", joints=joints("smpl") + offset)
-    found = read_joints(tmp_path / "a.npz", capture().replace(world_offset=offset), default_template())
+    found = read_joints(
+        tmp_path / "a.npz", capture().replace(world_offset=offset), default_template()
+    )
     row = ORDERS["smpl"].index("left_knee")
     assert found[2][KNEE].tolist() == [2.0, row, 2.0 + row, 1.0]
 
 
 def test_posed_vertices_far_from_the_origin(tmp_path: Path) -> None:
-    body, offset = default_template(), np.array([500_000.0, 4_600_000.0, 120.0])
+    body = default_template()
+    offset = np.array([500_000.0, 4_600_000.0, 120.0])
     vertices = posed(body)[0].double().numpy()
     np.savez(tmp_path / "near.npz", vertices=vertices)
     np.savez(tmp_path / "far.npz", vertices=vertices + offset)
@@ -174,7 +191,12 @@ def test_json_names_images_or_frames(tmp_path: Path) -> None:
 def test_sam_3d_body_is_in_the_axes_of_the_camera(tmp_path: Path) -> None:
     points = np.zeros((70, 3))
     points[11] = [0.1, 0.2, 0.3]
-    np.savez(tmp_path / "p1.npz", pred_keypoints_3d=points, pred_cam_t=np.array([0.0, 0.0, 5.0]), focal_length=500.0)
+    np.savez(
+        tmp_path / "p1.npz",
+        pred_keypoints_3d=points,
+        pred_cam_t=np.array([0.0, 0.0, 5.0]),
+        focal_length=500.0,
+    )
     found = read_joints(tmp_path, capture(), default_template())
     assert list(found) == [1]
     assert found[1][KNEE].tolist() == pytest.approx([0.1, -0.2, -1.3, 1.0])
@@ -183,7 +205,9 @@ def test_sam_3d_body_is_in_the_axes_of_the_camera(tmp_path: Path) -> None:
 def posed(body: BodyTemplate) -> tuple[torch.Tensor, torch.Tensor]:
     """Vertices (1, N, 3) and joints (22, 3) in a pose."""
     poses = torch.zeros(1, len(body.joints), 3)
-    poses[0, KNEE, 0], poses[0, 0, 1], poses[0, 16, 2] = 0.8, 0.5, -0.6
+    poses[0, KNEE, 0] = 0.8
+    poses[0, 0, 1] = 0.5
+    poses[0, 16, 2] = -0.6
     trans = torch.tensor([[0.3, 0.0, 1.0]])
     moves = joint_transforms(body.joints, body.parents, axis_angle_to_matrix(poses))[0]
     positions = (moves[..., :3] @ body.joints[..., None])[..., 0] + moves[..., 3] + trans
@@ -205,7 +229,9 @@ def test_frame_data_of_semantic_human_texture_stitching(tmp_path: Path) -> None:
     body = default_template()
     vertices, true = posed(body)
     with (tmp_path / "frame_data.pkl").open("wb") as file:
-        pickle.dump({"vertices": vertices.numpy(), "camera_f": np.array([100.0, 100.0])}, file, protocol=2)
+        pickle.dump(
+            {"vertices": vertices.numpy(), "camera_f": np.array([100.0, 100.0])}, file, protocol=2
+        )
     found = read_joints(tmp_path / "frame_data.pkl", capture(1), body)
     local = true * torch.tensor([1.0, -1.0, -1.0]) - torch.tensor([0.0, 0.0, 4.0])
     wanted = local * torch.tensor([1.0, -1.0, -1.0])

@@ -1,4 +1,5 @@
-"""The shape of a known person: where it is found, what it does to the template, and what is refused."""
+"""The shape of a known person: where it is found, what it does to the template, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -36,7 +37,12 @@ from dyngs.training.trainer import Trainer
 def fitted(folder: Path, kind: str = "anny") -> Path:
     folder.mkdir()
     betas = np.linspace(-1, 1, default_template().num_shapes)
-    parts = {"poses": np.zeros((2, 165)), "trans": np.zeros((2, 3)), "betas": betas, "surface_model_type": kind}
+    parts = {
+        "poses": np.zeros((2, 165)),
+        "trans": np.zeros((2, 3)),
+        "betas": betas,
+        "surface_model_type": kind,
+    }
     np.savez(folder / "body_train.npz", **parts)  # pyright: ignore[reportArgumentType]
     return folder
 
@@ -44,7 +50,8 @@ def fitted(folder: Path, kind: str = "anny") -> Path:
 def test_the_template_gets_the_shape(tmp_path: Path) -> None:
     body = default_template()
     known = known_shape(fitted(tmp_path / "a"), body)
-    shaped, betas = with_shape(body, known), shape_of(body, known)
+    shaped = with_shape(body, known)
+    betas = shape_of(body, known)
     assert body.joint_shape_dirs is not None
     assert torch.allclose(shaped.joints, body.joints + body.joint_shape_dirs @ betas, atol=1e-5)
     assert betas[-1] == 1
@@ -52,7 +59,8 @@ def test_the_template_gets_the_shape(tmp_path: Path) -> None:
 
 
 def test_a_run_names_the_capture_it_was_trained_on(tmp_path: Path) -> None:
-    folder, run = fitted(tmp_path / "a"), tmp_path / "run"
+    folder = fitted(tmp_path / "a")
+    run = tmp_path / "run"
     run.mkdir()
     write_text(run / "config.yaml", f"data:\n  root: {folder}\nmodel:\n  kind: human\n")
     assert known_shape(run, default_template()).betas[-1] == 1
@@ -78,18 +86,26 @@ def test_a_body_of_smpl_has_the_first_ten_shapes_and_no_expressions(tmp_path: Pa
 
 
 def test_a_person_of_a_file_is_known_to_that_file_alone(tmp_path: Path) -> None:
-    body, other = (read_body(write_npz(tmp_path / f"{i}.npz", model("smpl", seed=i))) for i in (0, 1))
+    body, other = (
+        read_body(write_npz(tmp_path / f"{i}.npz", model("smpl", seed=i))) for i in (0, 1)
+    )
     for folder, own in (("given", {}), ("fit", {"fitted_to": body.fingerprint})):
         path = fitted(tmp_path / folder, "smpl") / "body_train.npz"
         np.savez(path, **(dict(np.load(path)) | own))  # pyright: ignore[reportArgumentType]
         assert np.allclose(known_shape(path.parent, body).betas[:10], np.linspace(-1, 1, 44)[:10])
     assert known_shape(tmp_path / "given", other).fitted_to == "", "whose shape it is nobody says"
-    with pytest.raises(DyngsError, match="is of another template than smpl; name that of the person with --template"):
+    with pytest.raises(
+        DyngsError,
+        match="is of another template than smpl; name that of the person with --template",
+    ):
         known_shape(tmp_path / "fit", other)
 
 
 def test_a_run_names_its_template(tmp_path: Path) -> None:
-    write_text(tmp_path / "config.yaml", "data:\n  root: a\nmodel:\n  kind: human\n  body: s.npz\n  uv: s.obj\n")
+    write_text(
+        tmp_path / "config.yaml",
+        "data:\n  root: a\nmodel:\n  kind: human\n  body: s.npz\n  uv: s.obj\n",
+    )
     assert template_of_run(tmp_path) == HumanModel(body=Path("s.npz"), uv=Path("s.obj"))
     assert template_of_run(tmp_path / "none") == HumanModel()
     write_text(tmp_path / "config.yaml", "data:\n  root: a\n")
@@ -111,26 +127,36 @@ def avatar(person: Path) -> HumanScene:
 
 def new_trainer(person: Path) -> Trainer:
     model = HumanModel(resolution=24, sh_degree=0)
-    train, run = TrainConfig(steps=10), RunConfig(threads=1)
-    return assemble(Config(data=DataConfig(root=person), model=model, optim=OptimConfig(), train=train, run=run))
+    train = TrainConfig(steps=10)
+    run = RunConfig(threads=1)
+    return assemble(
+        Config(data=DataConfig(root=person), model=model, optim=OptimConfig(), train=train, run=run)
+    )
 
 
 @pytest.fixture(scope="module")
 def views(avatar: HumanScene, person: Path, tmp_path_factory: pytest.TempPathFactory) -> list[View]:
-    """The avatar in two of the three frames of its clip from three cameras; its colours are noise."""
-    folder, found = tmp_path_factory.mktemp("drawn"), []
+    """The avatar in two of the three frames of its clip from three cameras; its colours are
+    noise."""
+    folder = tmp_path_factory.mktemp("drawn")
+    found = []
     images = new_trainer(person).images
     cameras = {tuple(p.cameras.cam_from_world.flatten().tolist()): p.cameras for p in images}
     for frame, time in enumerate(avatar.times[:2]):
         for i, camera in enumerate(cameras.values()):
             larger = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None] * camera.intrinsics
             with torch.no_grad():
-                drawn = avatar.render(replace(camera, intrinsics=larger, width=SIZE, height=SIZE), time)
+                drawn = avatar.render(
+                    replace(camera, intrinsics=larger, width=SIZE, height=SIZE), time
+                )
             image = torch.cat([torch.rand(SIZE, SIZE, 3), drawn.alpha[0].clamp(0, 1)[..., None]], 2)
             path = folder / f"{frame}_{i}.png"
             write_image(path, (image.numpy() * 255).round().astype(np.uint8))
-            pose, intrinsics = camera.cam_from_world[0].double().numpy(), larger[0].double().numpy()
-            found.append(View(path.stem, path, pose, intrinsics, SIZE, SIZE, camera_id=i, frame=frame))
+            pose = camera.cam_from_world[0].double().numpy()
+            intrinsics = larger[0].double().numpy()
+            found.append(
+                View(path.stem, path, pose, intrinsics, SIZE, SIZE, camera_id=i, frame=frame)
+            )
     return found
 
 
@@ -141,7 +167,8 @@ def posed(avatar: HumanScene, views: list[View], clip: MotionClip) -> AvatarPose
 
 def turned(clip: MotionClip) -> MotionClip:
     """The clip with some joints turned by 9 degrees about some axis, 36 mm from where it was."""
-    rows, poses = [JOINT_NAMES.index(name) for name in TURNED], clip.poses.clone()
+    rows = [JOINT_NAMES.index(name) for name in TURNED]
+    poses = clip.poses.clone()
     away = torch.randn(len(clip), len(rows), 3, generator=torch.Generator().manual_seed(2))
     poses[:, rows] += 0.15 * away / away.norm(dim=2, keepdim=True)
     return replace(clip, poses=poses, trans=clip.trans + AWAY)
@@ -168,7 +195,9 @@ def test_disturbed_poses_are_found_again(
     assert torch.equal(after.times, start.times)
 
 
-def test_poses_that_fit_stay(avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_that_fit_stay(
+    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
     found = posed(avatar, views, avatar.clip)
     assert found.before > 0.98
@@ -178,13 +207,19 @@ def test_poses_that_fit_stay(avatar: HumanScene, views: list[View], monkeypatch:
     assert error(found.clip.clip, avatar.clip).max() < 2e-3
 
 
-def test_worse_poses_are_not_taken(avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Left-out views that show somebody else (a person who stands still) decide against what the others ask for."""
+def test_worse_poses_are_not_taken(
+    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Left-out views that show somebody else (a person who stands still) decide against what the
+    others ask for."""
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
     start = replace(avatar.clip, trans=avatar.clip.trans + AWAY)
     first = {view.frame: view for view in reversed(views)}
     others = [view for view in views if view not in first.values()]
-    moved = [replace(view, cam_from_world=_shifted(view.cam_from_world, -AWAY)) for view in first.values()]
+    moved = [
+        replace(view, cam_from_world=_shifted(view.cam_from_world, -AWAY))
+        for view in first.values()
+    ]
     found = posed(avatar, [*others, *moved], start)
     assert not found.taken
     assert found.clip.clip is start
@@ -202,8 +237,13 @@ def test_the_size_of_training_is_taken_where_it_fits(
     avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
-    clip, larger = avatar.clip, 1.1 * avatar.clip.scale
-    wrong = replace(clip, scale=larger, trans=clip.trans + (clip.scale - larger)[:, None] * avatar.skeleton.joints[0])
+    clip = avatar.clip
+    larger = 1.1 * avatar.clip.scale
+    wrong = replace(
+        clip,
+        scale=larger,
+        trans=clip.trans + (clip.scale - larger)[:, None] * avatar.skeleton.joints[0],
+    )
     found = posed(avatar, views, wrong)
     assert found.taken
     torch.testing.assert_close(found.clip.clip.scale[:2], clip.scale[:2])

@@ -13,7 +13,13 @@ from dyngs.data.loader import Image
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.fit.silhouettes import _OPTIONS as OPTIONS
-from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, longest_box_side, observed_frame, surface_of
+from dyngs.human.fit.silhouettes import (
+    Surface,
+    drawn_silhouettes,
+    longest_box_side,
+    observed_frame,
+    surface_of,
+)
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import posed_vertices
@@ -23,7 +29,9 @@ from dyngs.human.template.body_reader import default_template, read_body
 def image(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Image:
     alpha = torch.zeros(height, width)
     alpha[rows, columns] = 1.0
-    camera = Cameras(torch.eye(4)[None], torch.tensor([[[50.0, 0, 30], [0, 50, 20], [0, 0, 1]]]), width, height)
+    camera = Cameras(
+        torch.eye(4)[None], torch.tensor([[[50.0, 0, 30], [0, 50, 20], [0, 0, 1]]]), width, height
+    )
     return Image("p", camera, alpha[..., None].expand(-1, -1, 3), alpha, None, None, 0)
 
 
@@ -37,7 +45,8 @@ def test_a_point_of_the_world_falls_on_the_same_part_of_the_person() -> None:
     directions = torch.linalg.solve(shown.cameras.intrinsics[0], corner.T)
     inside = (frame.cameras.intrinsics[0] @ directions).T[:, :2]
     covered = frame.alpha[0] > 0.5
-    rows, columns = covered.any(1).nonzero()[:, 0], covered.any(0).nonzero()[:, 0]
+    rows = covered.any(1).nonzero()[:, 0]
+    columns = covered.any(0).nonzero()[:, 0]
     assert inside[0].round().tolist() == [float(columns[0]), float(rows[0])]
     assert inside[1].round().tolist() == [float(columns[-1]) + 1, float(rows[-1]) + 1]
     assert float(frame.alpha.sum()) * (25 / 10) ** 2 == pytest.approx(160, rel=0.01)
@@ -77,7 +86,13 @@ def test_turns_show_each_view_as_often_and_views_that_are_far_apart() -> None:
     areas = frame.alpha.sum((1, 2)).tolist()
     rows = [[areas.index(x) for x in part.alpha.sum((1, 2)).tolist()] for part in parts]
     assert sorted(x for part in rows for x in part) == sorted(3 * list(range(7)))
-    assert all(min(abs(a - b) % 7, 7 - abs(a - b) % 7) >= 2 for part in rows for a in part for b in part if a != b)
+    assert all(
+        min(abs(a - b) % 7, 7 - abs(a - b) % 7) >= 2
+        for part in rows
+        for a in part
+        for b in part
+        if a != b
+    )
     for part, own in zip(parts, rows, strict=True):
         torch.testing.assert_close(part.cameras.intrinsics, frame.cameras.intrinsics[own])
         torch.testing.assert_close(part.known, frame.known[own])
@@ -87,27 +102,37 @@ def test_turns_show_each_view_as_often_and_views_that_are_far_apart() -> None:
 def test_the_coverage_is_that_of_a_render_and_needs_no_colours() -> None:
     surface = surface_of(default_template(), 16)
     pose = torch.eye(4)[None].clone()
-    pose[0, :3] = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 3]])  # 3 m in front of a standing person
+    # 3 m in front of a standing person
+    pose[0, :3] = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 3]])
     camera = Cameras(pose, torch.tensor([[[40.0, 0, 24], [0, 40, 24], [0, 0, 1]]]), 48, 48)
-    found, coloured = drawn_silhouettes(surface.discs, camera), render(surface.discs, camera, OPTIONS).alpha
+    found = drawn_silhouettes(surface.discs, camera)
+    coloured = render(surface.discs, camera, OPTIONS).alpha
     assert found.sum() > 50
     torch.testing.assert_close(found, coloured, rtol=0, atol=1e-6)
 
 
-def test_pose_blend_shapes_move_the_surface_as_they_move_the_mesh(smpl_files: tuple[Path, Path]) -> None:
+def test_pose_blend_shapes_move_the_surface_as_they_move_the_mesh(
+    smpl_files: tuple[Path, Path],
+) -> None:
     body = read_body(*smpl_files)
-    surface, texels = surface_of(body, 24), atlas_texels(body, 24, body.vertices)
+    surface = surface_of(body, 24)
+    texels = atlas_texels(body, 24, body.vertices)
     poses = 0.5 * torch.randn(24, 3, generator=torch.Generator().manual_seed(1))
     poses[0] = 0.0
     place = torch.tensor([0.1, 0.2, 0.3])
     pose = BodyPose(axis_angle_to_matrix(poses), place, torch.tensor(1.0))
-    shape, skin = torch.zeros(10), surface.discs.replace(means=texels.points)
+    shape = torch.zeros(10)
+    skin = surface.discs.replace(means=texels.points)
 
     def away(drawn: Surface) -> torch.Tensor:
         """Distances of points of the skin from where the mesh has them, m."""
-        posed = replace(drawn, discs=skin).in_shape(shape, torch.zeros(len(drawn))).in_pose(pose).means
+        posed = (
+            replace(drawn, discs=skin).in_shape(shape, torch.zeros(len(drawn))).in_pose(pose).means
+        )
         mesh = posed_vertices(body, poses[None], place[None])[0]
-        return (posed - (texels.barycentric[..., None] * mesh[body.faces[texels.faces]]).sum(1)).norm(dim=1)
+        return (
+            posed - (texels.barycentric[..., None] * mesh[body.faces[texels.faces]]).sum(1)
+        ).norm(dim=1)
 
     # What remains: points between vertices are skinned, not placed between skinned vertices.
     assert away(surface).mean() < 2e-4

@@ -70,13 +70,16 @@ def joints_at(learned: Parameters, clip: MotionClip, surface: Surface) -> torch.
 
 
 def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
-    joints, positions = torch.zeros(55, 3), torch.zeros(1, 55, 3)
+    joints = torch.zeros(55, 3)
+    positions = torch.zeros(1, 55, 3)
     joints[1] = torch.tensor([0.5, 1.0, 0.0])
     positions[0, :2] = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])
     assert float(keypoint_error(joints, positions, camera())) == pytest.approx(0, abs=1e-6)
     moved = positions.clone()
     moved[0, 0, 0] += 3 * KEYPOINT
-    assert float(keypoint_error(joints, moved, camera())) == pytest.approx((math.sqrt(10) - 1) / 2, rel=1e-4)
+    assert float(keypoint_error(joints, moved, camera())) == pytest.approx(
+        (math.sqrt(10) - 1) / 2, rel=1e-4
+    )
     moved[0, 0, 2] = 0
     assert float(keypoint_error(joints, moved, camera())) == pytest.approx(0, abs=1e-6)
 
@@ -91,15 +94,21 @@ def test_silhouettes_count_where_they_are_known() -> None:
     assert float(silhouette_error(drawn, ObservedFrame(camera(), seen.alpha, half))) == 0
 
 
-def test_a_wrong_mask_among_right_ones_moves_the_person_less(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_mask_among_right_ones_moves_the_person_less(
+    surface: Surface, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Three views are right, the fourth one shows what is beside the person."""
-    given, view = clip(), camera()
+    given = clip()
+    view = camera()
     with torch.no_grad():
         alpha = drawn_frame(new_fit(given, surface), given, surface, 0, view)
-    views = Cameras(view.cam_from_world.expand(4, 4, 4), view.intrinsics.expand(4, 3, 3), SIZE, SIZE)
+    views = Cameras(
+        view.cam_from_world.expand(4, 4, 4), view.intrinsics.expand(4, 3, 3), SIZE, SIZE
+    )
     masks = torch.cat([alpha, alpha, alpha, alpha.roll(3, dims=2)])
     seen = ObservedFrame(views, masks, torch.ones_like(masks))
-    fitting, moved = Fitting(given, surface, near_given(given)), []
+    fitting = Fitting(given, surface, near_given(given))
+    moved = []
     for scale in (MISTAKEN, 1e9 * MISTAKEN):
         monkeypatch.setattr(solve, "MISTAKEN", scale)
         found = fitting.run(new_fit(given, surface), ("trans",), 80, lambda _: seen)
@@ -109,7 +118,9 @@ def test_a_wrong_mask_among_right_ones_moves_the_person_less(surface: Surface, m
 
 def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> None:
     """The given arm is bent by 2 rad; the image shows it straight."""
-    given, straight, view = clip(2.0), clip(), camera()
+    given = clip(2.0)
+    straight = clip()
+    view = camera()
     with torch.no_grad():
         truth = joints_at(new_fit(straight, surface), straight, surface)
         alpha = drawn_frame(new_fit(straight, surface), straight, surface, 0, view)
@@ -117,7 +128,9 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> No
     wrist = JOINT_NAMES.index("left_wrist")
     for name in ("left_shoulder", "left_elbow", "left_wrist"):
         row = JOINT_NAMES.index(name)
-        marked[0, row] = torch.tensor([0.5 + 1.6 * truth[row, 0] / 4, 0.5 - 1.6 * truth[row, 1] / 4, 1.0])
+        marked[0, row] = torch.tensor(
+            [0.5 + 1.6 * truth[row, 0] / 4, 0.5 - 1.6 * truth[row, 1] / 4, 1.0]
+        )
     errors = []
     for joints in (None, marked):
         seen = ObservedFrame(view, alpha, torch.ones_like(alpha), joints)
@@ -136,21 +149,28 @@ def test_frames_are_taken_from_all_over_the_clip() -> None:
 
 
 def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
-    given, view = clip(), camera()
+    given = clip()
+    view = camera()
     alpha = torch.ones(1, SIZE, SIZE)
-    seen, start = ObservedFrame(view, alpha, alpha), new_fit(given, surface)
+    seen = ObservedFrame(view, alpha, alpha)
+    start = new_fit(given, surface)
     found = Fitting(given, surface, near_given(given)).run(start, ("betas",), 2, lambda _: seen)
-    assert not any(value.any() for value in start.values().values()), "what was learned before stays as it is"
+    assert not any(value.any() for value in start.values().values()), (
+        "what was learned before stays as it is"
+    )
     changed = {name for name, value in found.values().items() if value.any()}
     assert changed == {"betas"}
 
 
 def test_rates_begin_where_they_have_fallen_to(surface: Surface) -> None:
     """Nobody is seen: the person shrinks all the time, by the rate of each step."""
-    given, view = clip(), camera()
+    given = clip()
+    view = camera()
     alpha = torch.zeros(1, SIZE, SIZE)
-    seen, start = ObservedFrame(view, alpha, alpha + 1), new_fit(given, surface)
-    fitting, sums = Fitting(given, surface, near_given(given)), []
+    seen = ObservedFrame(view, alpha, alpha + 1)
+    start = new_fit(given, surface)
+    fitting = Fitting(given, surface, near_given(given))
+    sums = []
     for fallen in (0.0, 0.75):
         moved = fitting.run(start, ("log_scale",), 4, lambda _: seen, fallen=fallen)["log_scale"]
         sums.append(-float(moved.detach()) / LR["log_scale"])
@@ -159,7 +179,8 @@ def test_rates_begin_where_they_have_fallen_to(surface: Surface) -> None:
 
 
 def test_joints_given_in_3d_are_robust_distances() -> None:
-    joints, given = torch.zeros(55, 3), torch.zeros(55, 4)
+    joints = torch.zeros(55, 3)
+    given = torch.zeros(55, 4)
     assert float(place_error(joints, given, torch.ones(()))) == 0
     given[4] = torch.tensor([3 * PLACE, 4 * PLACE, 0.0, 0.5])
     given[5] = torch.tensor([0.0, 0.0, 0.0, 0.5])
@@ -167,10 +188,14 @@ def test_joints_given_in_3d_are_robust_distances() -> None:
     assert float(place_error(joints, given, torch.tensor(5.0))) == pytest.approx(0.5 * (2**0.5 - 1))
 
 
-@pytest.mark.parametrize(("count", "row", "name"), [(24, 21, "right_wrist"), (52, 22, "left_index1")])
+@pytest.mark.parametrize(
+    ("count", "row", "name"), [(24, 21, "right_wrist"), (52, 22, "left_index1")]
+)
 def test_joints_of_other_bodies_are_compared_by_name(count: int, row: int, name: str) -> None:
-    """The last two joints of SMPL have no counterpart, and SMPL-H has fingers where SMPL-X has a face."""
-    joints, given = torch.zeros(count, 3), torch.zeros(55, 4)
+    """The last two joints of SMPL have no counterpart, and SMPL-H has fingers where SMPL-X has a
+    face."""
+    joints = torch.zeros(count, 3)
+    given = torch.zeros(55, 4)
     joints[row] = joints[-1] = torch.tensor([3 * PLACE, 4 * PLACE, 0.0])
     given[JOINT_NAMES.index(name), 3] = given[JOINT_NAMES.index("jaw"), 3] = 1.0
     assert float(place_error(joints, given, torch.ones(()))) == pytest.approx(26**0.5 - 1)
@@ -181,7 +206,9 @@ def test_joints_of_other_bodies_are_compared_by_name(count: int, row: int, name:
     assert float(keypoint_error(joints, marked, camera())) == pytest.approx(0, abs=1e-6)
 
 
-def test_shapes_cost_their_mean_square_with_and_without_directions_of_bones(surface: Surface) -> None:
+def test_shapes_cost_their_mean_square_with_and_without_directions_of_bones(
+    surface: Surface,
+) -> None:
     expected = usual(clip())
     for count, parts in ((surface.body.num_shapes, 2), (10, 1)):
         learned = new_fit(clip(), surface).values() | {"betas": torch.zeros(count)}
@@ -196,17 +223,24 @@ def test_a_longer_lens_from_further_away_shows_the_same_size(surface: Surface) -
     with torch.no_grad():
         learned["log_focal"].add_(0.5)
     poses = torch.eye(4)[None]
-    shown = refined(Cameras(poses, torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]]), 64, 64), learned)
+    shown = refined(
+        Cameras(poses, torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]]), 64, 64), learned
+    )
     factor = torch.tensor(0.5).exp()
     assert torch.allclose(shown.intrinsics[0, 0, 0], 100 * factor)
-    assert torch.allclose(100 * factor / (4.0 + shown.cam_from_world[0, 2, 3]), torch.tensor(100 / 4.0))
+    assert torch.allclose(
+        100 * factor / (4.0 + shown.cam_from_world[0, 2, 3]), torch.tensor(100 / 4.0)
+    )
     assert shown.intrinsics[0, :2, 2].tolist() == [32, 32]
     assert refined(shown, new_fit(clip(), surface)) is shown
 
 
 def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> None:
-    clip = MotionClip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 55, 3), torch.zeros(1, 3), torch.ones(1))
-    expected, row = usual(clip), JOINT_NAMES.index("left_collar")
+    clip = MotionClip(
+        torch.zeros(1, dtype=torch.float64), torch.zeros(1, 55, 3), torch.zeros(1, 3), torch.ones(1)
+    )
+    expected = usual(clip)
+    row = JOINT_NAMES.index("left_collar")
 
     def cost(deviations: float, prior_of_poses: PosePrior) -> float:
         learned = new_fit(clip, surface).values()
@@ -217,7 +251,9 @@ def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> Non
     fraction = 1 / (21 * 3)
     unlimited = replace(expected, limit=math.inf)
     assert cost(2.9, expected) == pytest.approx(cost(2.9, unlimited), abs=1e-8)
-    assert cost(5.0, expected) - cost(5.0, unlimited) == pytest.approx(LIMIT_WEIGHT * 2.0**2 * fraction, rel=1e-4)
+    assert cost(5.0, expected) - cost(5.0, unlimited) == pytest.approx(
+        LIMIT_WEIGHT * 2.0**2 * fraction, rel=1e-4
+    )
     assert near_given(clip).limit == math.inf, "given poses may be as they like"
 
 
@@ -228,7 +264,9 @@ def filmed(log_focal: float) -> tuple[Surface, MotionClip, list[ObservedFrame]]:
     """Who turns before a camera whose focal length is not the guessed one, by that logarithm."""
     surface = surface_of(default_template(), 16)
     intrinsics = torch.tensor([[0.9 * SIZE, 0, SIZE / 2], [0, 0.9 * SIZE, SIZE / 2], [0, 0, 1]])
-    camera = Cameras(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None], intrinsics[None], SIZE, SIZE)
+    camera = Cameras(
+        torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None], intrinsics[None], SIZE, SIZE
+    )
     poses = torch.zeros(FRAMES, 55, 3)
     poses[:, 0, 1] = torch.arange(FRAMES) * 0.7
     poses[:, JOINT_NAMES.index("left_shoulder"), 1] = -1.2
@@ -239,7 +277,10 @@ def filmed(log_focal: float) -> tuple[Surface, MotionClip, list[ObservedFrame]]:
     with torch.no_grad():
         true["log_focal"].add_(log_focal)
         known = torch.ones(1, SIZE, SIZE)
-        seen = [ObservedFrame(camera, drawn_frame(true, clip, surface, row, camera), known) for row in range(FRAMES)]
+        seen = [
+            ObservedFrame(camera, drawn_frame(true, clip, surface, row, camera), known)
+            for row in range(FRAMES)
+        ]
     return surface, clip, seen
 
 
@@ -261,7 +302,9 @@ def test_a_wrong_guess_is_corrected() -> None:
 def test_where_the_guess_stays_nothing_is_fitted_again() -> None:
     surface, clip, seen = filmed(0.0)
     start = new_fit(clip, surface)
-    found, lens = fit_lens(Fitting(clip, surface, near_given(clip)), start, (), seen.__getitem__, STEPS)
+    found, lens = fit_lens(
+        Fitting(clip, surface, near_given(clip)), start, (), seen.__getitem__, STEPS
+    )
     assert not lens.taken
     assert found is start
     assert "the guess stays" in lens.summary()

@@ -1,4 +1,5 @@
-"""First poses from silhouettes: place, size and heading of a person of whom nothing else is known."""
+"""First poses from silhouettes: place, size and heading of a person of whom nothing else is
+known."""
 
 from __future__ import annotations
 
@@ -54,11 +55,13 @@ def test_no_path_costs_less(seed: int, anchors: int, weight: float) -> None:
 
 
 def test_a_turn_goes_on_where_single_frames_cannot_tell() -> None:
-    """Side views of a person who turns all around: front and back of each look alike, but for noise."""
+    """Side views of a person who turns all around: front and back of each look alike, but for
+    noise."""
     true = [0, 1, 2, 3, 4, 5, 6, 7, 0]
     errors = np.full((len(true), NUM_HEADINGS), 1.0)
     for row, facing in enumerate(true):
-        mirrored = (NUM_HEADINGS // 2 - facing) % NUM_HEADINGS  # the same outline from a camera in front
+        # the same outline from a camera in front
+        mirrored = (NUM_HEADINGS // 2 - facing) % NUM_HEADINGS
         errors[row, facing], errors[row, mirrored] = 0.2, 0.2
     errors[0, 4], errors[4, 0], errors[2, 3] = 0.5, 0.5, 0.19
     assert likely_path(errors.tolist()) in (true, [(-x) % 8 for x in true])
@@ -75,7 +78,8 @@ def test_headings_are_evenly_spread_and_angles_are_the_shortest() -> None:
     assert [heading(i) for i in range(NUM_HEADINGS)] == pytest.approx(
         [2 * math.pi * i / NUM_HEADINGS for i in range(NUM_HEADINGS)]
     )
-    a, b = Rotation.from_rotvec([0, 3.0, 0]), Rotation.from_rotvec([0, -3.0, 0])
+    a = Rotation.from_rotvec([0, 3.0, 0])
+    b = Rotation.from_rotvec([0, -3.0, 0])
     vectors = [torch.from_numpy(x.as_rotvec()) for x in (a, b)]
     assert angle_between(vectors[0], vectors[1]) == pytest.approx(2 * math.pi - 6)
 
@@ -95,9 +99,14 @@ def ring(count: int, centre: torch.Tensor, distance: float = 4.0) -> Cameras:
         angle = 2 * math.pi * (i + 0.2) / count
         back = torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
         rotation = torch.stack(
-            [torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), back), torch.tensor([0.0, -1.0, 0.0]), -back]
+            [
+                torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), back),
+                torch.tensor([0.0, -1.0, 0.0]),
+                -back,
+            ]
         )
-        poses[i, :3, :3], poses[i, :3, 3] = rotation, -rotation @ (centre + distance * back)
+        poses[i, :3, :3] = rotation
+        poses[i, :3, 3] = -rotation @ (centre + distance * back)
     focal = torch.tensor([[1.6 * SIZE, 0, SIZE / 2], [0, 1.6 * SIZE, SIZE / 2], [0, 0, 1]])
     return Cameras(poses, focal.repeat(count, 1, 1), SIZE, SIZE)
 
@@ -148,12 +157,16 @@ def test_nobody_has_the_place_of_the_frame_before(surface: Surface) -> None:
 def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dyngs.human.fit.start.STEPS", 15)
     monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
-    place, heading = torch.tensor([0.0, 1.0, 0.0]), 2.0
+    place = torch.tensor([0.0, 1.0, 0.0])
+    heading = 2.0
     seen = seen_by(surface, standing(place, heading), ring(3, place))
     ticks: list[int] = []
-    clip = first_poses(torch.zeros(1, dtype=torch.float64), surface, lambda _: seen, lambda: ticks.append(1))
+    clip = first_poses(
+        torch.zeros(1, dtype=torch.float64), surface, lambda _: seen, lambda: ticks.append(1)
+    )
     facing = Rotation.from_rotvec(clip.poses[0, 0].double().numpy()).apply([0.0, 0.0, 1.0])
-    assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8  # few steps, from 45 degrees apart
+    # few steps, from 45 degrees apart
+    assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8
     assert len(ticks) == num_ticks(1, marked=False)
 
 
@@ -162,17 +175,24 @@ def test_nobody_at_all_is_an_error(surface: Surface) -> None:
         first_poses(torch.zeros(1, dtype=torch.float64), surface, lambda _: None)
 
 
-def test_who_turns_before_one_camera_is_followed(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From frame to frame a body would rather twist than turn: outlines of front and back are alike."""
+def test_who_turns_before_one_camera_is_followed(
+    surface: Surface, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From frame to frame a body would rather twist than turn: outlines of front and back are
+    alike."""
     monkeypatch.setattr("dyngs.human.fit.start.STEPS", 10)
     monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
-    place, camera = torch.tensor([0.0, 1.0, 0.0]), ring(1, torch.tensor([0.0, 1.0, 0.0]))
-    turns = [0.4 * math.pi + x for x in (0.1, 1.6, 3.1)]  # towards the camera, then sideways, then away from it
+    place = torch.tensor([0.0, 1.0, 0.0])
+    camera = ring(1, torch.tensor([0.0, 1.0, 0.0]))
+    # towards the camera, then sideways, then away from it
+    turns = [0.4 * math.pi + x for x in (0.1, 1.6, 3.1)]
     seen = [with_joints(surface, standing(place, turn), camera) for turn in turns]
     ticks: list[int] = []
     times = torch.linspace(0, 1, 3, dtype=torch.float64)
     clip = first_poses(times, surface, seen.__getitem__, lambda: ticks.append(1))
-    assert len(ticks) == num_ticks(3, marked=True) < num_ticks(3, marked=False), "key points leave few headings"
+    assert len(ticks) == num_ticks(3, marked=True) < num_ticks(3, marked=False), (
+        "key points leave few headings"
+    )
     for root, turn in zip(clip.poses[:, 0], turns, strict=True):
         facing = Rotation.from_rotvec(root.double().numpy()).apply([0.0, 0.0, 1.0])
         assert facing @ np.array([math.sin(turn), 0.0, math.cos(turn)]) > 0.8
@@ -180,7 +200,8 @@ def test_who_turns_before_one_camera_is_followed(surface: Surface, monkeypatch: 
 
 def with_joints(surface: Surface, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
     """What is seen, and the joints as key points."""
-    seen, blank = seen_by(surface, clip, cameras), new_fit(clip, surface)
+    seen = seen_by(surface, clip, cameras)
+    blank = new_fit(clip, surface)
     joints = posed_joints(surface.skeleton(blank["betas"]), frame_pose_of(blank, clip, 0))
     local = joints @ cameras.cam_from_world[0, :3, :3].T + cameras.cam_from_world[0, :3, 3]
     pixels = local @ cameras.intrinsics[0].T

@@ -38,7 +38,9 @@ def numbers(count: int = 55, **changes: Any) -> dict[str, object]:
     }
 
 
-def read(path: Path, arrays: dict[str, object], count: int = 55, up: UpAxis = "auto", shapes: int = 0) -> Motion:
+def read(
+    path: Path, arrays: dict[str, object], count: int = 55, up: UpAxis = "auto", shapes: int = 0
+) -> Motion:
     given = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
     np.savez(path / "x.npz", **given)  # pyright: ignore[reportArgumentType]
     return read_amass(path / "x.npz", tiny_body(count, shapes), up)
@@ -54,7 +56,8 @@ def as_written(arrays: dict[str, object], count: int, scale: float = 1.0) -> Mot
     return Motion(poses, trans, betas, 120.0, torch.full((FRAMES,), scale))
 
 
-# --- up axis ----------------------------------------------------------------------------------------------------------
+# --- up axis
+# ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [24, 52, 55])
@@ -91,9 +94,11 @@ def test_turning_heeds_the_scale(tmp_path: Path, scale: float) -> None:
         ({"up_axis": "z"}, "y", False),
     ],
 )
-def test_which_files_are_turned(tmp_path: Path, changes: dict[str, Any], up: UpAxis, is_turned: bool) -> None:
-    """AMASS's are; those with a scale, which fits of our own write, are not; the file's word counts more, the caller's
-    most."""
+def test_which_files_are_turned(
+    tmp_path: Path, changes: dict[str, Any], up: UpAxis, is_turned: bool
+) -> None:
+    """AMASS's are; those with a scale, which fits of our own write, are not; the file's word counts
+    more, the caller's most."""
     arrays = numbers(**changes)
     motion = read(tmp_path, arrays, up=up)
     plain = as_written(arrays, 55)
@@ -119,20 +124,28 @@ def test_own_files_stay_where_they_are_on_any_body(tmp_path: Path) -> None:
     assert torch.equal(motion.trans, as_written(arrays, 55).trans)
 
 
-# --- layouts ----------------------------------------------------------------------------------------------------------
+# --- layouts
+# ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [24, 52, 55])
 def test_joints_of_every_width(tmp_path: Path, count: int) -> None:
-    """Fingers go to their positions; the hands of SMPL are left out; what is not there does not turn."""
+    """Fingers go to their positions; the hands of SMPL are left out; what is not there does not
+    turn."""
     arrays = numbers(count, up_axis="y")
     motion = read(tmp_path, arrays, count)
     assert motion.poses.shape == (FRAMES, 55, 3)
     assert motion.poses.dtype == motion.trans.dtype == torch.float32
     written = dict(zip(JOINT_NAMES, random_motion(FRAMES).poses.unbind(1), strict=True))
     for i, name in enumerate(JOINT_NAMES):
-        is_there = i < 22 or (count == 55) or (count == 52 and name not in ("jaw", "left_eye", "right_eye"))
-        assert torch.equal(motion.poses[:, i], written[name] if is_there else torch.zeros(FRAMES, 3)), name
+        is_there = (
+            i < 22
+            or (count == 55)
+            or (count == 52 and name not in ("jaw", "left_eye", "right_eye"))
+        )
+        assert torch.equal(
+            motion.poses[:, i], written[name] if is_there else torch.zeros(FRAMES, 3)
+        ), name
 
 
 @pytest.mark.parametrize("left_out", [(), ("pose_hand",), ("pose_jaw", "pose_eye", "pose_hand")])
@@ -152,7 +165,8 @@ def test_parts_instead_of_poses(tmp_path: Path, left_out: tuple[str, ...]) -> No
     for key in left_out:
         expected[:, slice(*cuts[key])] = 0
     np.testing.assert_array_equal(
-        read(tmp_path, {**arrays, **parts}).poses.reshape(FRAMES, -1).numpy(), expected.astype(np.float32)
+        read(tmp_path, {**arrays, **parts}).poses.reshape(FRAMES, -1).numpy(),
+        expected.astype(np.float32),
     )
 
 
@@ -182,13 +196,16 @@ def test_the_motions_at_hand() -> None:
     for path in [*folder.glob("*.npz"), *(SHARED / "human").glob("*/body_*.npz")]:
         motion = read_amass(path, tiny_body())
         with np.load(path) as file:
-            np.testing.assert_array_equal(motion.poses.reshape(len(motion), -1).numpy(), file["poses"])
+            np.testing.assert_array_equal(
+                motion.poses.reshape(len(motion), -1).numpy(), file["poses"]
+            )
             np.testing.assert_array_equal(motion.trans.numpy(), file["trans"])
             assert motion.fps == file["mocap_frame_rate"]
             assert float(motion.scale[0]) == pytest.approx(float(file["scale"]))
 
 
-# --- files with the names of the package smplx ------------------------------------------------------------------------
+# --- files with the names of the package smplx
+# ------------------------------------------------------------------------
 
 
 def named(**changes: Any) -> dict[str, object]:
@@ -197,21 +214,38 @@ def named(**changes: Any) -> dict[str, object]:
     widths = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
     widths |= {"left_hand_pose": 45, "right_hand_pose": 45}
     ends = np.cumsum(list(widths.values()))
-    parts = {key: poses[:, end - width : end] for (key, width), end in zip(widths.items(), ends, strict=True)}
-    return {**parts, "transl": numbers()["trans"], "betas": np.ones((FRAMES, 10)), "fps": 25, **changes}
+    parts = {
+        key: poses[:, end - width : end]
+        for (key, width), end in zip(widths.items(), ends, strict=True)
+    }
+    return {
+        **parts,
+        "transl": numbers()["trans"],
+        "betas": np.ones((FRAMES, 10)),
+        "fps": 25,
+        **changes,
+    }
 
 
-UPS = {"y": np.eye(3), "z": Y_FROM_Z, "-y": np.diag([1.0, -1, -1]), "x": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}
+UPS = {
+    "y": np.eye(3),
+    "z": Y_FROM_Z,
+    "-y": np.diag([1.0, -1, -1]),
+    "x": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+}
 
 
 @pytest.mark.parametrize("axis", UPS)
 def test_fits_are_turned_so_that_the_pelvis_is_upright(tmp_path: Path, axis: str) -> None:
     """Vertex by vertex, whichever axis of the fit is up: its cameras decide that."""
-    y_from_file, body = UPS[axis], tiny_body(55, 10)
+    y_from_file = UPS[axis]
+    body = tiny_body(55, 10)
     given = named()
     roots = Rotation.from_rotvec(0.2 * np.asarray(given["global_orient"]))
     given["global_orient"] = (Rotation.from_matrix(y_from_file.T) * roots).as_rotvec()
-    flat = np.concatenate([np.asarray(x) for key, x in given.items() if "pose" in key or "orient" in key], axis=1)
+    flat = np.concatenate(
+        [np.asarray(x) for key, x in given.items() if "pose" in key or "orient" in key], axis=1
+    )
     arrays = {"poses": flat, "trans": given["transl"], "betas": np.ones(10)}
     expected = slow_vertices(body, as_written(arrays, 55)) @ y_from_file.T
     motion = read(tmp_path, given, shapes=10)
@@ -224,7 +258,9 @@ def test_fits_are_turned_so_that_the_pelvis_is_upright(tmp_path: Path, axis: str
 def test_what_fits_may_lack_and_spell_otherwise(tmp_path: Path) -> None:
     """Parts after the body, rows of joints, SMPL's 23 joints, one more axis."""
     whole = named()
-    short = {key: x for key, x in whole.items() if key in ("global_orient", "body_pose", "transl", "fps")}
+    short = {
+        key: x for key, x in whole.items() if key in ("global_orient", "body_pose", "transl", "fps")
+    }
     body = np.asarray(whole["body_pose"])
     padded = {**short, "body_pose": np.concatenate([body, np.ones((FRAMES, 6))], axis=1)}
     rows = {
@@ -247,21 +283,30 @@ def test_what_fits_may_lack_and_spell_otherwise(tmp_path: Path) -> None:
             "'left_hand_pose' must hold .* of 15 joints per frame, has 4 x 6;.*use_pca",
         ),
         ({"body_pose": None}, "the key 'body_pose' is missing"),
-        ({"body_pose": np.zeros((4, 21, 3, 3))}, "'body_pose' must hold .* 21 or 23 joints .*has 4 x 21 x 3 x 3;"),
+        (
+            {"body_pose": np.zeros((4, 21, 3, 3))},
+            "'body_pose' must hold .* 21 or 23 joints .*has 4 x 21 x 3 x 3;",
+        ),
         ({"transl": None}, "the key 'trans' is missing"),
         ({"fps": None}, "has no frame rate; .*dyngs data motion FILE OUT.npz --fps 30"),
         ({"global_orient": np.float64(1)}, "'global_orient' must hold .*has one number"),
-        ({"global_orient": np.zeros((3, 3))}, "'body_pose' must have 3 frames as 'global_orient' has, has 4 x 63"),
+        (
+            {"global_orient": np.zeros((3, 3))},
+            "'body_pose' must have 3 frames as 'global_orient' has, has 4 x 63",
+        ),
     ],
 )
-def test_broken_fits_say_what_is_wrong(tmp_path: Path, changes: dict[str, object], problem: str) -> None:
+def test_broken_fits_say_what_is_wrong(
+    tmp_path: Path, changes: dict[str, object], problem: str
+) -> None:
     with pytest.raises(DyngsError, match=problem) as caught:
         read(tmp_path, named(**changes))
     assert str(caught.value).startswith(str(tmp_path / "x.npz"))
     assert "\n" not in str(caught.value)
 
 
-# --- files of other programs -----------------------------------------------------------------------------------------
+# --- files of other programs
+# -----------------------------------------------------------------------------------------
 
 WALK = np.linspace([0, 1, 0], [0.02, 1, 0.01], FRAMES)  # at a speed of people
 SMPL = numbers(24, trans=WALK, betas=np.linspace(-1, 1, 10))
@@ -286,11 +331,14 @@ SHAPES = np.asarray(SMPL["betas"])
     ],
 )
 def test_layouts_of_the_same_motion(tmp_path: Path, changes: dict[str, object]) -> None:
-    """Rows of joints, rotation matrices, a batch of one, shapes per frame, rates as text: the values are the same."""
+    """Rows of joints, rotation matrices, a batch of one, shapes per frame, rates as text: the
+    values are the same."""
     plain = read(tmp_path, SMPL, 24, shapes=10)
     other = read(tmp_path, SMPL | changes, 24, shapes=10)
     for name in ("poses", "trans", "betas"):
-        np.testing.assert_allclose(getattr(other, name), getattr(plain, name), atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(other, name), getattr(plain, name), atol=1e-6, err_msg=name
+        )
     assert other.fps == 120
     assert other.notes == ()
 
@@ -299,9 +347,13 @@ def test_half_precision_and_the_22_joints_of_the_body(tmp_path: Path) -> None:
     """Any model has these joints, so the shape is dropped as that of another model."""
     halves = {key: np.asarray(SMPL[key]).astype(np.float16) for key in ("poses", "trans", "betas")}
     plain = read(tmp_path, SMPL, 24, shapes=10)
-    np.testing.assert_allclose(read(tmp_path, SMPL | halves, 24, shapes=10).poses, plain.poses, atol=2e-3)
+    np.testing.assert_allclose(
+        read(tmp_path, SMPL | halves, 24, shapes=10).poses, plain.poses, atol=2e-3
+    )
     halves["poses"] = MATRICES.astype(np.float16)
-    np.testing.assert_allclose(read(tmp_path, SMPL | halves, 24, shapes=10).poses, plain.poses, atol=4e-3)
+    np.testing.assert_allclose(
+        read(tmp_path, SMPL | halves, 24, shapes=10).poses, plain.poses, atol=4e-3
+    )
     body_only = read(tmp_path, SMPL | {"poses": ROTVECS[:, :22]}, 24, shapes=10)
     assert torch.equal(body_only.poses, plain.poses)
     assert not body_only.betas.any()
@@ -316,7 +368,9 @@ def test_files_of_romp_and_hmr(tmp_path: Path, as_matrices: bool) -> None:
     parts = {"global_orient": rotvecs[:, 0], "body_pose": rotvecs[:, 1:].reshape(FRAMES, -1)}
     rest = {"smpl_betas": SHAPES[None], "cam_trans": WALK, "fps": 25}
     if as_matrices:
-        matrices = Rotation.from_rotvec(rotvecs.reshape(-1, 3)).as_matrix().reshape(FRAMES, 24, 3, 3)
+        matrices = (
+            Rotation.from_rotvec(rotvecs.reshape(-1, 3)).as_matrix().reshape(FRAMES, 24, 3, 3)
+        )
         parts = {"global_orient": matrices[:, :1], "body_pose": matrices[:, 1:]}
     body = tiny_body(24, 10)
     stored = as_written({"poses": rotvecs, "trans": WALK, "betas": SHAPES}, 24)
@@ -329,7 +383,9 @@ def test_files_of_romp_and_hmr(tmp_path: Path, as_matrices: bool) -> None:
     np.testing.assert_allclose(thetas.poses, motion.poses, atol=1e-6)
 
 
-@pytest.mark.parametrize(("count", "said"), [(24, "the mean is taken"), (55, "dropped as the template is 'smplx'")])
+@pytest.mark.parametrize(
+    ("count", "said"), [(24, "the mean is taken"), (55, "dropped as the template is 'smplx'")]
+)
 def test_the_mean_of_shapes_per_frame(tmp_path: Path, count: int, said: str) -> None:
     betas = SHAPES + np.arange(FRAMES)[:, None]
     motion = read(tmp_path, SMPL | {"betas": betas}, count, shapes=10)
@@ -363,7 +419,8 @@ def test_positions_in_millimetres(tmp_path: Path) -> None:
     assert "the root moves at 1000 m/s" in note
 
 
-# --- broken files -----------------------------------------------------------------------------------------------------
+# --- broken files
+# -----------------------------------------------------------------------------------------------------
 
 NAN = np.full((FRAMES, 3), np.nan)
 
@@ -381,24 +438,45 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"poses": np.zeros((4, 3, 24))}, "'poses' must hold .*, has 4 x 3 x 24"),
         ({"poses": np.zeros((2, 4, 72))}, "'poses' must hold .*, has 2 x 4 x 72"),
         ({"poses": np.full((4, 24, 3, 3), 0.5)}, "'poses' must hold .*, has 4 x 24 x 3 x 3"),
-        ({"poses": -np.broadcast_to(np.eye(3), (4, 24, 3, 3))}, "'poses' must hold .*, has 4 x 24 x 3 x 3"),
+        (
+            {"poses": -np.broadcast_to(np.eye(3), (4, 24, 3, 3))},
+            "'poses' must hold .*, has 4 x 24 x 3 x 3",
+        ),
         ({"poses": np.zeros(165)}, "'poses' must hold .* has 165"),
-        ({"poses": np.full((4, 72), 30.0)}, "a joint is rotated by 52 rad, more than two turns; convert degrees"),
+        (
+            {"poses": np.full((4, 72), 30.0)},
+            "a joint is rotated by 52 rad, more than two turns; convert degrees",
+        ),
         ({"poses": np.zeros((0, 165)), "trans": np.zeros((0, 3))}, "has no frames"),
         ({"poses": np.full((4, 165), "a")}, "'poses' must hold numbers, not <U1"),
         ({"poses": np.full((4, 165), 1e30)}, "'poses' holds NaN or huge"),
         ({"poses": np.zeros((4, 165), complex)}, "'poses' must hold numbers"),
-        ({"poses": np.array([{}], object)}, "'poses' is not an array of numbers .*it holds Python objects"),
+        (
+            {"poses": np.array([{}], object)},
+            "'poses' is not an array of numbers .*it holds Python objects",
+        ),
         ({"trans": None}, "the key 'trans' is missing"),
         ({"trans": NAN}, "'trans' holds NaN"),
-        ({"trans": np.zeros((3, 3))}, "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 3"),
-        ({"trans": np.zeros((1, 3))}, "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 1 x 3"),
-        ({"trans": np.zeros((3, 4))}, "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 4"),
+        (
+            {"trans": np.zeros((3, 3))},
+            "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 3",
+        ),
+        (
+            {"trans": np.zeros((1, 3))},
+            "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 1 x 3",
+        ),
+        (
+            {"trans": np.zeros((3, 4))},
+            "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 4",
+        ),
         ({"mocap_framerate": None}, "has no frame rate; .*dyngs data motion FILE OUT.npz --fps 30"),
         ({"mocap_framerate": 0.0}, "'mocap_framerate' must be one positive number"),
         ({"mocap_framerate": [30.0, 25.0]}, "'mocap_framerate' must be one positive number"),
         ({"mocap_framerate": b"fast"}, "'mocap_framerate' must hold numbers, not .S4"),
-        ({"betas": np.zeros((3, 10))}, "'betas' must be one row of numbers or one for each frame, has 3 x 10"),
+        (
+            {"betas": np.zeros((3, 10))},
+            "'betas' must be one row of numbers or one for each frame, has 3 x 10",
+        ),
         ({"scale": -1.0}, "'scale' must be one positive number"),
         ({"scale": np.ones(3)}, "'scale' must be one positive number, or one for each of 4 frames"),
         ({"mocap_framerate": 1e-310}, "1e-310 frames per second is not the rate of a motion"),
@@ -406,7 +484,10 @@ NAN = np.full((FRAMES, 3), np.nan)
             {"poses": np.zeros((90_910, 72), np.uint8)},
             "90910 frames of 55 joints are too many; at most 5,000,000 poses",
         ),
-        ({"up_axis": np.frombuffer(b"\xff" * 4, "<U1")}, "'up_axis' is not an array .*what is no text"),
+        (
+            {"up_axis": np.frombuffer(b"\xff" * 4, "<U1")},
+            "'up_axis' is not an array .*what is no text",
+        ),
         ({"up_axis": ["y", "z"]}, "'up_axis' must be 'y' or 'z', not"),
         ({"up_axis": "x"}, "'up_axis' must be 'y' or 'z', not 'x'"),
         (
@@ -415,7 +496,9 @@ NAN = np.full((FRAMES, 3), np.nan)
         ),
     ],
 )
-def test_broken_files_say_what_is_wrong(tmp_path: Path, changes: dict[str, object], problem: str) -> None:
+def test_broken_files_say_what_is_wrong(
+    tmp_path: Path, changes: dict[str, object], problem: str
+) -> None:
     with pytest.raises(DyngsError, match=problem) as caught:
         read(tmp_path, numbers() | changes)
     assert str(caught.value).startswith(str(tmp_path / "x.npz"))
@@ -438,14 +521,16 @@ def test_a_single_array_and_a_missing_file(tmp_path: Path) -> None:
 
 
 def test_the_turned_root_of_a_person_lying_on_the_back(tmp_path: Path) -> None:
-    """In a z-up world, a standing SMPL body is turned by 90 degrees about x: that becomes no turn at all."""
+    """In a z-up world, a standing SMPL body is turned by 90 degrees about x: that becomes no turn
+    at all."""
     poses = np.zeros((FRAMES, 165))
     poses[:, 0] = np.pi / 2
     motion = read(tmp_path, numbers(poses=poses))
     assert motion.poses.abs().max() < 1e-6
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
+# --- writing
+# ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fps", [30.0, 29.97, 1 / 3])
@@ -466,7 +551,11 @@ def test_saved_files_are_those_of_amass(tmp_path: Path) -> None:
     write_amass(random_motion(), tmp_path / "x.npz")
     with np.load(tmp_path / "x.npz", allow_pickle=False) as file:
         assert file["poses"].shape == (4, 165)
-        assert {str(file[key]) for key in ("surface_model_type", "gender", "up_axis")} == {"smplx", "neutral", "y"}
+        assert {str(file[key]) for key in ("surface_model_type", "gender", "up_axis")} == {
+            "smplx",
+            "neutral",
+            "y",
+        }
 
 
 def test_what_cannot_be_saved(tmp_path: Path) -> None:

@@ -56,7 +56,8 @@ def two(tmp_path: Path) -> Path:
 
 
 def test_known_answer(two: Path) -> None:
-    """Position channels take the place of OFFSET along their axis; a joint turns what hangs on it."""
+    """Position channels take the place of OFFSET along their axis; a joint turns what hangs on
+    it."""
     source = read_bvh(two)
     assert source.names == ("Hip Bone", "Spine")
     assert source.fps == 40.0
@@ -75,8 +76,12 @@ def test_known_answer(two: Path) -> None:
 @pytest.mark.parametrize("order", ["".join(x) for x in permutations("XYZ")])
 def test_round_trip_of_a_body(tmp_path: Path, order: str) -> None:
     """World rotations of all joints and the pelvis' path come back, in any order of rotations."""
-    own, motion, body = skeleton(), random_motion(5), tiny_body()
-    path = write_bvh(tmp_path / "x.bvh", own, as_local(motion, own), pelvis_path(body, motion), order, fps=120)
+    own = skeleton()
+    motion = random_motion(5)
+    body = tiny_body()
+    path = write_bvh(
+        tmp_path / "x.bvh", own, as_local(motion, own), pelvis_path(body, motion), order, fps=120
+    )
     found = retarget(read_bvh(path), body)
     ours, theirs = (world_rotations(x.poses.double().numpy(), own.parents) for x in (found, motion))
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
@@ -90,13 +95,23 @@ def test_a_bent_elbow(tmp_path: Path) -> None:
     own = skeleton(JOINT_NAMES[:22])
     angles = np.zeros((2, 22, 3))
     angles[1, JOINT_NAMES.index("left_elbow"), 0] = 90
-    local = Rotation.from_euler("ZXY", angles.reshape(-1, 3), degrees=True).as_matrix().reshape(2, 22, 3, 3)
-    motion = retarget(read_bvh(write_bvh(tmp_path / "x.bvh", own, local, np.zeros((2, 3)))), tiny_body())
+    local = (
+        Rotation.from_euler("ZXY", angles.reshape(-1, 3), degrees=True)
+        .as_matrix()
+        .reshape(2, 22, 3, 3)
+    )
+    motion = retarget(
+        read_bvh(write_bvh(tmp_path / "x.bvh", own, local, np.zeros((2, 3)))), tiny_body()
+    )
     assert motion.poses[0].abs().max() < 1e-6
-    np.testing.assert_allclose(motion.poses[1, JOINT_NAMES.index("left_elbow")], (0, 0, np.pi / 2), atol=1e-6)
+    np.testing.assert_allclose(
+        motion.poses[1, JOINT_NAMES.index("left_elbow")], (0, 0, np.pi / 2), atol=1e-6
+    )
 
 
-@pytest.mark.parametrize("change", [("\n", "\r\n"), ("  ", "\t"), ("  OFFSET", "  \n\n  offset"), ("{", "\n{\n\n")])
+@pytest.mark.parametrize(
+    "change", [("\n", "\r\n"), ("  ", "\t"), ("  OFFSET", "  \n\n  offset"), ("{", "\n{\n\n")]
+)
 def test_looks_do_not_matter(two: Path, change: tuple[str, str]) -> None:
     expected = read_bvh(two)
     two.write_bytes(b"\xef\xbb\xbf" + TWO.replace(*change).encode())
@@ -127,9 +142,21 @@ def test_looks_do_not_matter(two: Path, change: tuple[str, str]) -> None:
         ("Frames: 2", "Frames: 999999999", "says 999999999 frames"),
         ("Frame Time: 0.025", "Frame Time: 0", "a positive Frame Time"),
         ("Frame Time: 0.025", "Frame Time: -1", "a positive Frame Time"),
-        ("Frame Time: 0.025", "Frame Time: 1e-310", "inf frames per second is not the rate of a motion"),
-        ("Frame Time: 0.025", "Frame Time: 1e-9", "1e.09 frames per second is not the rate of a motion"),
-        ("Frame Time: 0.025", "Frame Time: 1e8", "1e-08 frames per second is not the rate of a motion"),
+        (
+            "Frame Time: 0.025",
+            "Frame Time: 1e-310",
+            "inf frames per second is not the rate of a motion",
+        ),
+        (
+            "Frame Time: 0.025",
+            "Frame Time: 1e-9",
+            "1e.09 frames per second is not the rate of a motion",
+        ),
+        (
+            "Frame Time: 0.025",
+            "Frame Time: 1e8",
+            "1e-08 frames per second is not the rate of a motion",
+        ),
         ("5 0 0 0 90", "5 0 0 0", "says 2 frames of 5 numbers but holds 9"),
         ("5 0 0 0 90", "5 0 0 0 inf", "NaN or huge"),
         ("5 0 0 0 90", "5 0 0 0 1e30", "NaN or huge"),
@@ -151,9 +178,15 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 
 
 HOSTILE = {
-    "frames": (f"{TWO[: TWO.index('Frames')]}Frames: 300000\nFrame Time: 0.03\n" + "0 " * 1_500_000, "too many"),
+    "frames": (
+        f"{TWO[: TWO.index('Frames')]}Frames: 300000\nFrame Time: 0.03\n" + "0 " * 1_500_000,
+        "too many",
+    ),
     "blank lines": ("HIERARCHY" + "\n" * 1_000_000, "has no part MOTION"),
-    "joints": ("HIERARCHY ROOT a\n{\n" + "JOINT a\n{\n" * 5000 + "MOTION\n", "asks for 4,097 joints"),
+    "joints": (
+        "HIERARCHY ROOT a\n{\n" + "JOINT a\n{\n" * 5000 + "MOTION\n",
+        "asks for 4,097 joints",
+    ),
     "a long name": ("HIERARCHY\nROOT " + "a" * 1_000_000 + "\n{\n}\nMOTION", "has no OFFSET"),
     "a long word": (TWO.replace("0.025", "9" * 1_000_000), "NaN or huge"),
 }

@@ -1,4 +1,5 @@
-"""Feet on the floor: contact found, sliding measured and taken away, at any size, rate and up direction."""
+"""Feet on the floor: contact found, sliding measured and taken away, at any size, rate and up
+direction."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ Y = torch.tensor([0.0, 1.0, 0.0])
 def clip_of(trans: Tensor, poses: Tensor | None = None) -> MotionClip:
     count = len(trans)
     poses = torch.zeros(count, len(BODY.joints), 3) if poses is None else poses
-    return MotionClip(torch.linspace(0, 1, count, dtype=torch.float64), poses, trans, torch.ones(count))
+    return MotionClip(
+        torch.linspace(0, 1, count, dtype=torch.float64), poses, trans, torch.ones(count)
+    )
 
 
 def soles_of(clip: MotionClip) -> Tensor:
@@ -63,12 +66,16 @@ def test_size_up_direction_and_rate_are_those_of_the_clip() -> None:
     assert before.frames == 20
     assert before.slide == pytest.approx(0.005, rel=1e-3), "metres of the person"
     assert after.slide < 1e-5
-    assert foot_contact(clip, soles_of(clip), Y, 10 * FPS).frames == 0, "too fast to stand at ten times the rate"
+    assert foot_contact(clip, soles_of(clip), Y, 10 * FPS).frames == 0, (
+        "too fast to stand at ten times the rate"
+    )
 
 
 def walk(stride: float, root: float) -> MotionClip:
-    """Legs that swing by turns as stilts, 20 frames each; the root moves by ``root`` over what would keep the feet."""
-    count, poses = 80, torch.zeros(80, len(BODY.joints), 3)
+    """Legs that swing by turns as stilts, 20 frames each; the root moves by ``root`` over what
+    would keep the feet."""
+    count = 80
+    poses = torch.zeros(80, len(BODY.joints), 3)
     swing = torch.linspace(-stride, stride, 20)
     trans = torch.zeros(count, 3)
     left, right, knees = (JOINT_NAMES.index(x) for x in ("left_hip", "right_hip", "left_knee"))
@@ -88,7 +95,8 @@ def walk(stride: float, root: float) -> MotionClip:
 
 
 def test_a_walk_with_a_root_that_is_too_fast_is_slowed_down_to_the_feet() -> None:
-    true, fast = walk(0.3, 1.0), walk(0.3, 1.3)
+    true = walk(0.3, 1.0)
+    fast = walk(0.3, 1.3)
     kept, before, after = feet_kept(fast, soles_of(fast), Y, FPS)
     assert before.frames > 60
     assert after.slide < 0.4 * before.slide
@@ -135,4 +143,6 @@ def test_feet_that_sink_into_the_floor_while_other_legs_bend_still_touch_it() ->
     assert touching[142:].all()
     lifted = torch.zeros(150, 3)
     lifted[50:100, 1] = 0.3
-    assert not foot_contact(clip_of(lifted), soles_of(clip_of(lifted)), Y, FPS).touching[51:99].any()
+    assert (
+        not foot_contact(clip_of(lifted), soles_of(clip_of(lifted)), Y, FPS).touching[51:99].any()
+    )

@@ -1,4 +1,5 @@
-"""Animations of glTF skins: round trips, interpolation, containers, and broken files that end in one line."""
+"""Animations of glTF skins: round trips, interpolation, containers, and broken files that end in
+one line."""
 
 from __future__ import annotations
 
@@ -44,19 +45,24 @@ def clip(**changes: object) -> Clip:
 def two_joints(**changes: object) -> Glb:
     """A joint at (0, 1, 0) on one that turns about z from 0 to 90 degrees within a second."""
     own = type(OWN)(("root", "tip"), (-1, 0), np.array([[0.0, 0, 0], [0, 1, 0]]))
-    local = np.stack([[Rotation.from_euler("z", a, degrees=True).as_matrix(), np.eye(3)] for a in (0, 90)])
+    local = np.stack(
+        [[Rotation.from_euler("z", a, degrees=True).as_matrix(), np.eye(3)] for a in (0, 90)]
+    )
     return glb_of(own, Clip(local, np.zeros((2, 3)), fps=1.0, **changes))  # pyright: ignore[reportArgumentType]
 
 
 def same(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
     """World rotations of all joints, and the path of the pelvis from its start."""
-    ours, theirs = (world_rotations(x.poses.double().numpy(), OWN.parents) for x in (found, expected))
+    ours, theirs = (
+        world_rotations(x.poses.double().numpy(), OWN.parents) for x in (found, expected)
+    )
     np.testing.assert_allclose(ours, theirs, atol=atol)
     moved, wanted = (x.trans.numpy() - x.trans.numpy()[0] for x in (found, expected))
     np.testing.assert_allclose(moved, wanted, atol=atol)
 
 
-# --- round trips ------------------------------------------------------------------------------------------------------
+# --- round trips
+# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("interpolation", ["LINEAR", "STEP", "CUBICSPLINE"])
@@ -82,7 +88,9 @@ def test_a_mesh_bound_in_other_axes_and_units(tmp_path: Path) -> None:
     own = type(OWN)(OWN.names, OWN.parents, 100 * OWN.rest @ turn.T)
     above = np.eye(4)
     above[:3, :3] = 0.01 * turn.T
-    moved = Clip(turn @ as_local(MOTION, OWN) @ turn.T, 100 * pelvis_path(BODY, MOTION) @ turn.T, above=above)
+    moved = Clip(
+        turn @ as_local(MOTION, OWN) @ turn.T, 100 * pelvis_path(BODY, MOTION) @ turn.T, above=above
+    )
     same(retarget(read_gltf(glb_of(own, moved).write(tmp_path / "x.glb")), BODY), MOTION)
 
 
@@ -117,7 +125,8 @@ def test_a_file_without_a_skin_moves_its_animated_nodes(tmp_path: Path) -> None:
     same(retarget(source, BODY), MOTION)
 
 
-# --- VRM animations ---------------------------------------------------------------------------------------------------
+# --- VRM animations
+# ---------------------------------------------------------------------------------------------------
 
 BONES = skeleton(tuple(VRM))
 
@@ -129,13 +138,16 @@ def vrma(**changes: object) -> Glb:
 
 
 def test_a_vrm_animation_moves_the_bones_that_it_names(tmp_path: Path) -> None:
-    """All but jaw and eyes, which VRM does not animate; also with axes of its own at rest, and facing -z."""
+    """All but jaw and eyes, which VRM does not animate; also with axes of its own at rest, and
+    facing -z."""
     own = as_local(MOTION, BONES)
     own_poses = np.zeros((5, 55, 3))
     rows = [JOINT_NAMES.index(name) for name in BONES.names]
     own_poses[:, rows] = Rotation.from_matrix(own.reshape(-1, 3, 3)).as_rotvec().reshape(5, -1, 3)
     expected = world_rotations(own_poses, OWN.parents)
-    axes = Rotation.from_rotvec(np.random.default_rng(1).normal(size=(len(BONES.names), 3))).as_matrix()
+    axes = Rotation.from_rotvec(
+        np.random.default_rng(1).normal(size=(len(BONES.names), 3))
+    ).as_matrix()
     for changes in ({}, {"axes": axes}):
         source = read_vrm_animation(vrma(**changes).write(tmp_path / "x.vrma"))
         found = retarget(source, BODY)
@@ -151,7 +163,8 @@ def test_the_first_vrm_animation_counts(tmp_path: Path) -> None:
     glb.json["animations"].append({**still, "channels": glb.json["animations"][0]["channels"][:1]})
     path = glb.write(tmp_path / "x.vrma")
     np.testing.assert_array_equal(
-        read_vrm_animation(path).rotations, read_vrm_animation(vrma().write(tmp_path / "y.vrma")).rotations
+        read_vrm_animation(path).rotations,
+        read_vrm_animation(vrma().write(tmp_path / "y.vrma")).rotations,
     )
     assert np.ptp(read_vrm_animation(path, clip="second").positions[:, 0], axis=0).max() == 0
     with pytest.raises(DyngsError, match=r"has no animation 'x'; it has 'Walk', 'second'"):
@@ -162,14 +175,19 @@ def test_the_first_vrm_animation_counts(tmp_path: Path) -> None:
     ("spoil", "problem"),
     [
         (lambda g: g.json.pop("extensions"), "has no VRMC_vrm_animation"),
-        (lambda g: g.json["extensions"]["VRMC_vrm_animation"].pop("humanoid"), "humanoid: Field required"),
+        (
+            lambda g: g.json["extensions"]["VRMC_vrm_animation"].pop("humanoid"),
+            "humanoid: Field required",
+        ),
         (lambda g: _bones(g).update(hips={"node": 999}), "joint 999 is missing"),
         (lambda g: _bones(g).update(hips={"node": -1}), r"humanBones\.hips\.node"),
         (lambda g: _bones(g).clear(), "its humanoid has no bones"),
         (lambda g: g.json.pop("animations"), "no animation moves its joints"),
     ],
 )
-def test_vrm_animations_that_are_none(tmp_path: Path, spoil: Callable[[Glb], object], problem: str) -> None:
+def test_vrm_animations_that_are_none(
+    tmp_path: Path, spoil: Callable[[Glb], object], problem: str
+) -> None:
     glb = vrma()
     spoil(glb)
     with pytest.raises(DyngsError, match=problem) as caught:
@@ -182,11 +200,14 @@ def _bones(glb: Glb) -> dict:
     return glb.json["extensions"]["VRMC_vrm_animation"]["humanoid"]["humanBones"]
 
 
-# --- sampling ---------------------------------------------------------------------------------------------------------
+# --- sampling
+# ---------------------------------------------------------------------------------------------------------
 
 
 def angles_of(path: Path, fps: float) -> np.ndarray:
-    return Rotation.from_matrix(read_gltf(path, fps).rotations[:, 0]).as_euler("xyz", degrees=True)[:, 2]
+    return Rotation.from_matrix(read_gltf(path, fps).rotations[:, 0]).as_euler("xyz", degrees=True)[
+        :, 2
+    ]
 
 
 def test_between_keys(tmp_path: Path) -> None:
@@ -194,12 +215,15 @@ def test_between_keys(tmp_path: Path) -> None:
     path = tmp_path / "x.glb"
     two_joints(interpolation="LINEAR").write(path)
     np.testing.assert_allclose(angles_of(path, 4), [0, 22.5, 45, 67.5, 90], atol=1e-4)
-    np.testing.assert_allclose(read_gltf(path, 2).positions[1, 1], [-(0.5**0.5), 0.5**0.5, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        read_gltf(path, 2).positions[1, 1], [-(0.5**0.5), 0.5**0.5, 0], atol=1e-6
+    )
     two_joints(interpolation="STEP").write(path)
     np.testing.assert_allclose(angles_of(path, 4), [0, 0, 0, 0, 90], atol=1e-4)
     two_joints(interpolation="CUBICSPLINE").write(path)
     ease = 3 * 0.25**2 - 2 * 0.25**3
-    x, w = ease * np.sin(np.pi / 4), 1 - ease + ease * np.cos(np.pi / 4)
+    x = ease * np.sin(np.pi / 4)
+    w = 1 - ease + ease * np.cos(np.pi / 4)
     np.testing.assert_allclose(angles_of(path, 4)[1], np.degrees(2 * np.arctan2(x, w)), atol=1e-4)
 
 
@@ -214,11 +238,15 @@ def test_scale_lengthens_bones_but_does_not_turn_them(tmp_path: Path) -> None:
 def test_tangents_of_cubic_splines(tmp_path: Path) -> None:
     """A cube t^3 of the place is met exactly: its derivatives at the keys are 0 and 3."""
     glb = two_joints()
-    glb.json["animations"][0]["channels"] = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]
+    glb.json["animations"][0]["channels"] = [
+        {"sampler": 0, "target": {"node": 0, "path": "translation"}}
+    ]
     values = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 3, 0], [0, 1, 0], [0, 0, 0]])
     output = glb.add(values, "VEC3")
     times = glb.json["animations"][0]["samplers"][0]["input"]
-    glb.json["animations"][0]["samplers"] = [{"input": times, "output": output, "interpolation": "CUBICSPLINE"}]
+    glb.json["animations"][0]["samplers"] = [
+        {"input": times, "output": output, "interpolation": "CUBICSPLINE"}
+    ]
     found = read_gltf(glb.write(tmp_path / "x.glb"), 10).positions[:, 0, 1]
     np.testing.assert_allclose(found, np.linspace(0, 1, 11) ** 3, atol=1e-6)
 
@@ -234,10 +262,14 @@ def test_the_shorter_way_round(tmp_path: Path) -> None:
 def test_rotations_in_whole_numbers(tmp_path: Path) -> None:
     """16-bit fractions of 32767, with four bytes of something else between them."""
     glb = two_joints()
-    quats = np.round(Rotation.from_rotvec([[0, 0, 0], [0, 0, np.pi / 2]]).as_quat() * 32767).astype("<i2")
+    quats = np.round(Rotation.from_rotvec([[0, 0, 0], [0, 0, np.pi / 2]]).as_quat() * 32767).astype(
+        "<i2"
+    )
     start = len(glb.data)
     glb.data += b"".join(q.tobytes() + b"\xff" * 4 for q in quats)
-    glb.json["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": 24, "byteStride": 12})
+    glb.json["bufferViews"].append(
+        {"buffer": 0, "byteOffset": start, "byteLength": 24, "byteStride": 12}
+    )
     glb.json["accessors"].append(
         {
             "bufferView": len(glb.json["bufferViews"]) - 1,
@@ -271,7 +303,9 @@ def test_one_of_several_animations(tmp_path: Path) -> None:
     walk = glb.json["animations"][0]
     turns = glb.add(Rotation.from_rotvec([[0, 0, 0], [0, 0, np.radians(40)]]).as_quat(), "VEC4")
     sampler = {**walk["samplers"][0], "output": turns}
-    glb.json["animations"].append({"name": "Nod\n2", "samplers": [sampler], "channels": walk["channels"][:1]})
+    glb.json["animations"].append(
+        {"name": "Nod\n2", "samplers": [sampler], "channels": walk["channels"][:1]}
+    )
     path = glb.write(tmp_path / "x.glb")
     with pytest.raises(DyngsError, match=r"several animations; choose a clip of 'Walk', 'Nod.n2'"):
         read_gltf(path)
@@ -281,7 +315,8 @@ def test_one_of_several_animations(tmp_path: Path) -> None:
     assert Rotation.from_matrix(last).magnitude() == pytest.approx(np.radians(40), rel=1e-5)
 
 
-# --- broken files -----------------------------------------------------------------------------------------------------
+# --- broken files
+# -----------------------------------------------------------------------------------------------------
 
 
 def _sampler(glb: Glb, **changes: object) -> None:
@@ -294,32 +329,59 @@ def _node(glb: Glb, **changes: object) -> None:
 
 BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
     "no animation": (lambda g: g.json.pop("animations"), "no animation moves its joints"),
-    "no skin, no animation": (lambda g: (g.json.pop("skins"), g.json.pop("animations")), "no animation moves"),
+    "no skin, no animation": (
+        lambda g: (g.json.pop("skins"), g.json.pop("animations")),
+        "no animation moves",
+    ),
     "old": (lambda g: g.json["asset"].update(version="1.0"), "asset.version"),
     "no asset": (lambda g: g.json.pop("asset"), "asset: Field required"),
     "text": (lambda g: _node(g, translation="here"), "nodes.0.translation: "),
     "short": (lambda g: _node(g, rotation=[0, 0, 1]), "nodes.0.rotation: "),
     "huge": (lambda g: _node(g, scale=[1, 1, 1e30]), "nodes.0.scale.2: "),
-    "beyond bounds": (lambda g: [n.update(scale=[1e9] * 3, translation=[1e9] * 3) for n in g.json["nodes"]], "bounds"),
+    "beyond bounds": (
+        lambda g: [n.update(scale=[1e9] * 3, translation=[1e9] * 3) for n in g.json["nodes"]],
+        "bounds",
+    ),
     "NaN": (lambda g: _node(g, scale=[1, 1, float("nan")]), "nodes.0.scale.2: "),
-    "two parents": (lambda g: g.json["nodes"].append({"children": [1]}), "node 1 is missing or has two parents"),
+    "two parents": (
+        lambda g: g.json["nodes"].append({"children": [1]}),
+        "node 1 is missing or has two parents",
+    ),
     "no child": (lambda g: _node(g, children=[7]), "node 7 is missing"),
     "cycle": (lambda g: g.json["nodes"][1].update(children=[0]), "its own ancestor"),
     "no joint": (lambda g: g.json["skins"][0].update(joints=[0, 1, 9]), "joint 9 is missing"),
     "no joints": (lambda g: g.json["skins"][0].update(joints=[]), "skins.0.joints"),
-    "few matrices": (lambda g: g.json["accessors"][0].update(count=1), "1 inverse bind matrices for 2 joints"),
+    "few matrices": (
+        lambda g: g.json["accessors"][0].update(count=1),
+        "1 inverse bind matrices for 2 joints",
+    ),
     "flat": (lambda g: setattr(g, "data", b"\0" * 64 + g.data[64:]), "flat or mirrored"),
     "mirror": (lambda g: _node(g, scale=[-1, 1, 1]), "node 0 is mirrored"),
-    "zero": (lambda g: g.json["nodes"].append({"rotation": [0] * 4, "children": [0]}), "quaternion of zeros"),
+    "zero": (
+        lambda g: g.json["nodes"].append({"rotation": [0] * 4, "children": [0]}),
+        "quaternion of zeros",
+    ),
     "no accessor": (lambda g: _sampler(g, output=99), "accessor 99 is missing"),
     "kind": (lambda g: _sampler(g, output=1), "accessor 1 must hold VEC4, not 'SCALAR'"),
-    "component": (lambda g: g.json["accessors"][1].update(componentType=7), "accessor 1 must hold SCALAR"),
+    "component": (
+        lambda g: g.json["accessors"][1].update(componentType=7),
+        "accessor 1 must hold SCALAR",
+    ),
     "sparse": (lambda g: g.json["accessors"][1].update(sparse={}), "accessor 1 is sparse"),
-    "no data": (lambda g: g.json["accessors"][1].pop("bufferView"), "accessor 1 is sparse or has no data"),
+    "no data": (
+        lambda g: g.json["accessors"][1].pop("bufferView"),
+        "accessor 1 is sparse or has no data",
+    ),
     "no view": (lambda g: g.json["accessors"][1].update(bufferView=77), "missing buffer view"),
     "no buffer": (lambda g: g.json["bufferViews"][1].update(buffer=3), "buffer 3 is missing"),
-    "outside": (lambda g: g.json["bufferViews"][1].update(byteOffset=10**15), "lies outside its buffer"),
-    "past the end": (lambda g: g.json["accessors"][1].update(count=10**15), "lies outside its buffer"),
+    "outside": (
+        lambda g: g.json["bufferViews"][1].update(byteOffset=10**15),
+        "lies outside its buffer",
+    ),
+    "past the end": (
+        lambda g: g.json["accessors"][1].update(count=10**15),
+        "lies outside its buffer",
+    ),
     "offset": (lambda g: g.json["accessors"][1].update(byteOffset=4), "lies outside its buffer"),
     "negative": (lambda g: g.json["accessors"][1].update(byteOffset=-4), "accessors.1.byteOffset"),
     "meshopt": (
@@ -328,12 +390,24 @@ BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
     ),
     "interpolation": (lambda g: _sampler(g, interpolation="NONE"), "interpolation: "),
     "too few": (lambda g: _sampler(g, interpolation="CUBICSPLINE"), "has 2 times but 2 values"),
-    "no sampler": (lambda g: g.json["animations"][0]["channels"][0].update(sampler=9), "lacks a sampler"),
-    "falling": (lambda g: _sampler(g, input=g.add(np.array([1.0, 0.0]), "SCALAR")), "do not ascend"),
+    "no sampler": (
+        lambda g: g.json["animations"][0]["channels"][0].update(sampler=9),
+        "lacks a sampler",
+    ),
+    "falling": (
+        lambda g: _sampler(g, input=g.add(np.array([1.0, 0.0]), "SCALAR")),
+        "do not ascend",
+    ),
     "endless": (lambda g: _sampler(g, input=g.add(np.array([0, 1e8]), "SCALAR")), "too many"),
     "long": (lambda g: _sampler(g, input=g.add(np.array([0, 90000.0]), "SCALAR")), "too many"),
-    "infinite": (lambda g: _sampler(g, input=g.add(np.array([0, np.inf]), "SCALAR")), "NaN or huge"),
-    "matrix": (lambda g: _node(g, matrix=np.eye(4).ravel().tolist()), "node 0 is animated but has a matrix"),
+    "infinite": (
+        lambda g: _sampler(g, input=g.add(np.array([0, np.inf]), "SCALAR")),
+        "NaN or huge",
+    ),
+    "matrix": (
+        lambda g: _node(g, matrix=np.eye(4).ravel().tolist()),
+        "node 0 is animated but has a matrix",
+    ),
     "weights only": (
         lambda g: [c["target"].update(path="weights") for c in g.json["animations"][0]["channels"]],
         "moves no joint",
@@ -354,7 +428,17 @@ def test_broken_files_say_what_is_wrong(tmp_path: Path, case: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "uri", ["../secret.bin", "/etc/hostname", "http://host/x.bin", "file:x", "a\\b", "%2e%2e/secret.bin", "", "a\0b"]
+    "uri",
+    [
+        "../secret.bin",
+        "/etc/hostname",
+        "http://host/x.bin",
+        "file:x",
+        "a\\b",
+        "%2e%2e/secret.bin",
+        "",
+        "a\0b",
+    ],
 )
 def test_buffers_elsewhere_are_not_touched(tmp_path: Path, uri: str) -> None:
     glb = two_joints()
@@ -367,15 +451,21 @@ def test_buffers_elsewhere_are_not_touched(tmp_path: Path, uri: str) -> None:
         read_gltf(folder / "x.gltf")
 
 
-@pytest.mark.parametrize(("uri", "problem"), [("none.bin", "cannot be read"), ("data:;base64,?", "not base64")])
+@pytest.mark.parametrize(
+    ("uri", "problem"), [("none.bin", "cannot be read"), ("data:;base64,?", "not base64")]
+)
 def test_buffers_that_cannot_be_read(tmp_path: Path, uri: str, problem: str) -> None:
     glb = two_joints()
-    (tmp_path / "x.gltf").write_text(json.dumps({**glb.json, "buffers": [{"byteLength": 1, "uri": uri}]}))
+    (tmp_path / "x.gltf").write_text(
+        json.dumps({**glb.json, "buffers": [{"byteLength": 1, "uri": uri}]})
+    )
     with pytest.raises(DyngsError, match=problem):
         read_gltf(tmp_path / "x.gltf")
 
 
-@pytest.mark.parametrize("content", [b"", b"glTF", b"not a model", b"glTF\2\0\0\0\x14\0\0\0", b"[" * 100000, b"{}"])
+@pytest.mark.parametrize(
+    "content", [b"", b"glTF", b"not a model", b"glTF\2\0\0\0\x14\0\0\0", b"[" * 100000, b"{}"]
+)
 def test_files_of_another_kind(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "x.glb").write_bytes(content)
     with pytest.raises(DyngsError, match=r"x\.glb: ") as caught:
@@ -385,14 +475,18 @@ def test_files_of_another_kind(tmp_path: Path, content: bytes) -> None:
 
 def _shared_sampler(glb: Glb) -> None:
     """Ten thousand channels of one accessor with a thousand keys."""
-    times, values = glb.add(np.zeros(1000), "SCALAR"), glb.add(np.ones((1000, 4)), "VEC4")
+    times = glb.add(np.zeros(1000), "SCALAR")
+    values = glb.add(np.ones((1000, 4)), "VEC4")
     animation = glb.json["animations"][0]
     animation["samplers"][0].update(input=times, output=values)
     animation["channels"] = [{"sampler": 0, "target": {"node": 0, "path": "rotation"}}] * 10_000
 
 
 HOSTILE: dict[str, tuple[Callable[[Glb], object], str]] = {
-    "keys 2.8 hours apart": (lambda g: _sampler(g, input=g.add(np.array([0, 10_080.0]), "SCALAR")), "too many"),
+    "keys 2.8 hours apart": (
+        lambda g: _sampler(g, input=g.add(np.array([0, 10_080.0]), "SCALAR")),
+        "too many",
+    ),
     "nodes": (lambda g: g.json.update(nodes=[{}] * 70_000), "nodes: "),
     "joints": (lambda g: g.json["skins"][0].update(joints=[0] * 5000), "skins.0.joints: "),
     "one sampler": (_shared_sampler, "asks for .* numbers"),

@@ -37,10 +37,12 @@ def matrices(motion: Motion) -> np.ndarray:
     return Rotation.from_rotvec(motion.poses.double().numpy().reshape(-1, 3)).as_matrix()
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files
+# ------------------------------------------------------------------------------------------------------------
 
 
-# --- joints and times -------------------------------------------------------------------------------------------------
+# --- joints and times
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [24, 52, 55])
@@ -60,7 +62,9 @@ def test_every_nth_frame(frames: int, fps: float, step: int) -> None:
     motion = replace(random_motion(frames), fps=fps)
     down = motion.resampled(fps / step)
     torch.testing.assert_close(down.trans, motion.trans[::step])
-    np.testing.assert_allclose(matrices(down), matrices(replace(motion, poses=motion.poses[::step])), atol=1e-6)
+    np.testing.assert_allclose(
+        matrices(down), matrices(replace(motion, poses=motion.poses[::step])), atol=1e-6
+    )
     up = motion.resampled(fps * step)
     assert len(up) == (frames - 1) * step + 1
     back = up.resampled(fps)
@@ -69,13 +73,18 @@ def test_every_nth_frame(frames: int, fps: float, step: int) -> None:
 
 
 def test_between_frames() -> None:
-    """A turn by 3 rad and back over the shorter way, at constant speed; positions and scales on a line."""
+    """A turn by 3 rad and back over the shorter way, at constant speed; positions and scales on a
+    line."""
     poses = torch.zeros(2, 55, 3)
     poses[:, 3, 2] = torch.tensor([3.0, -3.0])
-    motion = Motion(poses, torch.tensor([[0.0, 0, 0], [4, 0, 0]]), torch.zeros(10), 1.0, torch.tensor([1.0, 2]))
+    motion = Motion(
+        poses, torch.tensor([[0.0, 0, 0], [4, 0, 0]]), torch.zeros(10), 1.0, torch.tensor([1.0, 2])
+    )
     found = motion.resampled(4.0)
     gap = 2 * np.pi - 6
-    angles = Rotation.from_rotvec(found.poses[:, 3].double().numpy()).as_euler("xyz")[:, 2] % (2 * np.pi)
+    angles = Rotation.from_rotvec(found.poses[:, 3].double().numpy()).as_euler("xyz")[:, 2] % (
+        2 * np.pi
+    )
     np.testing.assert_allclose(angles, 3 + gap * np.linspace(0, 1, 5), atol=1e-6)
     assert found.trans[:, 0].tolist() == [0, 1, 2, 3, 4]
     assert found.scale.tolist() == [1, 1.25, 1.5, 1.75, 2]
@@ -84,7 +93,9 @@ def test_between_frames() -> None:
 
 
 def test_times_that_float32_rounds_down_keep_their_last_frame() -> None:
-    assert [len(sample_times(float(np.float32(k / 30)), 1.0, 30.0)) for k in range(500)] == list(range(1, 501))
+    assert [len(sample_times(float(np.float32(k / 30)), 1.0, 30.0)) for k in range(500)] == list(
+        range(1, 501)
+    )
 
 
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf"), 1e9])
@@ -93,14 +104,21 @@ def test_rates_that_make_no_sense(fps: float) -> None:
         random_motion().resampled(fps)
 
 
-# --- limits -----------------------------------------------------------------------------------------------------------
+# --- limits
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of few joints too, as the body has 55."""
     require_frame_count(Path("x.glb"), MAX_JOINT_POSES // 100, 100)
-    for frames, joints in ((MAX_JOINT_POSES // 100 + 1, 100), (MAX_JOINT_POSES // 55 + 1, 1), (float("inf"), 1)):
-        with pytest.raises(DyngsError, match=r"x\.glb: .* too many; at most 5,000,000 .* or set .* DYNGS_LIMITS="):
+    for frames, joints in (
+        (MAX_JOINT_POSES // 100 + 1, 100),
+        (MAX_JOINT_POSES // 55 + 1, 1),
+        (float("inf"), 1),
+    ):
+        with pytest.raises(
+            DyngsError, match=r"x\.glb: .* too many; at most 5,000,000 .* or set .* DYNGS_LIMITS="
+        ):
             require_frame_count(Path("x.glb"), frames, joints)
     monkeypatch.setenv("DYNGS_LIMITS", "2")
     require_frame_count(Path("x.glb"), 2 * MAX_JOINT_POSES // 100, 100)
@@ -108,20 +126,25 @@ def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatc
 
 def test_resampling_has_the_same_limit() -> None:
     motion = replace(random_motion(), fps=1e-3)
-    with pytest.raises(DyngsError, match=r"more than 90,909 frames; ask for 30 or the like, or set DYNGS_LIMITS=N"):
+    with pytest.raises(
+        DyngsError, match=r"more than 90,909 frames; ask for 30 or the like, or set DYNGS_LIMITS=N"
+    ):
         motion.resampled(30.0)
 
 
 @pytest.mark.parametrize("fps", [0.0, 1e-310, 1e-9, 1e6, float("inf"), float("nan")])
 def test_rates_of_no_motion(fps: float) -> None:
-    with pytest.raises(DyngsError, match=r"x\.bvh: .* frames per second is not the rate of a motion"):
+    with pytest.raises(
+        DyngsError, match=r"x\.bvh: .* frames per second is not the rate of a motion"
+    ):
         require_frame_rate(Path("x.bvh"), fps)
 
 
 def test_long_motions_are_worked_on_in_parts() -> None:
     """As if they were not."""
     motion = random_motion(2500)
-    whole, parts = motion.resampled(24.0), frame_chunks(2500)
+    whole = motion.resampled(24.0)
+    parts = frame_chunks(2500)
     assert [(part.start, part.stop) for part in parts] == [(0, 1024), (1024, 2048), (2048, 2500)]
     expected = motion._interpolated(sample_times(2499, 30.0, 24.0), 24.0)
     for name in ("poses", "trans", "scale"):
@@ -132,7 +155,12 @@ def three_frames() -> MotionClip:
     poses = torch.zeros(3, 2, 3)
     poses[1, 1, 2], poses[2, 1, 2] = 0.5, 3.0
     trans = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]])
-    return MotionClip(torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64), poses, trans, torch.tensor([1.0, 1.0, 2.0]))
+    return MotionClip(
+        torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64),
+        poses,
+        trans,
+        torch.tensor([1.0, 1.0, 2.0]),
+    )
 
 
 def test_a_clip_is_exact_at_its_frames_and_turns_evenly_between() -> None:
@@ -173,7 +201,9 @@ def view(frame: int, time: float | None) -> View:
 
 def test_a_captured_motion_has_the_frames_that_views_show_in_order_of_time() -> None:
     given = bodies([3, 4, 7, 9])
-    filmed = captured_motion(WHERE, given, [view(9, 1.0), view(3, 0.0), view(7, 0.5), view(3, 0.0)], torch.zeros(55, 3))
+    filmed = captured_motion(
+        WHERE, given, [view(9, 1.0), view(3, 0.0), view(7, 0.5), view(3, 0.0)], torch.zeros(55, 3)
+    )
     assert filmed.frames == (3, 7, 9)
     assert filmed.clip.times.tolist() == [0.0, 0.5, 1.0]
     np.testing.assert_allclose(filmed.clip.trans.numpy(), given.trans[[0, 2, 3]])
@@ -196,7 +226,9 @@ def test_who_never_moves_has_one_pose_for_all_frames() -> None:
 
 
 def test_a_captured_motion_without_times_is_spread_by_frame_number() -> None:
-    filmed = captured_motion(WHERE, bodies([0, 1, 2]), [view(2, None), view(1, None)], torch.zeros(55, 3))
+    filmed = captured_motion(
+        WHERE, bodies([0, 1, 2]), [view(2, None), view(1, None)], torch.zeros(55, 3)
+    )
     assert filmed.frames == (1, 2)
     assert filmed.clip.times.tolist() == [0.5, 1.0]
 
@@ -214,6 +246,7 @@ def test_poses_of_smpl_move_a_body_of_55_joints() -> None:
 
 
 def test_clips_are_told_apart() -> None:
-    one, other = bodies([0, 1]), bodies([0, 2])
+    one = bodies([0, 1])
+    other = bodies([0, 2])
     assert same_bodies(one, bodies([0, 1]))
     assert not same_bodies(one, other)

@@ -17,18 +17,27 @@ from motion_files import (
 from torch import Tensor
 
 from dyngs.human.motion.motion import MotionClip, motion_clip
-from dyngs.human.motion.placement import place_like, place_on_floor, rest_clip, up_direction, upright
+from dyngs.human.motion.placement import (
+    place_like,
+    place_on_floor,
+    rest_clip,
+    up_direction,
+    upright,
+)
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 
 
 def joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
-    moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints)
+    moved = apply_transforms(
+        joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints
+    )
     return clip.scale[:, None, None] * moved + clip.trans[:, None]
 
 
 @pytest.mark.parametrize("up", [1, 2])
 def test_a_motion_is_put_where_the_person_was(up: int) -> None:
-    """As large, on the same floor, over the same place, the same way up; the motion itself is the same."""
+    """As large, on the same floor, over the same place, the same way up; the motion itself is the
+    same."""
     body = tiny_body()
     clip = motion_clip(random_motion(5, angle=0.3, seed=4))
     turn = torch.eye(3) if up == 1 else axis_angle_to_matrix(torch.tensor([math.pi / 2, 0.0, 0.0]))
@@ -37,27 +46,39 @@ def test_a_motion_is_put_where_the_person_was(up: int) -> None:
     from scipy.spatial.transform import Rotation
 
     turned = torch.from_numpy(Rotation.from_matrix(roots.numpy()).as_rotvec()).float()
-    like = MotionClip(like.times, torch.cat([turned[:, None], like.poses[:, 1:]], 1), like.trans, torch.full((4,), 2.0))
+    like = MotionClip(
+        like.times,
+        torch.cat([turned[:, None], like.poses[:, 1:]], 1),
+        like.trans,
+        torch.full((4,), 2.0),
+    )
     found = place_like(clip, like, body.joints, body.parents)
     ours, theirs = (joint_places(x, body.joints, body.parents) for x in (found, like))
     assert float(ours[..., up].min()) == pytest.approx(float(theirs[..., up].min()), abs=1e-4)
     for axis in {0, 1, 2} - {up}:
-        assert float(ours[:, 0, axis].mean()) == pytest.approx(float(theirs[:, 0, axis].mean()), abs=1e-4)
+        assert float(ours[:, 0, axis].mean()) == pytest.approx(
+            float(theirs[:, 0, axis].mean()), abs=1e-4
+        )
     alone = joint_places(clip, body.joints, body.parents)
     wanted = 2 * (alone - alone[:1, :1]) @ turn.T
     torch.testing.assert_close(ours - ours[:1, :1], wanted, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("up", [0, 1, 2])
-def test_what_is_placed_like_the_upright_pose_is_placed_like_the_clip_it_comes_from(up: int) -> None:
+def test_what_is_placed_like_the_upright_pose_is_placed_like_the_clip_it_comes_from(
+    up: int,
+) -> None:
     body = tiny_body()
     generator = torch.Generator().manual_seed(up)
     axis = torch.nn.functional.one_hot(torch.tensor((up + 1) % 3), 3).float()
     roots = 2.0 * axis + 0.05 * torch.randn(4, 3, generator=generator)
     poses = torch.cat([roots[:, None], 0.3 * torch.randn(4, 54, 3, generator=generator)], dim=1)
-    trans, times = torch.randn(4, 3, generator=generator), torch.linspace(0, 1, 4, dtype=torch.float64)
+    trans = torch.randn(4, 3, generator=generator)
+    times = torch.linspace(0, 1, 4, dtype=torch.float64)
     like = MotionClip(times, poses, trans, torch.tensor([1.9, 2.0, 2.0, 2.1]))
-    clip = MotionClip(times, 0.2 * torch.randn(4, 55, 3, generator=generator), trans.flip(0), torch.ones(4))
+    clip = MotionClip(
+        times, 0.2 * torch.randn(4, 55, 3, generator=generator), trans.flip(0), torch.ones(4)
+    )
     rest = rest_clip(like, body.joints, body.parents)
     assert len(rest) == 1
     assert not rest.poses[:, 1:].any()
@@ -68,14 +89,19 @@ def test_what_is_placed_like_the_upright_pose_is_placed_like_the_clip_it_comes_f
 
 def test_upright_turns_a_world_whose_z_is_up() -> None:
     """All joints as the rotation of the world moves them."""
-    joints, parents = torch.randn(3, 3, generator=torch.Generator().manual_seed(0)), (-1, 0, 1)
+    joints = torch.randn(3, 3, generator=torch.Generator().manual_seed(0))
+    parents = (-1, 0, 1)
     y_from_z = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     poses = 0.1 * torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(1))
     poses[:, 0] += torch.tensor([torch.pi / 2, 0, 0])
-    clip = MotionClip(torch.linspace(0, 1, 4).double(), poses, torch.rand(4, 3), torch.full((4,), 0.5))
+    clip = MotionClip(
+        torch.linspace(0, 1, 4).double(), poses, torch.rand(4, 3), torch.full((4,), 0.5)
+    )
 
     def positions(x: MotionClip) -> torch.Tensor:
-        moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(x.poses)), joints)
+        moved = apply_transforms(
+            joint_transforms(joints, parents, axis_angle_to_matrix(x.poses)), joints
+        )
         return x.scale[:, None, None] * moved + x.trans[:, None]
 
     turned = upright(clip, clip, joints)

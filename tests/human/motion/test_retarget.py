@@ -47,7 +47,8 @@ RightToeBase LowerBack Spine Spine1 Neck Neck1 Head LeftShoulder LeftArm LeftFor
 LeftHandIndex1 LThumb RightShoulder RightArm RightForeArm RightHand RightFingerBase RightHandIndex1 RThumb"""
 DAZ_NAMES = """hip abdomen chest neck head leftEye rightEye rCollar rShldr rForeArm rHand rThumb1 rThumb2 rIndex1
 rIndex2 lCollar lShldr lForeArm lHand lThumb1 rButtock rThigh rShin rFoot lButtock lThigh lShin lFoot"""
-CMU, DAZ = CMU_NAMES.split(), DAZ_NAMES.split()
+CMU = CMU_NAMES.split()
+DAZ = DAZ_NAMES.split()
 
 
 def names_of(rig: str) -> dict[str, str]:
@@ -88,10 +89,26 @@ def test_names_of_cmu_files() -> None:
 
 
 def test_names_of_mixamo_files() -> None:
-    names = [f"mixamorig_{x}" for x in ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head", "HeadTop_End")]
-    sided = ("Shoulder", "Arm", "ForeArm", "Hand", "HandThumb1", "HandIndex1", "UpLeg", "Leg", "Foot", "ToeBase")
+    names = [
+        f"mixamorig_{x}"
+        for x in ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head", "HeadTop_End")
+    ]
+    sided = (
+        "Shoulder",
+        "Arm",
+        "ForeArm",
+        "Hand",
+        "HandThumb1",
+        "HandIndex1",
+        "UpLeg",
+        "Leg",
+        "Foot",
+        "ToeBase",
+    )
     names += [f"mixamorig_{side}{x}" for side in ("Left", "Right") for x in sided]
-    found = {ours: names[i].removeprefix("mixamorig_") for ours, i in match_joints(FILE, names).items()}
+    found = {
+        ours: names[i].removeprefix("mixamorig_") for ours, i in match_joints(FILE, names).items()
+    }
     assert found["spine1"] == "Spine"
     assert found["spine3"] == "Spine2"
     assert found["right_elbow"] == "RightForeArm"
@@ -110,8 +127,23 @@ def test_names_of_daz_files() -> None:
 
 def test_names_of_biped_files() -> None:
     words = ("Pelvis", "Spine", "Spine1", "Neck", "Head")
-    sided = ("Clavicle", "UpperArm", "Forearm", "Hand", "Finger1", "Finger11", "Finger0", "Thigh", "Calf", "Foot")
-    names = ["Bip01", *(f"Bip01 {x}" for x in words), *(f"Bip01 {side} {x}" for side in "LR" for x in sided)]
+    sided = (
+        "Clavicle",
+        "UpperArm",
+        "Forearm",
+        "Hand",
+        "Finger1",
+        "Finger11",
+        "Finger0",
+        "Thigh",
+        "Calf",
+        "Foot",
+    )
+    names = [
+        "Bip01",
+        *(f"Bip01 {x}" for x in words),
+        *(f"Bip01 {side} {x}" for side in "LR" for x in sided),
+    ]
     found = {ours: names[i] for ours, i in match_joints(FILE, names).items()}
     assert found["left_index1"] == "Bip01 L Finger1"
     assert found["left_index2"] == "Bip01 L Finger11"
@@ -121,12 +153,16 @@ def test_names_of_biped_files() -> None:
 
 def test_what_is_missing_is_named() -> None:
     names = [name for name in CMU if name not in ("LeftForeArm", "RightLeg")]
-    with pytest.raises(DyngsError, match=r"walk\.bvh: unknown joint names; .* lacks rightleg, leftforearm; ") as caught:
+    with pytest.raises(
+        DyngsError, match=r"walk\.bvh: unknown joint names; .* lacks rightleg, leftforearm; "
+    ) as caught:
         match_joints(FILE, names)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("names", [[], [""], ["bone_0", "bone_1"], ["hips"] * 5000 + [f"{i}hips" for i in range(5000)]])
+@pytest.mark.parametrize(
+    "names", [[], [""], ["bone_0", "bone_1"], ["hips"] * 5000 + [f"{i}hips" for i in range(5000)]]
+)
 def test_strangers_are_turned_away(names: list[str]) -> None:
     with pytest.raises(DyngsError, match="unknown joint names"):
         match_joints(FILE, names)
@@ -148,7 +184,9 @@ def driven(own: Skeleton, poses: np.ndarray, root: np.ndarray) -> SkeletonMotion
     for i, parent in enumerate(own.parents):
         bone = own.rest[i] - own.rest[parent]
         positions[:, i] = root if parent < 0 else positions[:, parent] + rotations[:, parent] @ bone
-    return SkeletonMotion(Path("x.bvh"), own.names, own.rest, rotations, positions, 30.0, world_is_y_up=False)
+    return SkeletonMotion(
+        Path("x.bvh"), own.names, own.rest, rotations, positions, 30.0, world_is_y_up=False
+    )
 
 
 def at_rest(own: Skeleton, frames: int = 1) -> SkeletonMotion:
@@ -162,12 +200,15 @@ def of_motion(motion: Motion, own: Skeleton) -> SkeletonMotion:
 
 def close(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
     """The same rotations and the same positions."""
-    ours, theirs = (world_rotations(x.poses.double().numpy(), skeleton().parents) for x in (found, expected))
+    ours, theirs = (
+        world_rotations(x.poses.double().numpy(), skeleton().parents) for x in (found, expected)
+    )
     np.testing.assert_allclose(ours, theirs, atol=atol)
     np.testing.assert_allclose(found.trans.numpy(), expected.trans.numpy(), atol=atol)
 
 
-# --- known answers ----------------------------------------------------------------------------------------------------
+# --- known answers
+# ----------------------------------------------------------------------------------------------------
 
 
 def test_a_t_pose_is_the_zero_pose_on_the_floor() -> None:
@@ -192,23 +233,36 @@ def test_a_bent_elbow_is_a_bent_elbow() -> None:
 
 
 def test_arms_that_hang_at_rest_are_lowered() -> None:
-    """An A-pose at rest comes out as arms 45 degrees down: every bone along the other's, the rest nearly as it was."""
+    """An A-pose at rest comes out as arms 45 degrees down: every bone along the other's, the rest
+    nearly as it was."""
     own = skeleton()
     lowered = own.rest.copy()
     for side, angle in (("left", -45), ("right", 45)):
         shoulder = JOINT_NAMES.index(f"{side}_shoulder")
-        arm = [i for i, name in enumerate(JOINT_NAMES) if name.startswith(side) and abs(own.rest[i, 0]) > 0.2]
+        arm = [
+            i
+            for i, name in enumerate(JOINT_NAMES)
+            if name.startswith(side) and abs(own.rest[i, 0]) > 0.2
+        ]
         turn = Rotation.from_euler("z", angle, degrees=True)
         lowered[arm] = own.rest[shoulder] + turn.apply(own.rest[arm] - own.rest[shoulder])
     motion = retarget(at_rest(replace(own, rest=lowered)), tiny_body())
     expected = np.zeros((55, 3))
     expected[JOINT_NAMES.index("left_shoulder")] = (0, 0, -np.pi / 4)
     expected[JOINT_NAMES.index("right_shoulder")] = (0, 0, np.pi / 4)
-    np.testing.assert_allclose(motion.poses[0].numpy(), expected, atol=0.1)  # bones are not straight: some twist
+    # bones are not straight: some twist
+    np.testing.assert_allclose(motion.poses[0].numpy(), expected, atol=0.1)
     turned = world_rotations(motion.poses.double().numpy(), own.parents)[0]
-    for start, end in (("left_shoulder", "left_elbow"), ("right_elbow", "right_wrist"), ("left_index1", "left_index2")):
-        i, j = JOINT_NAMES.index(start), JOINT_NAMES.index(end)
-        np.testing.assert_allclose(turned[i] @ (own.rest[j] - own.rest[i]), lowered[j] - lowered[i], atol=1e-6)
+    for start, end in (
+        ("left_shoulder", "left_elbow"),
+        ("right_elbow", "right_wrist"),
+        ("left_index1", "left_index2"),
+    ):
+        i = JOINT_NAMES.index(start)
+        j = JOINT_NAMES.index(end)
+        np.testing.assert_allclose(
+            turned[i] @ (own.rest[j] - own.rest[i]), lowered[j] - lowered[i], atol=1e-6
+        )
 
 
 def test_hands_without_fingers_go_with_their_arms_and_flat_feet_stay_flat() -> None:
@@ -227,22 +281,29 @@ def test_hands_without_fingers_go_with_their_arms_and_flat_feet_stay_flat() -> N
 
 
 def test_the_path_shrinks_with_the_legs() -> None:
-    """A giant of twice our size who goes 1 m lets us go half a metre, and a jump of 1 m lifts us by half a metre."""
+    """A giant of twice our size who goes 1 m lets us go half a metre, and a jump of 1 m lifts us by
+    half a metre."""
     own = skeleton()
     giant = replace(own, rest=2 * own.rest)
     root = giant.rest[0] + np.array([[0, 0, 0], [0, 1, 1.0]])
     motion = retarget(driven(giant, np.zeros((2, 55, 3)), root), tiny_body())
-    np.testing.assert_allclose((motion.trans[1] - motion.trans[0]).numpy(), (0, 0.5, 0.5), atol=1e-6)
+    np.testing.assert_allclose(
+        (motion.trans[1] - motion.trans[0]).numpy(), (0, 0.5, 0.5), atol=1e-6
+    )
 
 
-# --- what must not matter ---------------------------------------------------------------------------------------------
+# --- what must not matter
+# ---------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 99), st.sampled_from(TURNS), st.floats(1e-3, 1e3))
-def test_rotations_are_kept_whatever_the_axes_and_the_unit(seed: int, turn: np.ndarray, unit: float) -> None:
+def test_rotations_are_kept_whatever_the_axes_and_the_unit(
+    seed: int, turn: np.ndarray, unit: float
+) -> None:
     """On a skeleton of our proportions; its world and its rest pose have the same axes."""
-    body, original = tiny_body(), random_motion(seed=seed)
+    body = tiny_body()
+    original = random_motion(seed=seed)
     source = of_motion(original, skeleton())
     found = retarget(
         replace(
@@ -258,9 +319,12 @@ def test_rotations_are_kept_whatever_the_axes_and_the_unit(seed: int, turn: np.n
 
 @pytest.mark.parametrize("turn", TURNS[::5])
 def test_in_a_world_that_is_y_up_the_axes_of_the_rest_pose_do_not_matter(turn: np.ndarray) -> None:
-    original, body = random_motion(), tiny_body()
+    original = random_motion()
+    body = tiny_body()
     source = of_motion(original, skeleton())
-    source = replace(source, rest=source.rest @ turn.T, rotations=source.rotations @ turn.T, world_is_y_up=True)
+    source = replace(
+        source, rest=source.rest @ turn.T, rotations=source.rotations @ turn.T, world_is_y_up=True
+    )
     close(retarget(source, body), place_on_floor(original, body))
 
 
@@ -268,7 +332,9 @@ def test_a_rest_pose_that_faces_anywhere_faces_forward() -> None:
     """Also between axes, beyond the 15 degrees within which they attract."""
     yaw = Rotation.from_euler("y", 30, degrees=True).as_matrix()
     own = skeleton()
-    assert abs(retarget(at_rest(replace(own, rest=own.rest @ yaw.T)), tiny_body()).poses).max() < 1e-6
+    assert (
+        abs(retarget(at_rest(replace(own, rest=own.rest @ yaw.T)), tiny_body()).poses).max() < 1e-6
+    )
 
 
 def test_a_crooked_rest_pose_does_not_turn_the_world() -> None:
@@ -282,10 +348,14 @@ def test_a_crooked_rest_pose_does_not_turn_the_world() -> None:
     assert motion.poses[:, JOINT_NAMES.index("left_shoulder")].abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("missing", [("spine2",), ("left_collar", "spine1", "head"), JOINT_NAMES[22:]])
+@pytest.mark.parametrize(
+    "missing", [("spine2",), ("left_collar", "spine1", "head"), JOINT_NAMES[22:]]
+)
 def test_joints_that_the_other_lacks_follow_their_parents(missing: tuple[str, ...]) -> None:
     own = skeleton([name for name in JOINT_NAMES if name not in missing])
-    poses = random_motion(2).poses.double().numpy()[:, [JOINT_NAMES.index(name) for name in own.names]]
+    poses = (
+        random_motion(2).poses.double().numpy()[:, [JOINT_NAMES.index(name) for name in own.names]]
+    )
     source = driven(own, poses, np.zeros((2, 3)))
     motion = retarget(source, tiny_body())
     found = world_rotations(motion.poses.double().numpy(), skeleton().parents)
@@ -293,13 +363,17 @@ def test_joints_that_the_other_lacks_follow_their_parents(missing: tuple[str, ..
         if name in missing:
             assert motion.poses[:, i].abs().max() < 1e-6
         else:
-            np.testing.assert_allclose(found[:, i], source.rotations[:, own.names.index(name)], atol=1e-5)
+            np.testing.assert_allclose(
+                found[:, i], source.rotations[:, own.names.index(name)], atol=1e-5
+            )
 
 
 def test_joints_in_between_do_not_matter() -> None:
     """A bone of two parts, such as a twist bone."""
     source = of_motion(random_motion(), skeleton())
-    halfway = source.rest[[JOINT_NAMES.index("left_shoulder"), JOINT_NAMES.index("left_elbow")]].mean(0)
+    halfway = source.rest[
+        [JOINT_NAMES.index("left_shoulder"), JOINT_NAMES.index("left_elbow")]
+    ].mean(0)
     longer = replace(
         source,
         names=("twist", *source.names),
@@ -313,20 +387,26 @@ def test_joints_in_between_do_not_matter() -> None:
 @pytest.mark.parametrize("count", [24, 52])
 def test_bodies_with_fewer_joints(count: int) -> None:
     """Rotations of the joints that they have are kept."""
-    original, body = random_motion(angle=0.6), tiny_body(count)
+    original = random_motion(angle=0.6)
+    body = tiny_body(count)
     motion = retarget(of_motion(original, skeleton()), body)
     close(motion, place_on_floor(original, body))
     assert slow_vertices(body, motion)[..., 1].min() == pytest.approx(0, abs=1e-6)
 
 
-# --- floor and small parts --------------------------------------------------------------------------------------------
+# --- floor and small parts
+# --------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
-@example((1.0, 0.0, 0.0), (-1.0, 3e-5, 0.0), False)  # nearly opposite: taken for opposite, so 3e-5 off
+# nearly opposite: taken for opposite, so 3e-5 off
+@example((1.0, 0.0, 0.0), (-1.0, 3e-5, 0.0), False)
 @example((0.0, 0.0, 1.0), (0.0, 4.315011e-238, 1.0), False)  # the product's square vanishes
 @example((1.0, 0.0, 0.0), (-1.0, 5e-5, 0.0), False)  # and just not so: 1e-7 off
-@given(*[st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)] * 2, st.booleans())
+@given(
+    *[st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)] * 2,
+    st.booleans(),
+)
 def test_the_least_rotation(start: tuple, end: tuple, opposite: bool) -> None:
     """It takes one direction to the other by the angle between them, also by half a turn."""
     a = np.array(start) / np.linalg.norm(start)
@@ -335,10 +415,13 @@ def test_the_least_rotation(start: tuple, end: tuple, opposite: bool) -> None:
     np.testing.assert_allclose(turn @ a, b, rtol=0, atol=1e-14)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), rtol=0, atol=1e-14)
     assert np.linalg.det(turn) == pytest.approx(1)
-    assert Rotation.from_matrix(turn).magnitude() == pytest.approx(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+    assert Rotation.from_matrix(turn).magnitude() == pytest.approx(
+        np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
+    )
 
 
-# --- errors -----------------------------------------------------------------------------------------------------------
+# --- errors
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_rest_pose_that_lies_in_a_line_is_refused() -> None:
@@ -374,9 +457,14 @@ def matrices(motion: Motion) -> np.ndarray:
 
 def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
     """The same motion from BVH, GLB and VRM animation, in upper case too."""
-    motion, own = random_motion(), skeleton()
-    local, root = as_local(motion, own), pelvis_path(BODY, motion)
-    files = [write_bvh(tmp_path / "x.BVH", own, local, root), glb_of(own, Clip(local, root)).write(tmp_path / "x.glb")]
+    motion = random_motion()
+    own = skeleton()
+    local = as_local(motion, own)
+    root = pelvis_path(BODY, motion)
+    files = [
+        write_bvh(tmp_path / "x.BVH", own, local, root),
+        glb_of(own, Clip(local, root)).write(tmp_path / "x.glb"),
+    ]
     for path in files:
         found = read_motion(path, BODY)
         np.testing.assert_allclose(matrices(found), matrices(motion), atol=1e-5)
@@ -388,16 +476,22 @@ def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
     )
     assert len(read_motion(files[1], BODY, fps=60.0, clip="Walk")) == 7
     bones = skeleton(tuple(VRM))
-    waving = vrma_of(bones, Clip(as_local(motion, bones), root, bind_matrices=False)).write(tmp_path / "x.vrma")
+    waving = vrma_of(bones, Clip(as_local(motion, bones), root, bind_matrices=False)).write(
+        tmp_path / "x.vrma"
+    )
     found = read_motion(waving, BODY, fps=60.0, clip="Walk")
     rows = [i for i, name in enumerate(JOINT_NAMES) if name in VRM]
-    np.testing.assert_allclose(found.poses[::2, rows].numpy(), motion.poses[:, rows].numpy(), atol=1e-5)
+    np.testing.assert_allclose(
+        found.poses[::2, rows].numpy(), motion.poses[:, rows].numpy(), atol=1e-5
+    )
 
 
 def test_the_body_that_comes_with_dyngs_is_the_default(tmp_path: Path) -> None:
     """Its feet come to the floor, its pelvis to the height of its legs."""
     own = skeleton()
-    motion = read_motion(write_bvh(tmp_path / "x.bvh", own, np.tile(np.eye(3), (1, 55, 1, 1)), own.rest[:1]))
+    motion = read_motion(
+        write_bvh(tmp_path / "x.bvh", own, np.tile(np.eye(3), (1, 55, 1, 1)), own.rest[:1])
+    )
     body = default_template()
     lowest = posed_vertices(body, motion.poses, motion.trans)[..., 1].min()
     assert float(lowest) == pytest.approx(0, abs=1e-5)
@@ -415,7 +509,9 @@ def test_the_body_that_comes_with_dyngs_is_the_default(tmp_path: Path) -> None:
         ("x.npz", {}, "no such file"),
     ],
 )
-def test_what_cannot_be_read(tmp_path: Path, name: str, options: dict[str, str], problem: str) -> None:
+def test_what_cannot_be_read(
+    tmp_path: Path, name: str, options: dict[str, str], problem: str
+) -> None:
     with pytest.raises(DyngsError, match=problem) as caught:
         read_motion(tmp_path / name, BODY, **options)  # pyright: ignore[reportArgumentType]
     assert str(tmp_path / name) in str(caught.value)

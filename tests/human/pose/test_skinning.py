@@ -1,4 +1,5 @@
-"""Rotations, the kinematic chain and the blend against slow loops in float64, and what they promise at rest.
+"""Rotations, the kinematic chain and the blend against slow loops in float64, and what they promise
+at rest.
 
 P points follow J joints.
 """
@@ -13,7 +14,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.pose.skinning import (
+    apply_transforms,
+    axis_angle_to_matrix,
+    blend_transforms,
+    joint_transforms,
+)
 
 CHAIN = tuple(range(-1, 11))
 STAR = (-1, *([0] * 11))
@@ -43,7 +49,8 @@ def slow_transforms(joints: np.ndarray, parents: tuple[int, ...], turned: np.nda
     return np.array(found)
 
 
-# --- rotations --------------------------------------------------------------------------------------------------------
+# --- rotations
+# --------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=100, deadline=None)
@@ -54,8 +61,8 @@ def test_rotations_are_those_of_scipy_at_any_angle(axis: list[float], exponent: 
     np.testing.assert_allclose(found, Rotation.from_rotvec(pose).as_matrix(), rtol=0, atol=1e-13)
     torch.testing.assert_close(found @ found.T, torch.eye(3).double(), rtol=0, atol=1e-13)
     single = axis_angle_to_matrix(torch.from_numpy(pose).float())
-    # The angle, as large as the pose is long, comes of rounded components by a rounded norm: two units of it; sines,
-    # axis and products add ten more.
+    # The angle, as large as the pose is long, comes of rounded components by a rounded norm: two
+    # units of it; sines, axis and products add ten more.
     allowed = torch.finfo(torch.float32).eps * (2 * float(np.linalg.norm(pose)) + 10)
     torch.testing.assert_close(single, found.float(), rtol=0, atol=allowed)
 
@@ -65,7 +72,9 @@ def test_no_turn_is_exactly_the_identity_and_has_the_gradient_of_the_cross_produ
         pose = torch.zeros(2, 3, dtype=dtype, requires_grad=True)
         turned = axis_angle_to_matrix(pose)
         assert torch.equal(turned, torch.eye(3, dtype=dtype).expand(2, 3, 3))
-        (turned[0, 2, 1] + 2 * turned[0, 0, 2] + 4 * turned[0, 1, 0] + 8 * turned[1].trace()).backward()
+        (
+            turned[0, 2, 1] + 2 * turned[0, 0, 2] + 4 * turned[0, 1, 0] + 8 * turned[1].trace()
+        ).backward()
         assert pose.grad is not None
         assert pose.grad.tolist() == [[1, 2, 4], [0, 0, 0]]
 
@@ -88,15 +97,21 @@ def test_gradients_of_tiny_turns_are_as_good_in_float32(size: float) -> None:
     torch.testing.assert_close(grads[0], grads[1], rtol=0, atol=3e-6)
 
 
-# --- the chain --------------------------------------------------------------------------------------------------------
+# --- the chain
+# --------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
 @given(trees(), st.integers(0, 100))
-def test_transforms_are_those_of_the_loop_over_any_tree(parents: tuple[int, ...], seed: int) -> None:
-    joints, turned = normal(len(parents), 3, seed=seed), axis_angle_to_matrix(normal(len(parents), 3, seed=seed + 1))
+def test_transforms_are_those_of_the_loop_over_any_tree(
+    parents: tuple[int, ...], seed: int
+) -> None:
+    joints = normal(len(parents), 3, seed=seed)
+    turned = axis_angle_to_matrix(normal(len(parents), 3, seed=seed + 1))
     found = joint_transforms(joints, parents, turned)
-    np.testing.assert_allclose(found, slow_transforms(joints.numpy(), parents, turned.numpy()), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        found, slow_transforms(joints.numpy(), parents, turned.numpy()), rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("parents", [CHAIN, STAR, (-1,)])
@@ -108,7 +123,8 @@ def test_rest_is_exactly_the_identity_wherever_the_joints_are(parents: tuple[int
 
 def test_frames_and_persons_are_those_one_by_one() -> None:
     """Leading sizes broadcast: joints of 2 persons in 4 frames each."""
-    joints, turned = normal(2, 1, 12, 3), axis_angle_to_matrix(normal(4, 12, 3))
+    joints = normal(2, 1, 12, 3)
+    turned = axis_angle_to_matrix(normal(4, 12, 3))
     found = joint_transforms(joints, CHAIN, turned)
     assert found.shape == (2, 4, 12, 3, 4)
     for person in range(2):
@@ -128,16 +144,19 @@ def test_what_hangs_on_a_joint_turns_about_its_place() -> None:
 
 
 def test_gradients_of_the_chain() -> None:
-    joints, pose = normal(6, 3).requires_grad_(), normal(2, 6, 3, seed=1).requires_grad_()
+    joints = normal(6, 3).requires_grad_()
+    pose = normal(2, 6, 3, seed=1).requires_grad_()
     for at in (pose, torch.zeros_like(pose).requires_grad_()):
         assert torch.autograd.gradcheck(
-            lambda j, p: joint_transforms(j, (-1, 0, 1, 1, 3, 0), axis_angle_to_matrix(p)), (joints, at)
+            lambda j, p: joint_transforms(j, (-1, 0, 1, 1, 3, 0), axis_angle_to_matrix(p)),
+            (joints, at),
         )
 
 
 def test_gradients_of_two_trees_of_persons_in_frames() -> None:
     """Leading sizes broadcast, and gradients are summed over them."""
-    joints, pose = normal(2, 1, 5, 3).requires_grad_(), normal(3, 5, 3, seed=1).requires_grad_()
+    joints = normal(2, 1, 5, 3).requires_grad_()
+    pose = normal(3, 5, 3, seed=1).requires_grad_()
     assert torch.autograd.gradcheck(
         lambda j, p: joint_transforms(j, (-1, 0, -1, 2, 2), axis_angle_to_matrix(p)), (joints, pose)
     )
@@ -146,15 +165,19 @@ def test_gradients_of_two_trees_of_persons_in_frames() -> None:
 @pytest.mark.parametrize("parents", [(0,), (-1, 1), (-1, 2, 1), (-1, 0, -2), (-1, 5)])
 def test_a_tree_out_of_order_is_refused_and_never_followed(parents: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="parents must come before their children"):
-        joint_transforms(normal(len(parents), 3), parents, axis_angle_to_matrix(normal(len(parents), 3)))
+        joint_transforms(
+            normal(len(parents), 3), parents, axis_angle_to_matrix(normal(len(parents), 3))
+        )
 
 
-# --- the blend --------------------------------------------------------------------------------------------------------
+# --- the blend
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_the_blend_is_that_of_the_loops() -> None:
     weights = torch.softmax(normal(7, 12), 1)
-    transforms, points = normal(3, 12, 3, 4, seed=1), normal(7, 3, seed=2)
+    transforms = normal(3, 12, 3, 4, seed=1)
+    points = normal(7, 3, seed=2)
     found = apply_transforms(blend_transforms(weights, transforms), points)
     for frame in range(3):
         for row in range(7):
@@ -166,7 +189,8 @@ def test_the_blend_is_that_of_the_loops() -> None:
 
 
 def test_gradients_of_the_blend() -> None:
-    weights, points = torch.softmax(normal(4, 3), 1).requires_grad_(), normal(2, 4, 3).requires_grad_()
+    weights = torch.softmax(normal(4, 3), 1).requires_grad_()
+    points = normal(2, 4, 3).requires_grad_()
     transforms = normal(2, 3, 3, 4).requires_grad_()
     assert torch.autograd.gradcheck(
         lambda w, t, p: apply_transforms(blend_transforms(w, t), p), (weights, transforms, points)

@@ -1,4 +1,5 @@
-"""The network over the atlas in training, on many people and on the images of one, and what is refused."""
+"""The network over the atlas in training, on many people and on the images of one, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -10,7 +11,14 @@ from tiny_people import NET, config, people, person
 
 from dyngs.config import Config
 from dyngs.errors import DyngsError
-from dyngs.human.prediction.learner import AtlasLearner, Filmed, PersonPredictor, learner, mean_colours, new_network
+from dyngs.human.prediction.learner import (
+    AtlasLearner,
+    Filmed,
+    PersonPredictor,
+    learner,
+    mean_colours,
+    new_network,
+)
 from dyngs.training.prediction import network_trainer
 
 
@@ -27,7 +35,9 @@ def assembled(config: Config) -> AtlasLearner:
 def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
     """Of the same person, images and background, before and after 20 steps."""
     long = config(folder, tmp_path)
-    trainer = network_trainer(long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})}))
+    trainer = network_trainer(
+        long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})})
+    )
     losses = [trainer.step().loss for _ in range(24)]
     assert sum(losses[-8:]) < 0.9 * sum(losses[:8])
     assert trainer.num_gaussians > 500
@@ -36,16 +46,22 @@ def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
 def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
     """Every other one of fewer images."""
     atlas = assembled(config(folder, tmp_path, source_sets=4, source_views=3))
-    assert [[len(choice) for choice in person.choices] for person in atlas.people] == [[3, 1, 3, 2]] * 2
+    assert [[len(choice) for choice in person.choices] for person in atlas.people] == [
+        [3, 1, 3, 2]
+    ] * 2
     assert [person.sitter.name for person in atlas.people] == ["p1", "p2"]
 
 
 def test_mean_colours_are_those_of_the_people(folder: Path, tmp_path: Path) -> None:
-    """Of one person they are what is seen; of two they lie between; the atlas is filled everywhere."""
+    """Of one person they are what is seen; of two they lie between; the atlas is filled
+    everywhere."""
     atlas = assembled(config(folder, tmp_path))
-    one, other, both = (mean_colours(some, 32) for some in ([atlas.people[0]], atlas.people[1:], atlas.people))
+    one, other, both = (
+        mean_colours(some, 32) for some in ([atlas.people[0]], atlas.people[1:], atlas.people)
+    )
     assert torch.equal(both, atlas.mean)
-    low, high = torch.minimum(one, other), torch.maximum(one, other)
+    low = torch.minimum(one, other)
+    high = torch.maximum(one, other)
     within = ((both >= low - 1e-5) & (both <= high + 1e-5)).all(0)
     assert within.float().mean() > 0.9, "texels that one of them does not show are the other's"
     assert (both > 0.02).any(0).all()
@@ -68,16 +84,23 @@ def test_training_on_the_images_of_one_person_shows_them_better(tmp_path: Path) 
 
 
 def error_after(shown: Filmed, steps: int) -> float:
-    """Sum over three views of the mean absolute error on white, of a network trained on these for ``steps``."""
+    """Sum over three views of the mean absolute error on white, of a network trained on these for
+    ``steps``."""
     values = {"data": {"root": "."}, "model": NET, "train": {"alpha_weight": 0.1}}
-    network, mean, views = new_network(NET, torch.Generator().manual_seed(0)), torch.full((3, 32, 32), 0.5), [0, 3, 6]
+    network = new_network(NET, torch.Generator().manual_seed(0))
+    mean = torch.full((3, 32, 32), 0.5)
+    views = [0, 3, 6]
     before = {name: x.clone() for name, x in network.state_dict().items()}
     whole = Config.model_validate(values)
     predictor = PersonPredictor(whole, NET, network, mean, shown, whole.data)
     predictor.adapt(views, steps)
     unchanged = all(torch.equal(x, before[name]) for name, x in network.state_dict().items())
     assert unchanged == (steps == 0)
-    scene, white = predictor.predict(views), torch.ones(3)
+    scene = predictor.predict(views)
+    white = torch.ones(3)
     images = [shown.images[view] for view in views]
-    errors = (scene.render(x.cameras, x.time, background=white).rgb[0] - x.composite(white) for x in images)
+    errors = (
+        scene.render(x.cameras, x.time, background=white).rgb[0] - x.composite(white)
+        for x in images
+    )
     return sum(error.abs().mean().item() for error in errors)

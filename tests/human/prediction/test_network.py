@@ -39,13 +39,15 @@ def test_weights_come_from_the_generator_alone() -> None:
     torch.manual_seed(1)
     first = network().state_dict()
     torch.manual_seed(2)
-    again, other = network().state_dict(), network(1).state_dict()
+    again = network().state_dict()
+    other = network(1).state_dict()
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not torch.equal(first["last.0.weight"], other["last.0.weight"])
 
 
 def test_every_weight_matters_once_the_heads_do() -> None:
-    made, generator = network(), torch.Generator().manual_seed(3)
+    made = network()
+    generator = torch.Generator().manual_seed(3)
     torch.nn.init.normal_(made.heads.weight, generator=generator)
     made(torch.rand(6, 32, 32, generator=generator)).square().sum().backward()
     for name, parameter in made.named_parameters():
@@ -54,8 +56,10 @@ def test_every_weight_matters_once_the_heads_do() -> None:
 
 
 def test_what_is_far_away_in_the_atlas_is_seen() -> None:
-    """A texel's input changes predictions at the other side: unseen parts are painted by what is seen elsewhere."""
-    made, generator = network(0, (8, 8, 8, 8)), torch.Generator().manual_seed(3)
+    """A texel's input changes predictions at the other side: unseen parts are painted by what is
+    seen elsewhere."""
+    made = network(0, (8, 8, 8, 8))
+    generator = torch.Generator().manual_seed(3)
     torch.nn.init.normal_(made.heads.weight, generator=generator)
     maps = torch.rand(6, 32, 32, generator=generator)
     other = maps.clone()
@@ -94,9 +98,12 @@ def predicted(shown: Shown, bias: dict[str, float] | None = None) -> PredictedAv
 
 def matrices(quats: Tensor) -> Tensor:
     """(N, 3, 3) of unit quaternions."""
-    w, xyz = quats[:, :1].clamp(-1, 1), quats[:, 1:]
+    w = quats[:, :1].clamp(-1, 1)
+    xyz = quats[:, 1:]
     return axis_angle_to_matrix(
-        torch.nn.functional.normalize(xyz, dim=1) * 2 * torch.atan2(xyz.norm(dim=1, keepdim=True), w)
+        torch.nn.functional.normalize(xyz, dim=1)
+        * 2
+        * torch.atan2(xyz.norm(dim=1, keepdim=True), w)
     )
 
 
@@ -112,11 +119,13 @@ def test_without_a_network_texels_have_seen_or_nearby_colours(shown: Shown) -> N
 
 def test_an_untrained_network_changes_colours_a_little_and_nothing_else(shown: Shown) -> None:
     """It trusts images by 98 %, and mixes the mean into what it guesses."""
-    bare, untrained = predict_gaussians(*shown, MEAN, None, 0.9), predicted(shown)
+    bare = predict_gaussians(*shown, MEAN, None, 0.9)
+    untrained = predicted(shown)
     for name in ("means", "log_scales", "logit_opacities"):
         assert torch.equal(getattr(bare.gaussians, name), getattr(untrained.gaussians, name))
     torch.testing.assert_close(untrained.gaussians.quats, bare.gaussians.quats)
-    different, count = (bare.gaussians.base_rgb - untrained.gaussians.base_rgb).abs(), len(shown[0].texels)
+    different = (bare.gaussians.base_rgb - untrained.gaussians.base_rgb).abs()
+    count = len(shown[0].texels)
     seen = shown[1].seen[0] > 0
     assert 0 < different[:count][seen].max() < 0.02
     assert 0 < different[:count][~seen].max() < 0.25
@@ -129,15 +138,18 @@ def test_the_skin_is_whole_and_scaffolds_are_carved(shown: Shown) -> None:
     kept = (maps.inside[1] == 1) & (maps.seen[1] > 0)
     assert (found.points[: len(sitter.texels)] == sitter.texels.points).all()
     torch.testing.assert_close(
-        found.points[len(sitter.texels) :], (sitter.texels.points + 0.02 * sitter.texels.normals)[kept]
+        found.points[len(sitter.texels) :],
+        (sitter.texels.points + 0.02 * sitter.texels.normals)[kept],
     )
     every = predict_gaussians(sitter, maps, MEAN, None, 0.0).gaussians
     assert len(found) < len(every) == len(sitter.texels) + int((maps.seen[1] > 0).sum())
 
 
 def test_every_quaternion_is_normalised_by_itself(shown: Shown) -> None:
-    """(1, 0, 0, 0) + 1 in all four is a turn by 2 acos(2 / sqrt 7) about the diagonal of each tangent frame."""
-    bare, turned = predicted(shown).gaussians, predicted(shown, {"rotation": 1.0}).gaussians
+    """(1, 0, 0, 0) + 1 in all four is a turn by 2 acos(2 / sqrt 7) about the diagonal of each
+    tangent frame."""
+    bare = predicted(shown).gaussians
+    turned = predicted(shown, {"rotation": 1.0}).gaussians
     torch.testing.assert_close(turned.quats.norm(dim=1), torch.ones(len(turned)))
     angle = 2 * torch.tensor(2 / 7**0.5).acos()
     expected = matrices(bare.quats) @ axis_angle_to_matrix(torch.ones(3) / 3**0.5 * angle)
@@ -145,12 +157,15 @@ def test_every_quaternion_is_normalised_by_itself(shown: Shown) -> None:
 
 
 def test_places_lengths_and_opacities_stay_within_bounds(shown: Shown) -> None:
-    """However loud the network: half way to the next scaffold along the normal, e^1.5 times as long."""
+    """However loud the network: half way to the next scaffold along the normal, e^1.5 times as
+    long."""
     sitter, _ = shown
     bare = predicted(shown).gaussians
     loud = predicted(shown, {"height": 50.0, "scale": 50.0, "opacity": 2.0}).gaussians
     count = len(sitter.texels)
-    torch.testing.assert_close(loud.means[:count], bare.means[:count] + 0.01 * sitter.texels.normals)
+    torch.testing.assert_close(
+        loud.means[:count], bare.means[:count] + 0.01 * sitter.texels.normals
+    )
     torch.testing.assert_close(loud.log_scales, bare.log_scales + 1.5)
     torch.testing.assert_close(loud.logit_opacities, bare.logit_opacities + 2)
 
@@ -158,10 +173,14 @@ def test_places_lengths_and_opacities_stay_within_bounds(shown: Shown) -> None:
 def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None:
     sitter, maps = shown
     seen = maps.seen[0] > 0
-    trusting = predicted(shown, {"colour": 0.5, "image_weight": 50.0}).gaussians.base_rgb[: len(sitter.texels)]
+    trusting = predicted(shown, {"colour": 0.5, "image_weight": 50.0}).gaussians.base_rgb[
+        : len(sitter.texels)
+    ]
     torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
     mean, nearby, other_side = guessed_colours(sitter, maps, MEAN)
-    guess = torch.stack([mean, nearby, other_side], dim=-1) @ torch.tensor([0.0, 2.0, 0.0]).softmax(0)
+    guess = torch.stack([mean, nearby, other_side], dim=-1) @ torch.tensor([0.0, 2.0, 0.0]).softmax(
+        0
+    )
     torch.testing.assert_close(trusting[~seen], guess[~seen] + 0.5)
     wary = predicted(shown, {"colour": 0.5, "image_weight": -50.0}).gaussians.base_rgb
     torch.testing.assert_close(wary[: len(sitter.texels)], guess + 0.5)
@@ -185,7 +204,9 @@ def test_all_heads_learn(shown: Shown) -> None:
     grad = made.heads.bias.grad
     assert grad is not None
     moved = dict(zip(HEADS, grad.view(2, -1)[0].split(tuple(HEADS.values())), strict=True))
-    assert {name for name, x in moved.items() if bool((x == 0).all())} <= {"rotation"}, "a turn changes no length"
+    assert {name for name, x in moved.items() if bool((x == 0).all())} <= {"rotation"}, (
+        "a turn changes no length"
+    )
 
 
 def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
@@ -196,5 +217,6 @@ def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
     torch.testing.assert_close(found[-1], found[-2] / 3)
     other = network_inputs(sitter, replace(maps, rgb=1 - maps.rgb), MEAN)
     changed = (found != other).flatten(1).any(1)
-    level, other_side = [True] * 3 + [False] * 3, [True] * 3
+    level = [True] * 3 + [False] * 3
+    other_side = [True] * 3
     assert changed.tolist() == level + level + [False] * 12 + other_side + [False] * 3

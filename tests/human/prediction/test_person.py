@@ -21,13 +21,17 @@ def sitter(tmp_path_factory: pytest.TempPathFactory) -> CapturedPerson:
 
 def gaps(sitter: CapturedPerson, chosen: list[int]) -> list[float]:
     """Degrees between neighbours on the ring, all around."""
-    centers = [-v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3] for v in (sitter.views[i] for i in chosen)]
+    centers = [
+        -v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3]
+        for v in (sitter.views[i] for i in chosen)
+    ]
     azimuths = np.sort([np.degrees(np.arctan2(c[0], c[2])) % 360 for c in centers])
     return sorted(np.diff([*azimuths, azimuths[0] + 360]))
 
 
 def test_chosen_views_are_spread_around_the_person(sitter: CapturedPerson) -> None:
-    """Of eight cameras 45 degrees apart, three leave no gap above 135 degrees, two are opposite, four every other."""
+    """Of eight cameras 45 degrees apart, three leave no gap above 135 degrees, two are opposite,
+    four every other."""
     np.testing.assert_allclose(gaps(sitter, spread_views(sitter, 3)), [90, 135, 135])
     np.testing.assert_allclose(gaps(sitter, spread_views(sitter, 2)), [180, 180])
     np.testing.assert_allclose(gaps(sitter, spread_views(sitter, 4)), [90, 90, 90, 90])
@@ -51,7 +55,9 @@ def test_a_sitter_has_a_disc_per_texel_and_scaffold(sitter: CapturedPerson) -> N
     np.testing.assert_allclose(away.numpy(), 0.02, atol=1e-6)  # float32
 
 
-def test_captures_without_a_body_or_silhouettes_are_refused(sitter: CapturedPerson, tmp_path: Path) -> None:
+def test_captures_without_a_body_or_silhouettes_are_refused(
+    sitter: CapturedPerson, tmp_path: Path
+) -> None:
     capture = read_capture(DataConfig.model_validate({"root": people(tmp_path, (2,)) / "p2"}))
     with pytest.raises(DyngsError, match="no body parameters"):
         captured_person(capture.replace(body=None), NET, body())

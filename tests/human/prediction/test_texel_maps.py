@@ -19,7 +19,12 @@ from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.loader import Image
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
-from dyngs.human.prediction.person import CapturedPerson, captured_person, colours_nearby, mirror_texels
+from dyngs.human.prediction.person import (
+    CapturedPerson,
+    captured_person,
+    colours_nearby,
+    mirror_texels,
+)
 from dyngs.human.prediction.texel_maps import (
     HULL_LIMIT,
     from_atlas,
@@ -51,10 +56,14 @@ def test_mirror_texels_lie_on_the_other_side() -> None:
 
 
 def test_unseen_texels_take_colours_from_their_surroundings() -> None:
-    """The back of a person seen from the front: legs like legs, the chest like the chest; what is seen stays."""
-    points, normals = texels().points, texels().normals
+    """The back of a person seen from the front: legs like legs, the chest like the chest; what is
+    seen stays."""
+    points = texels().points
+    normals = texels().normals
     seen = normals[:, 2].clamp_min(0)
-    rgb = torch.where((points[:, 1] > 0)[:, None], torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
+    rgb = torch.where(
+        (points[:, 1] > 0)[:, None], torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
+    )
     found = colours_nearby(texels(), rgb * (seen > 0)[:, None], seen)
     assert torch.equal(found[seen > 0], rgb[seen > 0])
     away = (seen == 0) & (points[:, 1].abs() > 0.15)
@@ -63,7 +72,8 @@ def test_unseen_texels_take_colours_from_their_surroundings() -> None:
 
 
 def test_few_or_no_seen_texels_are_enough() -> None:
-    rgb, none = torch.rand(len(texels()), 3), torch.zeros(len(texels()))
+    rgb = torch.rand(len(texels()), 3)
+    none = torch.zeros(len(texels()))
     assert (colours_nearby(texels(), rgb, none) == 0.5).all()
     one = none.clone()
     one[7] = 1.0
@@ -85,9 +95,15 @@ def body() -> BodyTemplate:
 def sitter(poses: Tensor) -> CapturedPerson:
     """A person of whom there is one view, in the pose (55, 3), scaffolds at 0 and 4 cm."""
     view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
-    frames = BodyFrames((0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1))
-    capture = Capture(Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames})
-    return captured_person(capture, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)), body())
+    frames = BodyFrames(
+        (0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1)
+    )
+    capture = Capture(
+        Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames}
+    )
+    return captured_person(
+        capture, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)), body()
+    )
 
 
 def arms_before_the_chest() -> Tensor:
@@ -100,10 +116,13 @@ def arms_before_the_chest() -> Tensor:
 
 
 def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """(256, 256, 3) texture by positions (P, 3) of the T-pose and the joint (P,) that moves each."""
+    """(256, 256, 3) texture by positions (P, 3) of the T-pose and the joint (P,) that moves
+    each."""
     uv, uv_faces = texture_coordinates(body())
     columns, rows = texel_coordinates(uv, 256)
-    fragments = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
+    fragments = rasterize(
+        np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256
+    )
     around = body().faces.numpy()[fragments.faces]
     positions = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
     joints = interpolate(fragments.barycentric, body().weights.double().numpy()[around]).argmax(1)
@@ -115,11 +134,15 @@ def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.nda
 def image(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Image:
     exact, (uv, uv_faces) = body().to(dtype=torch.float64), texture_coordinates(body())
     vertices = posed_vertices(exact, poses[None].double(), torch.zeros(1, 3).double())[0].numpy()
-    pixels = render_mesh(PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2)
+    pixels = render_mesh(
+        PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2
+    )
     rgba = torch.from_numpy(pixels).float()
     focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
     intrinsics = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]).float()
-    camera = Cameras(torch.from_numpy(cam_from_opengl(pose)).float()[None], intrinsics[None], SIZE, SIZE)
+    camera = Cameras(
+        torch.from_numpy(cam_from_opengl(pose)).float()[None], intrinsics[None], SIZE, SIZE
+    )
     return Image("v", camera, rgba[..., :3] * rgba[..., 3:], rgba[..., 3], None, None, 0)
 
 
@@ -134,12 +157,16 @@ def posing(of: CapturedPerson) -> BodyPose:
 
 
 def test_distances_from_the_edge_are_those_of_the_outline() -> None:
-    """From the front, texels on the outer side of the legs lie on it, and those 4 cm above them 4 cm outside."""
+    """From the front, texels on the outer side of the legs lie on it, and those 4 cm above them 4
+    cm outside."""
     shown = sitter(torch.zeros(55, 3))
     seen = image(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
     maps = observe_texels(shown, [(seen, shown.pose_in(shown.views[0]))])
-    points, normals = shown.texels.points, shown.texels.normals
-    outer = (normals[:, 0] * points[:, 0].sign() > 0.98) & (points[:, 1] < -0.1) & (points[:, 1] > -0.7)
+    points = shown.texels.points
+    normals = shown.texels.normals
+    outer = (
+        (normals[:, 0] * points[:, 0].sign() > 0.98) & (points[:, 1] < -0.1) & (points[:, 1] > -0.7)
+    )
     assert outer.sum() > 10
     assert maps.hull[0, outer].abs().max() < 0.025
     torch.testing.assert_close(maps.hull[1, outer].mean(), torch.tensor(-0.04), atol=0.008, rtol=0)
@@ -149,11 +176,16 @@ def test_distances_from_the_edge_are_those_of_the_outline() -> None:
 
 
 def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
-    """Arms red, the rest blue: of the texels seen, nearly all have their own colour, and parts of the chest are hidden
-    that are seen when the arms are aside. Mixed colours remain where a pixel covers both."""
-    texture = painted(lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9]))
+    """Arms red, the rest blue: of the texels seen, nearly all have their own colour, and parts of
+    the chest are hidden that are seen when the arms are aside. Mixed colours remain where a pixel
+    covers both."""
+    texture = painted(
+        lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9])
+    )
     crossed = sitter(arms_before_the_chest())
-    maps = observe_texels(crossed, [(image(arms_before_the_chest(), texture, FRONT), posing(crossed))])
+    maps = observe_texels(
+        crossed, [(image(arms_before_the_chest(), texture, FRONT), posing(crossed))]
+    )
     arms = torch.from_numpy(is_arm(crossed.texels.weights.argmax(1)))
     redness = maps.rgb[0, :, 0] / maps.rgb[0].sum(1).clamp_min(1e-6)
     seen = maps.seen[0] > 0.3
@@ -167,7 +199,8 @@ def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
 
 
 def test_a_texel_has_the_colour_of_its_place() -> None:
-    """A smooth colour over the body, from two sides; up to the light and half a pixel of its change."""
+    """A smooth colour over the body, from two sides; up to the light and half a pixel of its
+    change."""
     texture = painted(lambda positions, _: 0.5 + 0.4 * np.sin(3 * positions))
     aside = sitter(torch.zeros(55, 3))
     shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
@@ -180,10 +213,13 @@ def test_a_texel_has_the_colour_of_its_place() -> None:
 
 
 def test_only_what_faces_a_camera_is_seen() -> None:
-    """From before: nothing of the back, and most of the front; more from two sides than from one."""
-    texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
+    """From before: nothing of the back, and most of the front; more from two sides than from
+    one."""
+    texture = np.full((8, 8, 3), 0.5)
+    aside = sitter(torch.zeros(55, 3))
     shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
-    one, two = observe_texels(aside, shown[:1]), observe_texels(aside, shown)
+    one = observe_texels(aside, shown[:1])
+    two = observe_texels(aside, shown)
     normals = aside.texels.normals
     assert (one.seen[0][normals[:, 2] < -0.2] == 0).all()
     assert (one.seen[0][normals[:, 2] > 0.8] > 0).float().mean() > 0.85, "not inside the mouth"
@@ -193,10 +229,13 @@ def test_only_what_faces_a_camera_is_seen() -> None:
 
 
 def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
-    """At 0 nearly all texels are inside, at 4 cm those that point aside are not; a second view carves more."""
-    texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
+    """At 0 nearly all texels are inside, at 4 cm those that point aside are not; a second view
+    carves more."""
+    texture = np.full((8, 8, 3), 0.5)
+    aside = sitter(torch.zeros(55, 3))
     shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
-    one, two = observe_texels(aside, shown[:1]), observe_texels(aside, shown)
+    one = observe_texels(aside, shown[:1])
+    two = observe_texels(aside, shown)
     assert (one.inside[0] == 1).float().mean() > 0.9
     assert (one.inside[1] == 1).float().mean() < 0.8
     assert (two.inside[1] == 1).float().mean() < 0.8 * (one.inside[1] == 1).float().mean()
@@ -205,7 +244,8 @@ def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
 
 
 def test_without_alpha_everything_is_inside() -> None:
-    aside, rest = sitter(torch.zeros(55, 3)), torch.zeros(55, 3)
+    aside = sitter(torch.zeros(55, 3))
+    rest = torch.zeros(55, 3)
     opaque = replace(image(rest, np.full((8, 8, 3), 0.5), FRONT), alpha=None)
     assert (observe_texels(aside, [(opaque, posing(aside))]).inside == 1).all()
 

@@ -1,4 +1,5 @@
-"""The synthetic person: visibility against brute-force ray casting, known colours, files and their reader."""
+"""The synthetic person: visibility against brute-force ray casting, known colours, files and their
+reader."""
 
 from __future__ import annotations
 
@@ -63,11 +64,14 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def posed(motion: Motion, frame: int) -> np.ndarray:
     exact = body().to(dtype=torch.float64)
-    return posed_vertices(exact, motion.poses[[frame]].double(), motion.trans[[frame]].double())[0].numpy()
+    return posed_vertices(exact, motion.poses[[frame]].double(), motion.trans[[frame]].double())[
+        0
+    ].numpy()
 
 
 def mesh_of(vertices: np.ndarray, image: np.ndarray) -> PosedMesh:
-    uv, uv_faces = body().uv, body().uv_faces
+    uv = body().uv
+    uv_faces = body().uv_faces
     assert uv is not None
     assert uv_faces is not None
     return PosedMesh(vertices, body().faces.numpy(), uv.double().numpy(), uv_faces.numpy(), image)
@@ -81,7 +85,8 @@ def front_camera(distance: float = 3.5, height: float = 0.95) -> np.ndarray:
 
 
 def pixels_of(world_from_cam: np.ndarray, points: np.ndarray, size: int) -> np.ndarray:
-    """(P, 2) column and row of points in the world, by the convention of the readers: centres at halves."""
+    """(P, 2) column and row of points in the world, by the convention of the readers: centres at
+    halves."""
     cam_from_world = cam_from_opengl(world_from_cam)
     x, y, z = cam_from_world[:3, :3] @ points.T + cam_from_world[:3, 3:]
     focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
@@ -89,19 +94,26 @@ def pixels_of(world_from_cam: np.ndarray, points: np.ndarray, size: int) -> np.n
 
 
 def rays_of(world_from_cam: np.ndarray, size: int, samples: int) -> np.ndarray:
-    """((size samples)^2, 3) directions through the positions of all pixels, row by row of these positions."""
+    """((size samples)^2, 3) directions through the positions of all pixels, row by row of these
+    positions."""
     n = size * samples
     x, y = np.meshgrid(*[((np.arange(n) + 0.5) / n - 0.5) * 2 * np.tan(0.5 * CAMERA_ANGLE_X)] * 2)
     return np.stack([x, -y, -np.ones_like(x)], axis=-1).reshape(-1, 3) @ world_from_cam[:3, :3].T
 
 
-def cast(corners: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First triangle (R,), -1 for none, and barycentrics (R, 3), of all rays with all triangles (T, 3, 3), by Cramer's
-    rule: origin + t ray = a + u (b - a) + v (c - a)."""
+def cast(
+    corners: np.ndarray, origin: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """First triangle (R,), -1 for none, and barycentrics (R, 3), of all rays with all triangles (T,
+    3, 3), by Cramer's rule: origin + t ray = a + u (b - a) + v (c - a)."""
     a, b, c = corners.transpose(1, 0, 2)
-    first, second, start = b - a, c - a, origin - a
-    faces, fractions = np.full(len(rays), -1), np.zeros((len(rays), 3))
-    normal, moment = np.cross(first, second), np.cross(start, first)
+    first = b - a
+    second = c - a
+    start = origin - a
+    faces = np.full(len(rays), -1)
+    fractions = np.zeros((len(rays), 3))
+    normal = np.cross(first, second)
+    moment = np.cross(start, first)
     for i, ray in enumerate(rays):
         across = np.cross(ray, second)
         determinant = -normal @ ray
@@ -127,7 +139,8 @@ def slow_normals(mesh: PosedMesh) -> np.ndarray:
 def slow_texture(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Bilinear between the centres of texels."""
     size = len(image)
-    column, row = np.clip(uv[0] * size - 0.5, 0, size - 1), np.clip((1 - uv[1]) * size - 0.5, 0, size - 1)
+    column = np.clip(uv[0] * size - 0.5, 0, size - 1)
+    row = np.clip((1 - uv[1]) * size - 0.5, 0, size - 1)
     color = np.zeros(3)
     for i in range(size):
         for j in range(size):
@@ -135,13 +148,17 @@ def slow_texture(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return color
 
 
-# --- images ---------------------------------------------------------------------------------------------------------
+# --- images
+# ---------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), size=st.integers(1, 9), samples=st.integers(1, 3))
-def test_images_are_those_of_casting_every_ray_at_every_triangle(seed: int, size: int, samples: int) -> None:
-    """Of random triangles through each other, with perspective, texture, light and straight alpha."""
+def test_images_are_those_of_casting_every_ray_at_every_triangle(
+    seed: int, size: int, samples: int
+) -> None:
+    """Of random triangles through each other, with perspective, texture, light and straight
+    alpha."""
     make = np.random.default_rng(seed)
     mesh = PosedMesh(
         vertices=make.uniform(-1, 1, (12, 3)),
@@ -152,21 +169,28 @@ def test_images_are_those_of_casting_every_ray_at_every_triangle(seed: int, size
     )
     pose = front_camera(2.5, 0.1)
     faces, fractions = cast(mesh.vertices[mesh.faces], pose[:3, 3], rays_of(pose, size, samples))
-    normals, colors = slow_normals(mesh), np.zeros((len(faces), 4))
+    normals = slow_normals(mesh)
+    colors = np.zeros((len(faces), 4))
     for i in np.flatnonzero(faces >= 0):
         normal = fractions[i] @ normals[mesh.faces[faces[i]]]
         light = 0.6 + 0.45 * max(normal @ LIGHT / np.linalg.norm(normal), 0.0)
-        rgb = np.minimum(light * slow_texture(mesh.texture, fractions[i] @ mesh.uv[mesh.uv_faces[faces[i]]]), 1.0)
+        rgb = np.minimum(
+            light * slow_texture(mesh.texture, fractions[i] @ mesh.uv[mesh.uv_faces[faces[i]]]), 1.0
+        )
         colors[i] = *rgb, 1.0
     sums = colors.reshape(size, samples, size, samples, 4).sum((1, 3))
     found = render_mesh(mesh, pose, size, samples)
     np.testing.assert_allclose(found[..., 3], sums[..., 3] / samples**2, atol=1e-12)
-    np.testing.assert_allclose(found[..., :3] * found[..., 3:], sums[..., :3] / samples**2, atol=1e-6)
+    np.testing.assert_allclose(
+        found[..., :3] * found[..., 3:], sums[..., :3] / samples**2, atol=1e-6
+    )
 
 
 def test_the_silhouette_is_that_of_the_posed_mesh() -> None:
     """Rays at every pixel, against the full mesh."""
-    vertices, pose, size = posed(squat(body(), 2), 1), front_camera(3.0, 0.8), 16
+    vertices = posed(squat(body(), 2), 1)
+    pose = front_camera(3.0, 0.8)
+    size = 16
     faces, _ = cast(vertices[body().faces.numpy()], pose[:3, 3], rays_of(pose, size, 1))
     found = render_mesh(mesh_of(vertices, texture()), pose, size, 1)[..., 3]
     assert set(np.unique(found)) == {0.0, 1.0}
@@ -175,14 +199,17 @@ def test_the_silhouette_is_that_of_the_posed_mesh() -> None:
 
 
 def test_a_texel_is_seen_where_the_surface_is() -> None:
-    """A red spot of 9 x 9 texels about the middle of a triangle on the chest appears there and nowhere else."""
-    vertices, size = posed(walk(body(), 1), 0), 64
+    """A red spot of 9 x 9 texels about the middle of a triangle on the chest appears there and
+    nowhere else."""
+    vertices = posed(walk(body(), 1), 0)
+    size = 64
     mesh = mesh_of(vertices, np.full((512, 512, 3), 0.5))
     pose = front_camera()
     middles = body().vertices.numpy()[mesh.faces].mean(1)
     face = int(np.linalg.norm(middles - [0.05, 0.45, 0.15], axis=1).argmin())
     u, v = mesh.uv[mesh.uv_faces[face]].mean(0)
-    row, column = int((1 - v) * 512), int(u * 512)
+    row = int((1 - v) * 512)
+    column = int(u * 512)
     mesh.texture[row - 4 : row + 5, column - 4 : column + 5] = [0.5, 0.0, 0.0]
     found = render_mesh(mesh, pose, size, 4)
     redness = (found[..., 0] - found[..., 1]) * found[..., 3]
@@ -195,7 +222,8 @@ def test_a_texel_is_seen_where_the_surface_is() -> None:
 
 
 def test_the_left_hand_is_on_the_left_of_the_person() -> None:
-    """An image from the front shows it on the right, one from behind on the left; it is painted by its vertices."""
+    """An image from the front shows it on the right, one from behind on the left; it is painted by
+    its vertices."""
     at_rest = body().vertices.double().numpy()
     mesh = mesh_of(at_rest + np.array([0.0, 0.83, 0.0]), np.ones((128, 128, 3)))
     wrist = body().joints[JOINT_NAMES.index("left_wrist"), 0].item()
@@ -204,7 +232,8 @@ def test_the_left_hand_is_on_the_left_of_the_person() -> None:
             u, v = mesh.uv[corners_uv].mean(0)
             mesh.texture[int((1 - v) * 128), int(u * 128)] = [0.0, 1.0, 0.0]
     behind = front_camera()
-    behind[:3, :3], behind[2, 3] = np.diag([-1.0, 1, -1]), -3.5
+    behind[:3, :3] = np.diag([-1.0, 1, -1])
+    behind[2, 3] = -3.5
     for pose, side in ((front_camera(), 1), (behind, -1)):
         found = render_mesh(mesh, pose, 48, 2)
         greenness = (found[..., 1] - found[..., 0]) * found[..., 3]
@@ -215,10 +244,13 @@ def test_the_left_hand_is_on_the_left_of_the_person() -> None:
 
 def test_what_is_behind_the_camera_is_refused() -> None:
     with pytest.raises(ValueError, match="in front of the camera"):
-        render_mesh(mesh_of(body().vertices.double().numpy(), texture()), front_camera(0.0, 0.0), 8, 1)
+        render_mesh(
+            mesh_of(body().vertices.double().numpy(), texture()), front_camera(0.0, 0.0), 8, 1
+        )
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files
+# ------------------------------------------------------------------------------------------------------------
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -226,7 +258,9 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()
+    }
 
 
 def captured(folder: Path) -> Capture:
@@ -235,7 +269,9 @@ def captured(folder: Path) -> Capture:
 
 def seen_at(view: View, points: np.ndarray) -> np.ndarray:
     """(P, 2) column and row."""
-    u, v, w = view.intrinsics @ (view.cam_from_world[:3, :3] @ points.T + view.cam_from_world[:3, 3:])
+    u, v, w = view.intrinsics @ (
+        view.cam_from_world[:3, :3] @ points.T + view.cam_from_world[:3, 3:]
+    )
     return np.stack([u / w, v / w], axis=-1)
 
 
@@ -252,21 +288,28 @@ def test_another_seed_is_another_person_of_another_size(root: Path, tmp_path: Pa
     torch.testing.assert_close(motion.scale, torch.full((2,), outfit.size))
     torch.testing.assert_close(motion.trans, outfit.size * walk(body(), 2).trans)
     exact = dress_body(body(), outfit).to(dtype=torch.float64)
-    vertices = posed_vertices(exact, motion.poses.double(), motion.trans.double(), scale=motion.scale.double())
+    vertices = posed_vertices(
+        exact, motion.poses.double(), motion.trans.double(), scale=motion.scale.double()
+    )
     for view in captured(other).splits["train"][:3]:
         is_person = pixels(view.image_path)[..., 3] == 255
         positions = seen_at(view, vertices[0].numpy())
         for found, expected in zip(np.nonzero(is_person), positions.T[::-1], strict=True):
-            assert expected.min() - 0.5 <= found.min() + 0.5 <= expected.min() + 2  # pixels: centres are sampled
+            # pixels: centres are sampled
+            assert expected.min() - 0.5 <= found.min() + 0.5 <= expected.min() + 2
             assert expected.max() - 2 <= found.max() + 0.5 <= expected.max() + 0.5
-    assert (pixels(root / "images/train/f000_c00.png") != pixels(other / "images/train/f000_c00.png")).any()
+    assert (
+        pixels(root / "images/train/f000_c00.png") != pixels(other / "images/train/f000_c00.png")
+    ).any()
 
 
 def test_varied_people_differ_in_body_light_and_clip(root: Path, tmp_path: Path) -> None:
     """Each by its own; body parameters are in the template's own shape space, and are exact."""
     plain = files(root)
     for name in ("light_seed", "clip_seed"):
-        some = files(write_human_capture(tmp_path / name, replace(TINY, num_new=0, num_test=0, **{name: 3})))
+        some = files(
+            write_human_capture(tmp_path / name, replace(TINY, num_new=0, num_test=0, **{name: 3}))
+        )
         assert some["images/train/f000_c00.png"] != plain["images/train/f000_c00.png"]
         assert (some["body_train.npz"] != plain["body_train.npz"]) == (name == "clip_seed")
     person = write_human_capture(tmp_path / "varied", varied(TINY, 3))
@@ -290,7 +333,10 @@ def test_light_comes_from_above_and_not_too_bright() -> None:
 def test_the_layout_is_read_as_a_person(root: Path) -> None:
     capture = captured(root)
     assert (capture.format, capture.warnings, capture.has_alpha) == ("body_json", (), True)
-    seen = {str(split): [(v.frame, v.camera_id, v.time) for v in views] for split, views in capture.splits.items()}
+    seen = {
+        str(split): [(v.frame, v.camera_id, v.time) for v in views]
+        for split, views in capture.splits.items()
+    }
     assert seen == {
         "train": [(f, c, float(f)) for f in range(2) for c in range(3)],
         "test": [(f, 3, float(f)) for f in range(2)],
@@ -303,7 +349,8 @@ def test_the_layout_is_read_as_a_person(root: Path) -> None:
 
 
 def test_the_parameters_pose_the_template_as_the_images_show_it(root: Path) -> None:
-    """Through the readers: the pelvis lies inside the silhouette, and the silhouette just fills the posed vertices'."""
+    """Through the readers: the pelvis lies inside the silhouette, and the silhouette just fills the
+    posed vertices'."""
     capture = captured(root)
     assert capture.body is not None
     exact = body().to(dtype=torch.float64)
@@ -332,13 +379,15 @@ def test_the_parameters_pose_the_template_as_the_images_show_it(root: Path) -> N
 
 def test_motions_of_the_files_are_those_of_the_clips(root: Path) -> None:
     for name, clip in (("train", walk), ("pose", squat)):
-        found, expected = read_motion(root / f"body_{name}.npz", body()), clip(body(), 2)
+        found = read_motion(root / f"body_{name}.npz", body())
+        expected = clip(body(), 2)
         assert torch.equal(found.poses, expected.poses)
         assert torch.equal(found.trans, expected.trans)
 
 
 def test_cameras_stand_around_the_person_and_see_all_of_it(tmp_path: Path) -> None:
-    """Nothing touches the border; test cameras stand between training cameras, at 22.5 degrees of eight."""
+    """Nothing touches the border; test cameras stand between training cameras, at 22.5 degrees of
+    eight."""
     options = replace(TINY, size=16, num_frames=1, num_new=1, num_cameras=8, num_test=2)
     capture = captured(write_human_capture(tmp_path / "out", options))
     azimuths: dict[str, list[float]] = {}
@@ -347,15 +396,23 @@ def test_cameras_stand_around_the_person_and_see_all_of_it(tmp_path: Path) -> No
             alpha = pixels(view.image_path)[..., 3]
             assert not np.concatenate([alpha[[0, -1]], alpha[:, [0, -1]].T]).any()
             center = -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]
-            azimuths.setdefault(str(split), []).append(np.degrees(np.arctan2(center[0], center[2])) % 360)
+            azimuths.setdefault(str(split), []).append(
+                np.degrees(np.arctan2(center[0], center[2])) % 360
+            )
     np.testing.assert_allclose(azimuths["train"], 45.0 * np.arange(8), atol=1e-9)
     np.testing.assert_allclose(azimuths["test"], [22.5, 202.5])
     assert azimuths["pose"] == azimuths["test"]
 
 
 def test_one_frame_without_test_cameras_is_enough(tmp_path: Path) -> None:
-    out = write_human_capture(tmp_path / "out", replace(TINY, num_frames=1, num_cameras=1, num_test=0))
-    assert set(files(out)) == {"transforms_train.json", "body_train.npz", "images/train/f000_c00.png"}
+    out = write_human_capture(
+        tmp_path / "out", replace(TINY, num_frames=1, num_cameras=1, num_test=0)
+    )
+    assert set(files(out)) == {
+        "transforms_train.json",
+        "body_train.npz",
+        "images/train/f000_c00.png",
+    }
 
 
 @pytest.mark.parametrize("changes", [{"size": 0}, {"samples": 0}, {"num_test": -1}, {"seed": -1}])
@@ -372,13 +429,15 @@ def test_a_used_folder_is_left_alone(tmp_path: Path) -> None:
     assert list(files(tmp_path)) == ["mine.txt"]
 
 
-# --- a walk in the layout of D-NeRF ---------------------------------------------------------------------------------
+# --- a walk in the layout of D-NeRF
+# ---------------------------------------------------------------------------------
 
 
 def test_a_walk_is_seen_once_per_time_and_its_true_tracks_lie_on_the_person(tmp_path: Path) -> None:
     options = HumanOptions(size=48, num_frames=5, num_test=2, samples=1)
     capture = captured(write_walking_capture(tmp_path / "out", options))
-    train, test = capture.splits["train"], capture.splits["test"]
+    train = capture.splits["train"]
+    test = capture.splits["test"]
     assert [view.time for view in train] == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert [view.time for view in test] == [0.125, 0.625]
     assert len({view.cam_from_world.tobytes() for view in (*train, *test)}) == 7
@@ -391,8 +450,12 @@ def test_a_walk_is_seen_once_per_time_and_its_true_tracks_lie_on_the_person(tmp_
         assert 0.2 < seen.mean() < 0.7, "one side of the person is seen"
         columns, rows = seen_at(view, tracks.points[tracks.moments[row]][seen]).T.astype(int)
         covered = np.pad(pixels(view.image_path)[..., 3], 1)
-        around = np.max([covered[rows + i, columns + j] for i in range(3) for j in range(3)], axis=0)
-        assert (around > 0).mean() > 0.97, "fingers are thinner than pixels, whose centres are sampled"
+        around = np.max(
+            [covered[rows + i, columns + j] for i in range(3) for j in range(3)], axis=0
+        )
+        assert (around > 0).mean() > 0.97, (
+            "fingers are thinner than pixels, whose centres are sampled"
+        )
     moved = np.linalg.norm(np.diff(tracks.points, axis=0), axis=-1)
     assert moved.max() > 0.05
     with pytest.raises(DyngsError, match="more times than test images"):

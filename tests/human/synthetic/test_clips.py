@@ -15,7 +15,8 @@ from dyngs.human.template.body import BodyTemplate, posed_vertices
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
 
-DANCE, OTHER = partial(random_clip, seed=1), partial(random_clip, seed=2)
+DANCE = partial(random_clip, seed=1)
+OTHER = partial(random_clip, seed=2)
 
 
 @cache
@@ -25,12 +26,17 @@ def body() -> BodyTemplate:
 
 def posed(motion: Motion, frame: int) -> np.ndarray:
     exact = body().to(dtype=torch.float64)
-    return posed_vertices(exact, motion.poses[[frame]].double(), motion.trans[[frame]].double())[0].numpy()
+    return posed_vertices(exact, motion.poses[[frame]].double(), motion.trans[[frame]].double())[
+        0
+    ].numpy()
 
 
 @pytest.mark.parametrize("clip", [walk, squat, DANCE, OTHER])
-def test_the_person_stands_on_the_floor_within_sight(clip: Callable[[BodyTemplate, int], Motion]) -> None:
-    """In every frame the lowest vertex is at y = 0, and all are inside a cylinder that the cameras see."""
+def test_the_person_stands_on_the_floor_within_sight(
+    clip: Callable[[BodyTemplate, int], Motion],
+) -> None:
+    """In every frame the lowest vertex is at y = 0, and all are inside a cylinder that the cameras
+    see."""
     motion = clip(body(), 5)
     for frame in range(5):
         x, y, z = posed(motion, frame).T
@@ -44,7 +50,11 @@ def test_the_clips_are_what_their_names_say() -> None:
     """Feet pass each other in a walk; in a squat the pelvis goes down and the hands go up."""
 
     def vertex(joint: str) -> int:
-        return int(torch.linalg.vector_norm(body().vertices - body().joints[JOINT_NAMES.index(joint)], dim=-1).argmin())
+        return int(
+            torch.linalg.vector_norm(
+                body().vertices - body().joints[JOINT_NAMES.index(joint)], dim=-1
+            ).argmin()
+        )
 
     left, right, wrist = (vertex(name) for name in ("left_ankle", "right_ankle", "left_wrist"))
     steps = [posed(walk(body(), 7), frame)[[left, right]] for frame in (1, 3)]
@@ -52,7 +62,8 @@ def test_the_clips_are_what_their_names_say() -> None:
     assert ahead[0] > 0.3
     assert ahead[1] < -0.3
     motion = squat(body(), 3)
-    first, last = posed(motion, 0)[wrist], posed(motion, 2)[wrist]
+    first = posed(motion, 0)[wrist]
+    last = posed(motion, 2)[wrist]
     assert motion.trans[2, 1] < motion.trans[0, 1] - 0.2
     assert last[1] > first[1] + 0.2
 

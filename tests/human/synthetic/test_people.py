@@ -1,4 +1,5 @@
-"""Sets of synthetic people: the same bytes, all different, depth and key points that fit the images."""
+"""Sets of synthetic people: the same bytes, all different, depth and key points that fit the
+images."""
 
 from __future__ import annotations
 
@@ -25,7 +26,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
 
 
 def test_the_same_options_give_the_same_bytes_also_in_parts(root: Path, tmp_path: Path) -> None:
@@ -38,7 +43,11 @@ def test_the_same_options_give_the_same_bytes_also_in_parts(root: Path, tmp_path
 
 def test_people_differ_in_everything() -> None:
     """Also those of other seeds; every other one wears usual clothes; shards hold so many."""
-    options = [person_options(PeopleOptions(seed=seed), number) for seed in (0, 1) for number in range(SHARD + 1)]
+    options = [
+        person_options(PeopleOptions(seed=seed), number)
+        for seed in (0, 1)
+        for number in range(SHARD + 1)
+    ]
     for name in ("seed", "body_seed", "light_seed", "clip_seed", "ring_seed"):
         assert len({getattr(one, name) for one in options}) == len(options)
     assert [one.usual_clothes for one in options[:4]] == [False, True, False, True]
@@ -53,17 +62,24 @@ def test_depth_and_silhouettes_agree_between_views(root: Path) -> None:
         for image in images:
             assert image.depth is not None
             assert image.alpha is not None
-            assert (image.depth[image.alpha == 1] > 0).float().mean() > 0.99, "depth is of centres of pixels"
+            assert (image.depth[image.alpha == 1] > 0).float().mean() > 0.99, (
+                "depth is of centres of pixels"
+            )
             assert (image.alpha[image.depth > 0] > 0).float().mean() > 0.99
             rows, columns = (image.depth > 0).nonzero(as_tuple=True)
             pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=1)
-            seen = image.depth[rows, columns][:, None] * (pixels @ torch.linalg.inv(image.cameras.intrinsics[0]).T)
+            seen = image.depth[rows, columns][:, None] * (
+                pixels @ torch.linalg.inv(image.cameras.intrinsics[0]).T
+            )
             pose = image.cameras.cam_from_world[0]
             points = (seen - pose[:3, 3]) @ pose[:3, :3]
             assert float(points[:, 1].min()) + 0.02 >= 0
             for other in images:
                 assert other.alpha is not None
-                there = points @ other.cameras.cam_from_world[0, :3, :3].T + other.cameras.cam_from_world[0, :3, 3]
+                there = (
+                    points @ other.cameras.cam_from_world[0, :3, :3].T
+                    + other.cameras.cam_from_world[0, :3, 3]
+                )
                 flat = there @ other.cameras.intrinsics[0].T
                 column, row = (flat[:, :2] / flat[:, 2:]).long().T
                 wide = torch.nn.functional.max_pool2d(other.alpha[None], 3, 1, 1)[0]
@@ -89,7 +105,12 @@ def test_what_does_not_fit_is_refused(root: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(DyngsError, match="exists already"):
         write_people(tmp_path, SMALL)
-    for bad in (PeopleOptions(people=0), PeopleOptions(size=0), PeopleOptions(cameras=0), PeopleOptions(seed=-1)):
+    for bad in (
+        PeopleOptions(people=0),
+        PeopleOptions(size=0),
+        PeopleOptions(cameras=0),
+        PeopleOptions(seed=-1),
+    ):
         with pytest.raises(DyngsError, match="at least"):
             write_people(tmp_path / "new", bad)
     assert not (tmp_path / "new").exists()

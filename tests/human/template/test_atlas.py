@@ -1,4 +1,5 @@
-"""Texels on the surface of a template: which triangle has them, where they lie, and what lies above them."""
+"""Texels on the surface of a template: which triangle has them, where they lie, and what lies above
+them."""
 
 from __future__ import annotations
 
@@ -24,8 +25,11 @@ from dyngs.human.template.body_reader import default_template
 NUM_JOINTS = 2
 
 
-def body_of(vertices: Tensor, faces: Tensor, uv: Tensor, uv_faces: Tensor | None = None) -> BodyTemplate:
-    """A template with two joints; the fraction of the second grows with x, from 0 at x = 0 to 1 at x = 1."""
+def body_of(
+    vertices: Tensor, faces: Tensor, uv: Tensor, uv_faces: Tensor | None = None
+) -> BodyTemplate:
+    """A template with two joints; the fraction of the second grows with x, from 0 at x = 0 to 1 at
+    x = 1."""
     fraction = vertices[:, :1]
     return BodyTemplate(
         name="test",
@@ -40,7 +44,8 @@ def body_of(vertices: Tensor, faces: Tensor, uv: Tensor, uv_faces: Tensor | None
 
 
 def sheet(uv: Tensor, faces: Tensor) -> BodyTemplate:
-    """The part of the plane z = 0.25 whose texture is itself, facing +z where ``faces`` are counter-clockwise."""
+    """The part of the plane z = 0.25 whose texture is itself, facing +z where ``faces`` are
+    counter-clockwise."""
     return body_of(torch.cat([uv, torch.full((len(uv), 1), 0.25)], dim=1), faces, uv)
 
 
@@ -48,18 +53,30 @@ def square(flipped: bool = False) -> BodyTemplate:
     """A square of side 1 of two triangles; its texture upright or mirrored."""
     corners = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     body = sheet(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
-    return replace(body, uv=corners * torch.tensor([-1.0, 1]) + torch.tensor([1.0, 0])) if flipped else body
+    return (
+        replace(body, uv=corners * torch.tensor([-1.0, 1]) + torch.tensor([1.0, 0]))
+        if flipped
+        else body
+    )
 
 
 def cube(turned_diagonals: int) -> BodyTemplate:
-    """The cube [0, 1]^3, each side a third of the atlas' width and half of its height; 6 bits turn its diagonals."""
+    """The cube [0, 1]^3, each side a third of the atlas' width and half of its height; 6 bits turn
+    its diagonals."""
     vertices = torch.tensor(list(product((0.0, 1.0), repeat=3)))
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces, uv_faces, uv = [], [], []
+    faces = []
+    uv_faces = []
+    uv = []
     for k, side in enumerate(sides):
         place = torch.tensor([k % 3, k // 3])
-        uv += [(place + torch.tensor(c)) / torch.tensor([3.0, 2]) for c in ((0, 0), (1, 0), (1, 1), (0, 1))]
-        for corners in ((0, 1, 2), (0, 2, 3)) if turned_diagonals >> k & 1 else ((0, 1, 3), (1, 2, 3)):
+        uv += [
+            (place + torch.tensor(c)) / torch.tensor([3.0, 2])
+            for c in ((0, 0), (1, 0), (1, 1), (0, 1))
+        ]
+        for corners in (
+            ((0, 1, 2), (0, 2, 3)) if turned_diagonals >> k & 1 else ((0, 1, 3), (1, 2, 3))
+        ):
             faces.append([side[c] for c in corners])
             uv_faces.append([4 * k + c for c in corners])
     return body_of(vertices, torch.tensor(faces), torch.stack(uv), torch.tensor(uv_faces))
@@ -67,8 +84,11 @@ def cube(turned_diagonals: int) -> BodyTemplate:
 
 def centres(texels: Texels) -> Tensor:
     """(P, 2) uv of the texels' centres."""
-    row, column = texels.index // texels.resolution, texels.index % texels.resolution
-    return torch.stack([(column + 0.5) / texels.resolution, 1 - (row + 0.5) / texels.resolution], dim=1)
+    row = texels.index // texels.resolution
+    column = texels.index % texels.resolution
+    return torch.stack(
+        [(column + 0.5) / texels.resolution, 1 - (row + 0.5) / texels.resolution], dim=1
+    )
 
 
 def face_normals(body: BodyTemplate, faces: Tensor) -> Tensor:
@@ -90,16 +110,19 @@ def anny(resolution: int) -> Texels:
     return atlas_texels(default_template(), resolution)
 
 
-# --- which triangle has a texel ---------------------------------------------------------------------------------------
+# --- which triangle has a texel
+# ---------------------------------------------------------------------------------------
 
 
 def first_triangle(corners: np.ndarray, column: int, row: int, resolution: int) -> int | None:
-    """The first of the triangles (T, 3, 2), in 64ths of the atlas' side, that holds the centre; in whole numbers."""
+    """The first of the triangles (T, 3, 2), in 64ths of the atlas' side, that holds the centre; in
+    whole numbers."""
     centre = (64 * (2 * column + 1), 64 * (2 * (resolution - row) - 1))
     for number, triangle in enumerate((2 * resolution * corners).tolist()):
         turns = []
         for k in range(3):
-            a, b = triangle[k], triangle[(k + 1) % 3]
+            a = triangle[k]
+            b = triangle[(k + 1) % 3]
             turns.append((b[0] - a[0]) * (centre[1] - a[1]) - (b[1] - a[1]) * (centre[0] - a[0]))
         (ax, ay), (bx, by), (cx, cy) = triangle
         if (bx - ax) * (cy - ay) != (by - ay) * (cx - ax) and (min(turns) >= 0 or max(turns) <= 0):
@@ -109,10 +132,17 @@ def first_triangle(corners: np.ndarray, column: int, row: int, resolution: int) 
 
 @settings(max_examples=60, deadline=None)
 @given(arrays(np.int64, (4, 3, 2), elements=st.integers(-8, 72)), st.sampled_from([1, 2, 4, 8]))
-def test_the_first_triangle_that_holds_the_centre_has_the_texel(corners: np.ndarray, resolution: int) -> None:
-    """On a grid on which centres lie on edges and corners; triangles overlap, are degenerate, or leave the atlas."""
+def test_the_first_triangle_that_holds_the_centre_has_the_texel(
+    corners: np.ndarray, resolution: int
+) -> None:
+    """On a grid on which centres lie on edges and corners; triangles overlap, are degenerate, or
+    leave the atlas."""
     uv = torch.from_numpy(corners.reshape(-1, 2) / 64).float()
-    body = body_of(torch.rand(12, 3, generator=torch.Generator().manual_seed(0)), torch.arange(12).reshape(4, 3), uv)
+    body = body_of(
+        torch.rand(12, 3, generator=torch.Generator().manual_seed(0)),
+        torch.arange(12).reshape(4, 3),
+        uv,
+    )
     texels = atlas_texels(body, resolution)
     found = dict(zip(texels.index.tolist(), texels.faces.tolist(), strict=True))
     expected = {}
@@ -130,7 +160,9 @@ def test_the_first_triangle_that_holds_the_centre_has_the_texel(corners: np.ndar
 def test_a_triangulated_square_has_neither_holes_nor_overlap(seed: int, resolution: int) -> None:
     """Of any triangles; centres are blends of their corners."""
     points = np.random.default_rng(seed).random((20, 2))
-    uv = np.concatenate([points, [[0, 0], [1, 0], [1, 1], [0, 1]], np.round(points * resolution) / resolution])
+    uv = np.concatenate(
+        [points, [[0, 0], [1, 0], [1, 1], [0, 1]], np.round(points * resolution) / resolution]
+    )
     uv = np.unique(uv.astype(np.float32), axis=0)
     faces = torch.from_numpy(Delaunay(uv).simplices).long()
     texels = atlas_texels(sheet(torch.from_numpy(uv), faces), resolution)
@@ -145,10 +177,14 @@ def test_a_triangulated_square_has_neither_holes_nor_overlap(seed: int, resoluti
 @settings(max_examples=60, deadline=None)
 @given(st.floats(0, 1), st.integers(0, 6), st.integers(0, 6))
 def test_no_texel_is_lost_on_a_shared_edge(start: float, column: int, row: int) -> None:
-    """An edge across the atlas that meets a centre up to rounding: one side or the other has the texel."""
-    u, v = (column + 0.5) / 7, 1 - (row + 0.5) / 7
+    """An edge across the atlas that meets a centre up to rounding: one side or the other has the
+    texel."""
+    u = (column + 0.5) / 7
+    v = 1 - (row + 0.5) / 7
     end = start + (v - start) / u
-    uv = torch.tensor([[0.0, -9], [1, -9], [0, start], [1, end], [0, 9], [1, 9]], dtype=torch.float64)
+    uv = torch.tensor(
+        [[0.0, -9], [1, -9], [0, start], [1, end], [0, 9], [1, 9]], dtype=torch.float64
+    )
     texels = atlas_texels(sheet(uv, torch.tensor([[0, 1, 3], [0, 3, 2], [2, 3, 5], [2, 5, 4]])), 7)
     assert torch.equal(texels.index, torch.arange(49))
 
@@ -161,7 +197,8 @@ def test_the_first_row_is_at_the_top() -> None:
 
 
 def test_degenerate_triangles_cover_nothing() -> None:
-    """In the atlas, or on the surface: there the neighbour has the shared edge, and nobody the inside."""
+    """In the atlas, or on the surface: there the neighbour has the shared edge, and nobody the
+    inside."""
     body = square()
     assert body.uv is not None
     flat = body.vertices.clone()
@@ -179,7 +216,8 @@ def test_degenerate_triangles_cover_nothing() -> None:
     assert torch.equal(atlas_texels(replace(body, uv=uv), 4).index, texels.index)
 
 
-# --- where it lies on the surface -------------------------------------------------------------------------------------
+# --- where it lies on the surface
+# -------------------------------------------------------------------------------------
 
 
 def test_on_a_plane_everything_is_known() -> None:
@@ -211,7 +249,8 @@ def test_mirrored_texture_has_right_handed_frames_all_the_same() -> None:
 
 @pytest.mark.parametrize("turned_diagonals", [0, 0b111111, 0b010011])
 def test_cube(turned_diagonals: int) -> None:
-    """Normals at corners are diagonal however its sides are cut; elsewhere they are blends; areas are exact."""
+    """Normals at corners are diagonal however its sides are cut; elsewhere they are blends; areas
+    are exact."""
     body = cube(turned_diagonals)
     texels = atlas_texels(body, 24)
     assert len(texels) == 24 * 24
@@ -230,7 +269,9 @@ def test_a_sheet_with_two_sides_has_the_normals_of_its_faces() -> None:
     """Its smooth normals cancel."""
     uv = torch.tensor([[0.0, 0], [0.5, 0], [0, 0.5], [1, 1], [0.5, 1], [1, 0.5]])
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    body = body_of(vertices, torch.tensor([[0, 1, 2], [0, 2, 1]]), uv, torch.tensor([[0, 1, 2], [3, 4, 5]]))
+    body = body_of(
+        vertices, torch.tensor([[0, 1, 2], [0, 2, 1]]), uv, torch.tensor([[0, 1, 2], [3, 4, 5]])
+    )
     texels = atlas_texels(body, 8)
     assert set(texels.faces.tolist()) == {0, 1}
     expected = torch.tensor([[0.0, 0, 1], [0, 0, -1]])[texels.faces]
@@ -239,7 +280,8 @@ def test_a_sheet_with_two_sides_has_the_normals_of_its_faces() -> None:
 
 
 def test_a_normal_along_the_tangent_still_has_a_frame() -> None:
-    """A sheet with two sides, whose own normals cancel, and at each corner a fin that looks along x, as u grows."""
+    """A sheet with two sides, whose own normals cancel, and at each corner a fin that looks along
+    x, as u grows."""
     sides = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     fins = (sides[:, None] + torch.tensor([[0.0, 1, 0], [0, 0, 1]])).reshape(6, 3)
     faces = torch.tensor([[0, 1, 2], [0, 2, 1], [0, 3, 4], [1, 5, 6], [2, 7, 8]])
@@ -254,7 +296,8 @@ def test_a_normal_along_the_tangent_still_has_a_frame() -> None:
 def test_a_larger_person_has_larger_texels() -> None:
     """The rest shape may be another than the template's."""
     body = default_template()
-    usual, large = anny(64), atlas_texels(body, 64, vertices=2 * body.vertices)
+    usual = anny(64)
+    large = atlas_texels(body, 64, vertices=2 * body.vertices)
     assert torch.equal(large.index, usual.index)
     torch.testing.assert_close(large.points, 2 * usual.points)
     torch.testing.assert_close(large.size, 2 * usual.size)
@@ -274,7 +317,8 @@ def test_what_cannot_be_done() -> None:
         atlas_texels(body, 8, vertices=torch.full((4, 3), math.nan))
 
 
-# --- the shipped template ---------------------------------------------------------------------------------------------
+# --- the shipped template
+# ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("resolution", "count"), [(256, 40_994), (512, 163_992)])
@@ -282,7 +326,8 @@ def test_texels_of_the_template(resolution: int, count: int) -> None:
     texels = anny(resolution)
     assert len(texels) == count
     assert bool((texels.index.diff() > 0).all())
-    fractions, sums = texels.barycentric, texels.weights.double().sum(1)
+    fractions = texels.barycentric
+    sums = texels.weights.double().sum(1)
     assert float(fractions.min()) >= 0
     assert float(fractions.max()) <= 1
     torch.testing.assert_close(sums, torch.ones_like(sums), rtol=0, atol=5e-7)
@@ -291,7 +336,8 @@ def test_texels_of_the_template(resolution: int, count: int) -> None:
 
 def test_texels_lie_on_their_faces_which_look_outwards() -> None:
     """Smooth normals differ from those of faces, but nowhere by 90 degrees."""
-    body, texels = default_template(), anny(256)
+    body = default_template()
+    texels = anny(256)
     flat = face_normals(body, texels.faces)
     corner = body.vertices[body.faces[texels.faces, 0]].double()
     above = ((texels.points.double() - corner) * flat).sum(1)
@@ -314,7 +360,9 @@ def test_squares_of_the_sizes_add_up_to_the_surface() -> None:
     assert float(anny(256).size.double().square().sum()) == pytest.approx(area, rel=2e-3)
 
 
-# --- shells -----------------------------------------------------------------------------------------------------------
+# --- shells
+# -----------------------------------------------------------------------------------------------------------
 
 
-# --- neighbours -------------------------------------------------------------------------------------------------------
+# --- neighbours
+# -------------------------------------------------------------------------------------------------------

@@ -1,4 +1,5 @@
-"""The body in any pose: known answers with the free template, batches, gradients, requests that cannot be met.
+"""The body in any pose: known answers with the free template, batches, gradients, requests that
+cannot be met.
 
 J joints, M vertices, F frames.
 """
@@ -28,8 +29,21 @@ from dyngs.human.template.body import (
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
 
-LEFT_ELBOW, LEFT_WRIST, LEFT_FINGERS = 18, 20, range(25, 40)
-SIDES = {1: 2, 4: 5, 7: 8, 10: 11, 13: 14, 16: 17, 18: 19, 20: 21, 23: 24, **{i: i + 15 for i in range(25, 40)}}
+LEFT_ELBOW = 18
+LEFT_WRIST = 20
+LEFT_FINGERS = range(25, 40)
+SIDES = {
+    1: 2,
+    4: 5,
+    7: 8,
+    10: 11,
+    13: 14,
+    16: 17,
+    18: 19,
+    20: 21,
+    23: 24,
+    **{i: i + 15 for i in range(25, 40)},
+}
 """Left joints of SMPL-X and their counterparts on the right."""
 
 
@@ -66,7 +80,8 @@ def about_z(angle: float) -> Tensor:
     return torch.tensor([0.0, 0.0, angle])
 
 
-# --- the free template ------------------------------------------------------------------------------------------------
+# --- the free template
+# ------------------------------------------------------------------------------------------------
 
 
 def test_the_template_is_a_person_of_normal_size_who_faces_forward(template: BodyTemplate) -> None:
@@ -86,7 +101,9 @@ def test_its_surface_is_closed_and_faces_outward(template: BodyTemplate) -> None
     a, b, c = template.vertices.double()[template.faces].unbind(1)
     volume = float((a * torch.linalg.cross(b, c)).sum() / 6)
     assert 0.05 < volume < 0.1
-    edges = torch.cat([template.faces[:, [0, 1]], template.faces[:, [1, 2]], template.faces[:, [2, 0]]])
+    edges = torch.cat(
+        [template.faces[:, [0, 1]], template.faces[:, [1, 2]], template.faces[:, [2, 0]]]
+    )
     forward, backward = (x[:, 0] * len(template.vertices) + x[:, 1] for x in (edges, edges.flip(1)))
     assert torch.equal(forward.sort().values, backward.sort().values)
     assert len(forward.unique()) == len(forward)
@@ -104,11 +121,13 @@ def test_its_texture_coordinates_belong_to_the_corners(template: BodyTemplate) -
 
 def test_rest_is_the_template(template: BodyTemplate) -> None:
     found = posed_vertices(template, torch.zeros(2, 55, 3), torch.zeros(2, 3))
-    torch.testing.assert_close(found, template.vertices.expand(2, -1, -1), rtol=0, atol=2e-7)  # one bit of 1.0 m
+    # one bit of 1.0 m
+    torch.testing.assert_close(found, template.vertices.expand(2, -1, -1), rtol=0, atol=2e-7)
 
 
 def test_an_elbow_bent_by_90_degrees_lifts_the_forearm(template: BodyTemplate) -> None:
-    """The left arm lies along +x; about +z it goes from +x to +y. What follows only the hand turns about the elbow."""
+    """The left arm lies along +x; about +z it goes from +x to +y. What follows only the hand turns
+    about the elbow."""
     poses = torch.zeros(1, 55, 3)
     poses[0, LEFT_ELBOW] = about_z(math.pi / 2)
     found = posed_vertices(template, poses, torch.zeros(1, 3))[0]
@@ -116,7 +135,9 @@ def test_an_elbow_bent_by_90_degrees_lifts_the_forearm(template: BodyTemplate) -
     assert hand.sum() > 500
     elbow = template.joints[LEFT_ELBOW]
     arm = template.vertices[hand] - elbow
-    expected = torch.stack([elbow[0] - arm[:, 1], elbow[1] + arm[:, 0], template.vertices[hand, 2]], 1)
+    expected = torch.stack(
+        [elbow[0] - arm[:, 1], elbow[1] + arm[:, 0], template.vertices[hand, 2]], 1
+    )
     torch.testing.assert_close(found[hand], expected, rtol=0, atol=1e-6)
     assert found[hand, 1].min() > elbow[1] + 0.2
     still = template.weights[:, [LEFT_ELBOW, LEFT_WRIST, *LEFT_FINGERS]].sum(1) == 0
@@ -124,7 +145,8 @@ def test_an_elbow_bent_by_90_degrees_lifts_the_forearm(template: BodyTemplate) -
 
 
 def test_the_mirrored_pose_is_the_mirrored_body(template: BodyTemplate) -> None:
-    """Left and right changed, y and z of the axes reversed. The template is symmetric to a fraction of a millimetre."""
+    """Left and right changed, y and z of the axes reversed. The template is symmetric to a fraction
+    of a millimetre."""
     poses = 0.3 * normal(1, 55, 3).float()
     mirrored = poses * torch.tensor([1.0, -1.0, -1.0])
     swap = list(range(55))
@@ -132,7 +154,9 @@ def test_the_mirrored_pose_is_the_mirrored_body(template: BodyTemplate) -> None:
         swap[left], swap[right] = right, left
     both = torch.cat([poses, mirrored[:, swap]])
     one, other = posed_vertices(template, both, torch.zeros(2, 3))
-    _, twins = KDTree(template.vertices.numpy()).query((template.vertices * torch.tensor([-1.0, 1, 1])).numpy())
+    _, twins = KDTree(template.vertices.numpy()).query(
+        (template.vertices * torch.tensor([-1.0, 1, 1])).numpy()
+    )
     gaps = (one[torch.from_numpy(twins)] * torch.tensor([-1.0, 1, 1]) - other).norm(dim=1)
     assert float(gaps.mean()) < 2e-4
     assert float(gaps.max()) < 1e-2
@@ -148,13 +172,17 @@ def test_the_root_turns_all_about_the_pelvis_before_scale_and_shift(template: Bo
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
 
 
-# --- shape and expression ---------------------------------------------------------------------------------------------
+# --- shape and expression
+# ---------------------------------------------------------------------------------------------
 
 
 def test_shape_moves_vertices_and_joints_linearly() -> None:
-    body, betas, expression = tiny(), torch.tensor([0.5, -1, 2]).double(), torch.tensor([3.0, -0.25]).double()
+    body = tiny()
+    betas = torch.tensor([0.5, -1, 2]).double()
+    expression = torch.tensor([3.0, -0.25]).double()
     vertices, joints = apply_shape(body, betas, expression)
-    expected, expected_joints = body.vertices.clone(), body.joints.clone()
+    expected = body.vertices.clone()
+    expected_joints = body.joints.clone()
     for amounts, dirs, joint_dirs in (
         (betas, body.shape_dirs, body.joint_shape_dirs),
         (expression, body.expression_dirs, body.joint_expression_dirs),
@@ -171,7 +199,9 @@ def test_shape_moves_vertices_and_joints_linearly() -> None:
 def test_parameters_not_given_are_zero() -> None:
     body = tiny()
     one = torch.tensor([0.7]).double()
-    torch.testing.assert_close(apply_shape(body, one), apply_shape(body, torch.tensor([0.7, 0, 0]).double()))
+    torch.testing.assert_close(
+        apply_shape(body, one), apply_shape(body, torch.tensor([0.7, 0, 0]).double())
+    )
     assert apply_shape(body, None) == (body.vertices, body.joints)
     assert torch.equal(apply_shape(body, one[:0])[0], body.vertices)
 
@@ -179,32 +209,39 @@ def test_parameters_not_given_are_zero() -> None:
 def test_zeros_that_the_body_has_no_use_for_are_fine(template: BodyTemplate) -> None:
     """Motion files come with 10 or 16 of them."""
     assert torch.equal(apply_shape(template, torch.zeros(10))[0], template.vertices)
-    found, expected = (
-        apply_shape(tiny(), torch.tensor([1.0, 2, 3, 0, 0]).double()),
-        apply_shape(tiny(), torch.tensor([1.0, 2, 3]).double()),
-    )
+    found = apply_shape(tiny(), torch.tensor([1.0, 2, 3, 0, 0]).double())
+    expected = apply_shape(tiny(), torch.tensor([1.0, 2, 3]).double())
     torch.testing.assert_close(found, expected)
 
 
 def test_parameters_that_the_body_lacks_are_refused(template: BodyTemplate) -> None:
-    with pytest.raises(DyngsError, match=r"^betas: 46 numbers given, but the anny body has 44; .*set them to 0$"):
+    with pytest.raises(
+        DyngsError, match=r"^betas: 46 numbers given, but the anny body has 44; .*set them to 0$"
+    ):
         apply_shape(template, torch.ones(46))
     with pytest.raises(DyngsError, match=r"^expression: 3 numbers given, but the tiny body has 2;"):
         apply_shape(tiny(), None, torch.ones(3).double())
 
 
 def test_poses_of_another_body_are_refused(template: BodyTemplate) -> None:
-    with pytest.raises(DyngsError, match=r"^poses must be \(frames, 55, 3\) for the anny body, got \(1, 24, 3\)$"):
+    with pytest.raises(
+        DyngsError, match=r"^poses must be \(frames, 55, 3\) for the anny body, got \(1, 24, 3\)$"
+    ):
         posed_vertices(template, torch.zeros(1, 24, 3), torch.zeros(1, 3))
 
 
-# --- batches, types, gradients ----------------------------------------------------------------------------------------
+# --- batches, types, gradients
+# ----------------------------------------------------------------------------------------
 
 
 def test_frames_are_those_one_by_one() -> None:
     """Also when shape and expression change with the frame."""
-    body, poses, trans, scale = tiny(), normal(3, 4, 3), normal(3, 3), normal(3).exp()
-    betas, expression = normal(3, 3), normal(3, 2)
+    body = tiny()
+    poses = normal(3, 4, 3)
+    trans = normal(3, 3)
+    scale = normal(3).exp()
+    betas = normal(3, 3)
+    expression = normal(3, 2)
     found = posed_vertices(body, poses, trans, betas, expression, scale)
     constant = posed_vertices(body, poses, trans, betas[0], expression[0], scale)
     for f in range(3):
@@ -216,12 +253,17 @@ def test_frames_are_those_one_by_one() -> None:
 
 
 def test_pose_blend_shapes_follow_all_rotations_but_the_root() -> None:
-    body, poses = tiny(), torch.zeros(1, 4, 3).double()
+    body = tiny()
+    poses = torch.zeros(1, 4, 3).double()
     plain = replace(body, pose_dirs=None)
     poses[0, 0] = normal(3)
-    torch.testing.assert_close(posed_vertices(body, poses, normal(1, 3)), posed_vertices(plain, poses, normal(1, 3)))
+    torch.testing.assert_close(
+        posed_vertices(body, poses, normal(1, 3)), posed_vertices(plain, poses, normal(1, 3))
+    )
     poses[0, 2] = normal(3)
-    assert not torch.allclose(posed_vertices(body, poses, normal(1, 3)), posed_vertices(plain, poses, normal(1, 3)))
+    assert not torch.allclose(
+        posed_vertices(body, poses, normal(1, 3)), posed_vertices(plain, poses, normal(1, 3))
+    )
 
 
 def test_no_frames_are_no_vertices(template: BodyTemplate) -> None:
@@ -234,7 +276,11 @@ def test_in_float64_nothing_is_left_in_float32(template: BodyTemplate) -> None:
     found = posed_vertices(body, poses, normal(1, 3))
     assert found.dtype == torch.float64
     assert body.faces.dtype == torch.long
-    assert {getattr(body, f.name).dtype for f in fields(body) if isinstance(getattr(body, f.name), Tensor)} == {
+    assert {
+        getattr(body, f.name).dtype
+        for f in fields(body)
+        if isinstance(getattr(body, f.name), Tensor)
+    } == {
         torch.float64,
         torch.long,
     }
@@ -246,10 +292,13 @@ def test_in_float64_nothing_is_left_in_float32(template: BodyTemplate) -> None:
 def test_gradients(size: float) -> None:
     body = tiny()
     given = (size * normal(2, 4, 3), normal(2, 3), normal(3), normal(2, 2), normal(2).exp())
-    assert torch.autograd.gradcheck(lambda *x: posed_vertices(body, *x), tuple(x.requires_grad_() for x in given))
+    assert torch.autograd.gradcheck(
+        lambda *x: posed_vertices(body, *x), tuple(x.requires_grad_() for x in given)
+    )
 
 
-# --- what does not fit ------------------------------------------------------------------------------------------------
+# --- what does not fit
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -291,7 +340,9 @@ def test_a_bone_moves_all_that_is_below_it_and_nothing_else() -> None:
     _, _, joints = bare_template()
     knee = joints[:, :, 3 * SIDED.index("knee") + 1]
     moved = {name for name, move in zip(JOINT_NAMES, knee, strict=True) if move.any()}
-    assert moved == {f"{side}_{name}" for side in ("left", "right") for name in ("knee", "ankle", "foot")}
+    assert moved == {
+        f"{side}_{name}" for side in ("left", "right") for name in ("knee", "ankle", "foot")
+    }
     assert knee[JOINT_NAMES.index("left_foot"), 1] == pytest.approx(BONE_UNIT)
 
 
@@ -303,7 +354,9 @@ def test_a_longer_shin_stretches_the_shin_and_carries_the_foot() -> None:
     body, vertices, _ = bare_template()
     ankle = vertices[:, 1, 3 * SIDED.index("ankle") + 1]
     weights = body.weights.numpy()
-    foot, head, shin = (weights[:, JOINT_NAMES.index(name)] > 0.99 for name in ("left_foot", "head", "left_knee"))
+    foot, head, shin = (
+        weights[:, JOINT_NAMES.index(name)] > 0.99 for name in ("left_foot", "head", "left_knee")
+    )
     assert ankle[foot] == pytest.approx(BONE_UNIT)
     assert np.abs(ankle[head]).max() == 0
     height = body.vertices.numpy()[shin, 1]
@@ -322,6 +375,9 @@ def test_the_template_has_directions_of_shape_and_of_bones() -> None:
 def test_directions_of_shape_are_symmetric() -> None:
     body, _, _ = bare_template()
     assert body.joint_shape_dirs is not None
-    hips = (body.joint_shape_dirs[JOINT_NAMES.index(f"{side}_hip"), :, :10] for side in ("left", "right"))
+    hips = (
+        body.joint_shape_dirs[JOINT_NAMES.index(f"{side}_hip"), :, :10]
+        for side in ("left", "right")
+    )
     left, right = (x.numpy() for x in hips)
     assert np.allclose(left * np.array([-1, 1, 1])[:, None], right, atol=2e-5)

@@ -8,8 +8,22 @@ from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS, mirrored_joints
 
 
 def test_the_joints_are_those_of_smplx() -> None:
-    known = {0: "pelvis", 9: "spine3", 15: "head", 18: "left_elbow", 21: "right_wrist", 22: "jaw", 24: "right_eye"}
-    known |= {25: "left_index1", 36: "left_ring3", 39: "left_thumb3", 40: "right_index1", 54: "right_thumb3"}
+    known = {
+        0: "pelvis",
+        9: "spine3",
+        15: "head",
+        18: "left_elbow",
+        21: "right_wrist",
+        22: "jaw",
+        24: "right_eye",
+    }
+    known |= {
+        25: "left_index1",
+        36: "left_ring3",
+        39: "left_thumb3",
+        40: "right_index1",
+        54: "right_thumb3",
+    }
     assert len(set(JOINT_NAMES)) == 55
     assert {i: JOINT_NAMES[i] for i in known} == known
 
@@ -20,7 +34,8 @@ def test_the_other_side_of_every_joint(count: int) -> None:
     assert sorted(mirrored) == list(range(count))
     assert [mirrored[row] for row in mirrored] == list(range(count))
     for row, rank in enumerate(SMPLX_ROWS[count]):
-        name, other = JOINT_NAMES[rank], mirrored[row]
+        name = JOINT_NAMES[rank]
+        other = mirrored[row]
         if other != row:
             assert {name, JOINT_NAMES[SMPLX_ROWS[count][other]]} == {
                 f"left_{name[name.index('_') + 1 :]}",

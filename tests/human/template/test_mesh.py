@@ -8,7 +8,8 @@ from dyngs.human.template.mesh import interpolate, normalized, rasterize, vertex
 
 
 def test_the_nearer_triangle_is_seen() -> None:
-    """Two that overlap: attributes at a grid point are those of the one with the larger nearness."""
+    """Two that overlap: attributes at a grid point are those of the one with the larger
+    nearness."""
     far = [[0.0, 0.0, 0.5], [8.0, 0.0, 0.5], [0.0, 8.0, 0.5]]
     near = [[0.0, 0.0, 1.0], [3.0, 0.0, 1.0], [0.0, 3.0, 1.0]]
     fragments = rasterize(np.array([far, near]), 8, 8)
@@ -18,7 +19,9 @@ def test_the_nearer_triangle_is_seen() -> None:
     assert owner[9] == 1
     assert owner[4] == 0
     assert owner[63] == -1
-    columns = interpolate(fragments.barycentric, np.array([far, near])[fragments.faces][..., :1])[:, 0]
+    columns = interpolate(fragments.barycentric, np.array([far, near])[fragments.faces][..., :1])[
+        :, 0
+    ]
     np.testing.assert_allclose(columns, fragments.index % 8, atol=1e-12)  # sums of a few float64
     assert len(np.unique(fragments.index)) == len(fragments.index)
 
@@ -39,4 +42,6 @@ def test_normals_of_a_pyramid() -> None:
 
 
 def test_unit_leaves_zero() -> None:
-    np.testing.assert_array_equal(normalized(np.array([[0.0, 0, 0], [0, 3, 4]])), [[0, 0, 0], [0, 0.6, 0.8]])
+    np.testing.assert_array_equal(
+        normalized(np.array([[0.0, 0, 0], [0, 3, 4]])), [[0, 0, 0], [0, 0.6, 0.8]]
+    )

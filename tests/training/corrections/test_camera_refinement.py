@@ -1,4 +1,5 @@
-"""Corrections of cameras: their gradients, what they leave alone, and that they find cameras that were disturbed."""
+"""Corrections of cameras: their gradients, what they leave alone, and that they find cameras that
+were disturbed."""
 
 from __future__ import annotations
 
@@ -59,7 +60,10 @@ def random_views(count: int, seed: int = 0) -> list[View]:
 
 def camera_of(view: View) -> Cameras:
     return Cameras(
-        torch.as_tensor(view.cam_from_world)[None], torch.as_tensor(view.intrinsics)[None], view.width, view.height
+        torch.as_tensor(view.cam_from_world)[None],
+        torch.as_tensor(view.intrinsics)[None],
+        view.width,
+        view.height,
     )
 
 
@@ -73,7 +77,8 @@ def test_slopes_are_the_gradients_of_a_correction(seed: int) -> None:
 
     def loss(camera: Cameras) -> Tensor:
         k = camera.intrinsics[0]
-        of_lens = torch.stack([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])  # all that the rasterizer takes of it
+        # all that the rasterizer takes of it
+        of_lens = torch.stack([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
         return (camera.cam_from_world[0, :3] * weights).sum() + (of_lens * by_lens).sum()
 
     leaf = watched(camera)
@@ -95,8 +100,11 @@ def test_no_correction_changes_nothing() -> None:
 def test_a_correction_means_the_same_at_every_scale() -> None:
     """The same point of the world moves by the same fraction of the image."""
     view = random_views(1)[0]
-    small = replace(view, intrinsics=np.diag([0.5, 0.5, 1.0]) @ view.intrinsics, width=160, height=120)
-    pose, lens = torch.tensor([0.01, -0.02, 0.03, 0.1, 0.2, -0.1]), torch.tensor([0.05, 0.01, -0.02])
+    small = replace(
+        view, intrinsics=np.diag([0.5, 0.5, 1.0]) @ view.intrinsics, width=160, height=120
+    )
+    pose = torch.tensor([0.01, -0.02, 0.03, 0.1, 0.2, -0.1])
+    lens = torch.tensor([0.05, 0.01, -0.02])
     large, little = (corrected(camera_of(v), pose, lens, SIZE) for v in (view, small))
     torch.testing.assert_close(large.cam_from_world, little.cam_from_world)
     torch.testing.assert_close(0.5 * large.intrinsics[0, :2], little.intrinsics[0, :2])
@@ -111,7 +119,8 @@ def test_views_of_a_fixed_camera_share_their_correction() -> None:
 
 
 def test_a_lens_of_few_poses_stays() -> None:
-    few, many = random_views(MIN_POSES - 1), random_views(MIN_POSES)
+    few = random_views(MIN_POSES - 1)
+    many = random_views(MIN_POSES)
     assert CameraCorrections(few, SIZE).rows(0) == (0, None)
     assert CameraCorrections(many, SIZE).rows(0) == (0, 0)
     standing = [replace(many[0], name=f"{i}") for i in range(MIN_POSES)]
@@ -120,8 +129,10 @@ def test_a_lens_of_few_poses_stays() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_common_motions_change_no_image(seed: int) -> None:
-    """A similarity of the world that scene and cameras follow together is one of them: to first order."""
-    views, small = random_views(6, seed), 1e-5
+    """A similarity of the world that scene and cameras follow together is one of them: to first
+    order."""
+    views = random_views(6, seed)
+    small = 1e-5
     generator = torch.Generator().manual_seed(seed)
     turn, shift = (torch.randn(3, generator=generator, dtype=torch.float64) for _ in range(2))
     grown = 1 + 0.7 * small
@@ -130,17 +141,31 @@ def test_common_motions_change_no_image(seed: int) -> None:
     for view, center in zip(views, centers, strict=True):
         camera = torch.as_tensor(view.cam_from_world)
         pivot = torch.as_tensor(centers.mean(0))
-        moved = turned(small * turn) @ (grown * (torch.as_tensor(center) - pivot)) + pivot + small * shift
+        moved = (
+            turned(small * turn) @ (grown * (torch.as_tensor(center) - pivot))
+            + pivot
+            + small * shift
+        )
         rotation = camera[:3, :3] @ turned(small * turn).T
         change = rotation @ camera[:3, :3].T  # of the camera's axes
         vector = (
-            torch.stack([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
+            torch.stack(
+                [
+                    change[2, 1] - change[1, 2],
+                    change[0, 2] - change[2, 0],
+                    change[1, 0] - change[0, 1],
+                ]
+            )
+            / 2
         )
         translation = -rotation @ moved - change @ camera[:3, 3]
         found.append(torch.cat([vector, translation / SIZE]) / small)
-    correction, basis = torch.stack(found).view(-1), common_motions(views, SIZE).double()
+    correction = torch.stack(found).view(-1)
+    basis = common_motions(views, SIZE).double()
     assert basis.shape == (36, 7)
-    torch.testing.assert_close(basis @ (basis.T @ correction), correction, rtol=0, atol=1e-4 * float(correction.norm()))
+    torch.testing.assert_close(
+        basis @ (basis.T @ correction), correction, rtol=0, atol=1e-4 * float(correction.norm())
+    )
 
 
 def test_one_camera_stays() -> None:
@@ -160,9 +185,11 @@ def points_seen(camera: Cameras, points: Tensor) -> Tensor:
 
 def test_disturbed_cameras_are_found() -> None:
     """Known points in view of cameras that were disturbed, whose errors in pixels are the loss."""
-    generator, steps = torch.Generator().manual_seed(3), 1500
+    generator = torch.Generator().manual_seed(3)
+    steps = 1500
     points = torch.randn(40, 3, generator=generator)
-    truth, views = [], []
+    truth = []
+    views = []
     for view in random_views(MIN_POSES, 5):
         pose = view.cam_from_world.copy()
         pose[:3, 3] = [0, 0, 8]
@@ -181,7 +208,9 @@ def test_disturbed_cameras_are_found() -> None:
         error.backward()
         refinement.optimize(step, index, camera)
         errors.append(float(error.detach()))
-    first, last = (np.mean(errors[part]) for part in (slice(0, int(STARTS * steps)), slice(-8, None)))
+    first, last = (
+        np.mean(errors[part]) for part in (slice(0, int(STARTS * steps)), slice(-8, None))
+    )
     assert last < 0.2 * first
 
 
@@ -191,7 +220,9 @@ def test_state_goes_on_and_that_of_others_is_refused() -> None:
 
     def steps(refinement: CameraRefinement, first: int, last: int) -> None:
         for step in range(first, last):
-            camera = watched(refinement.corrections.applied(step % MIN_POSES, camera_of(views[step % MIN_POSES])))
+            camera = watched(
+                refinement.corrections.applied(step % MIN_POSES, camera_of(views[step % MIN_POSES]))
+            )
             (camera.cam_from_world[0, :3].sin().sum() + camera.intrinsics.sum() / 300).backward()
             refinement.optimize(step, step % MIN_POSES, camera)
 
@@ -239,7 +270,9 @@ def test_images_of_a_trainer_have_the_corrected_cameras(still: Path) -> None:
     trainer.refinement.corrections.poses[0, 0] = 0.1
     found = [trainer.images.shrunk(0, divisor).cameras for divisor in (1, 2, 2)]
     for before, after in zip(given, found, strict=True):
-        assert torch.equal(after.cam_from_world, trainer.refinement.corrections.applied(0, before).cam_from_world)
+        assert torch.equal(
+            after.cam_from_world, trainer.refinement.corrections.applied(0, before).cam_from_world
+        )
         assert not torch.equal(after.cam_from_world, before.cam_from_world)
 
 
@@ -252,7 +285,8 @@ def test_without_refinement_nothing_is_kept_for_it(refine: str, still: Path) -> 
 
 
 def test_a_view_that_was_not_trained_on_has_what_is_known_of_its_camera() -> None:
-    """The pose of a camera that stands still, a lens of many poses, and nothing else; training views have both."""
+    """The pose of a camera that stands still, a lens of many poses, and nothing else; training
+    views have both."""
     views = random_views(MIN_POSES)
     found = CameraCorrections(views, SIZE)
     found.poses += 0.01
@@ -263,21 +297,28 @@ def test_a_view_that_was_not_trained_on_has_what_is_known_of_its_camera() -> Non
     same_place = replace(other, cam_from_world=views[2].cam_from_world)
     for index, view in enumerate(views):
         torch.testing.assert_close(
-            found.applied_to(view, camera_of(view)).cam_from_world, found.applied(index, camera_of(view)).cam_from_world
+            found.applied_to(view, camera_of(view)).cam_from_world,
+            found.applied(index, camera_of(view)).cam_from_world,
         )
-    np.testing.assert_array_equal(found.corrected_view(zoomed).cam_from_world, zoomed.cam_from_world)
+    np.testing.assert_array_equal(
+        found.corrected_view(zoomed).cam_from_world, zoomed.cam_from_world
+    )
     np.testing.assert_array_equal(found.corrected_view(zoomed).intrinsics, zoomed.intrinsics)
     np.testing.assert_array_equal(found.corrected_view(other).cam_from_world, other.cam_from_world)
     lens = found.corrected_view(views[0]).intrinsics
     np.testing.assert_array_equal(found.corrected_view(other).intrinsics, lens)
     assert abs(lens[0, 0] / other.intrinsics[0, 0] - np.exp(0.02)) < 1e-6
     np.testing.assert_array_equal(
-        found.corrected_view(same_place).cam_from_world, found.corrected_view(views[2]).cam_from_world
+        found.corrected_view(same_place).cam_from_world,
+        found.corrected_view(views[2]).cam_from_world,
     )
-    assert np.abs(found.corrected_view(views[2]).cam_from_world - views[2].cam_from_world).max() > 1e-3
+    assert (
+        np.abs(found.corrected_view(views[2]).cam_from_world - views[2].cam_from_world).max() > 1e-3
+    )
 
 
-BLACK, WRONG = torch.zeros(3), torch.tensor([0.01, -0.012, 0.008, 0.01, 0.008, -0.01])
+BLACK = torch.zeros(3)
+WRONG = torch.tensor([0.01, -0.012, 0.008, 0.01, 0.008, -0.01])
 
 
 def scene_and_image() -> tuple[StaticScene, Image]:

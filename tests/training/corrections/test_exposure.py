@@ -1,4 +1,5 @@
-"""Exposures are learned where images differ in them; the mean one is the identity, and runs can be resumed."""
+"""Exposures are learned where images differ in them; the mean one is the identity, and runs can be
+resumed."""
 
 from __future__ import annotations
 
@@ -9,7 +10,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DynamicModel,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.data.loader import Image
 from dyngs.kinds import assemble
 from dyngs.models.renderable import Rendering
@@ -17,14 +26,17 @@ from dyngs.training.corrections.exposure import WARM_UP, ViewExposures
 from dyngs.training.trainer import Trainer
 
 BLACK = torch.zeros(3)
-STEPS, GAINS = 200, (0.7, 1.0, 1.3, 1.5)
+STEPS = 200
+GAINS = (0.7, 1.0, 1.3, 1.5)
 
 
 def shown(rgb: Tensor) -> Rendering:
     return Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None)
 
 
-def trained_on(gains: tuple[float, ...], beside: list[list[int]] | None = None, hidden: int = -1) -> ViewExposures:
+def trained_on(
+    gains: tuple[float, ...], beside: list[list[int]] | None = None, hidden: int = -1
+) -> ViewExposures:
     """Return exposures after training on images of one scene, which learns its brightness, too.
 
     Args:
@@ -33,7 +45,9 @@ def trained_on(gains: tuple[float, ...], beside: list[list[int]] | None = None, 
         hidden: of which all pixels are masked.
     """
     exposures = ViewExposures(beside or [[] for _ in gains], STEPS)
-    scene = (0.1 + 0.5 * torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0))).requires_grad_()
+    scene = (
+        0.1 + 0.5 * torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0))
+    ).requires_grad_()
     given = scene.detach().clone()
     optimizer = torch.optim.Adam([scene], 0.01)
     for step in range(1, STEPS + 1):
@@ -57,7 +71,8 @@ def brightness(exposures: ViewExposures, count: int) -> Tensor:
 
 def test_gains_are_learned_and_their_mean_is_the_identity() -> None:
     exposures = trained_on(GAINS)
-    found, given = brightness(exposures, len(GAINS)), torch.tensor(GAINS)
+    found = brightness(exposures, len(GAINS))
+    given = torch.tensor(GAINS)
     torch.testing.assert_close(found, given / given.mean(), atol=0.06, rtol=0)
     mean = torch.stack([exposures.affine(i).detach() for i in range(len(GAINS))]).mean(0)
     torch.testing.assert_close(mean, torch.eye(3, 4), atol=1e-5, rtol=0)
@@ -90,7 +105,8 @@ def test_images_that_agree_keep_the_identity() -> None:
 
 def test_in_a_video_a_image_that_says_nothing_takes_after_those_beside_it() -> None:
     """All pixels of the third are masked; in a capture without order nothing is known of it."""
-    gains, hidden = (1.0, 1.0, 1.3, 1.3, 1.3), 3
+    gains = (1.0, 1.0, 1.3, 1.3, 1.3)
+    hidden = 3
     row = [[1], [0, 2], [1, 3], [2, 4], [3]]
     free, video = (trained_on(gains, beside, hidden) for beside in (None, row))
     assert abs(float(brightness(video, 5)[hidden] - brightness(video, 5)[4])) < 0.03
@@ -116,7 +132,8 @@ def test_first_steps_show_images_as_they_are() -> None:
 
 @pytest.mark.parametrize("name", ["values", "visits", "exp_avg.values"])
 def test_a_state_of_other_images_is_refused(name: str) -> None:
-    exposures, other = ViewExposures([[], []], STEPS), ViewExposures([[]], STEPS)
+    exposures = ViewExposures([[], []], STEPS)
+    other = ViewExposures([[]], STEPS)
     with pytest.raises(ValueError, match=name):
         exposures.load_state(exposures.state() | {name: other.state()[name]})
 
@@ -135,7 +152,9 @@ def trainer_of(root: Path, choice: str, model: StaticModel | DynamicModel) -> Tr
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_resumed_run_has_the_same_bytes(moves: bool, still: Path, moving: Path) -> None:
-    root, model = (moving, DynamicModel(sh_degree=0)) if moves else (still, StaticModel(sh_degree=0))
+    root, model = (
+        (moving, DynamicModel(sh_degree=0)) if moves else (still, StaticModel(sh_degree=0))
+    )
     whole, first, second = (trainer_of(root, "always", model) for _ in range(3))
     for _ in range(24):
         whole.step()

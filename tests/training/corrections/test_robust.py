@@ -1,4 +1,5 @@
-"""Masks found in training: what one image shows and the others do not is left out, and nothing else is."""
+"""Masks found in training: what one image shows and the others do not is left out, and nothing else
+is."""
 
 from __future__ import annotations
 
@@ -7,11 +8,28 @@ from pathlib import Path
 
 import pytest
 import torch
-from flat_wall import BLACK, SIZE, cameras_before_wall, learned, places, seen_from, with_block, with_depth
+from flat_wall import (
+    BLACK,
+    SIZE,
+    cameras_before_wall,
+    learned,
+    places,
+    seen_from,
+    with_block,
+    with_depth,
+)
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DynamicModel,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.data.loader import Image
 from dyngs.kinds import assemble
 from dyngs.models.renderable import Rendering
@@ -21,14 +39,17 @@ from dyngs.training.trainer import Trainer
 
 COUNT, STEPS = 8, 100
 AFTER = round(WARM_UP * STEPS) + 1
-ROWS, COLUMNS = slice(12, 42), slice(20, 44)
+ROWS = slice(12, 42)
+COLUMNS = slice(20, 44)
 
 
 def masks_of(images: list[Image]) -> RobustMasks:
     return RobustMasks(images, [image.cameras for image in images], STEPS)  # type: ignore[arg-type]
 
 
-def masked_images(images: list[Image], drawn: list[Tensor], masks: RobustMasks | None = None) -> list[Image]:
+def masked_images(
+    images: list[Image], drawn: list[Tensor], masks: RobustMasks | None = None
+) -> list[Image]:
     """Return all images after a round of training on them."""
     masks = masks or masks_of(images)
     return [
@@ -75,8 +96,10 @@ def test_nothing_is_left_out_where_views_agree() -> None:
 
 
 def test_what_is_not_learned_yet_counts() -> None:
-    """A hole in the model errs as much as a passer-by, but there the other views look like the image."""
-    images, drawn = busy_wall(()), []
+    """A hole in the model errs as much as a passer-by, but there the other views look like the
+    image."""
+    images = busy_wall(())
+    drawn = []
     for image in images:
         x, y = places(image.cameras)
         rgb = learned(image.cameras)
@@ -94,7 +117,8 @@ def test_all_counts_while_the_run_warms_up() -> None:
 
 def test_a_image_is_looked_at_now_and_then_and_its_mask_stays_in_between() -> None:
     images = busy_wall()
-    masks, drawn = masks_of(images), learned(images[1].cameras)
+    masks = masks_of(images)
+    drawn = learned(images[1].cameras)
     found: list[Tensor] = []
     looks: list[int] = []
 
@@ -131,7 +155,9 @@ def test_smaller_images_have_the_same_cells() -> None:
     mask = masks.masked(1, AFTER, half, half.rgb_premultiplied, BLACK, with_depth).mask
     assert mask is not None
     assert mask.shape == (SIZE[1] // 2, SIZE[0] // 2)
-    assert not bool(mask[ROWS.start // 2 : ROWS.stop // 2, COLUMNS.start // 2 : COLUMNS.stop // 2].any())
+    assert not bool(
+        mask[ROWS.start // 2 : ROWS.stop // 2, COLUMNS.start // 2 : COLUMNS.stop // 2].any()
+    )
 
 
 @pytest.mark.parametrize(

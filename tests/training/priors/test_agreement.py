@@ -7,7 +7,12 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.training.priors.agreement import depth_agreement, flow_agreement, mask_agreement, track_agreement
+from dyngs.training.priors.agreement import (
+    depth_agreement,
+    flow_agreement,
+    mask_agreement,
+    track_agreement,
+)
 
 SIZE, FOCAL, FAR, NEAR = 48, 48.0, 6.0, 3.0
 BOX = slice(16, 32)
@@ -16,7 +21,9 @@ BOX = slice(16, 32)
 def texture(seed: int, channels: int = 3) -> torch.Tensor:
     """(96, 96, 3) smooth noise: neighbouring pixels are alike, as in photos."""
     noise = torch.rand(1, channels, 24, 24, generator=torch.Generator().manual_seed(seed))
-    return torch.nn.functional.interpolate(noise, size=(96, 96), mode="bilinear")[0].permute(1, 2, 0)
+    return torch.nn.functional.interpolate(noise, size=(96, 96), mode="bilinear")[0].permute(
+        1, 2, 0
+    )
 
 
 def image(shift: float = 0.0, box_px: int = 0, time: float = 0.0) -> Image:
@@ -29,11 +36,23 @@ def image(shift: float = 0.0, box_px: int = 0, time: float = 0.0) -> Image:
     k = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
     wall, box = (round(FOCAL * shift / z) for z in (FAR, NEAR))
     rgb = texture(0)[24 : 24 + SIZE, 24 + wall : 24 + wall + SIZE].clone()
-    depth, moves = torch.full((SIZE, SIZE), FAR), torch.zeros(SIZE, SIZE)
+    depth = torch.full((SIZE, SIZE), FAR)
+    moves = torch.zeros(SIZE, SIZE)
     left = BOX.start - box + box_px
     where = (BOX, slice(left, left + BOX.stop - BOX.start))
-    rgb[where], depth[where], moves[where] = texture(1)[BOX, BOX], NEAR, 1.0
-    return Image("a", Cameras(pose[None], k[None], SIZE, SIZE), rgb, None, None, time, moves=moves, depth=depth)
+    rgb[where] = texture(1)[BOX, BOX]
+    depth[where] = NEAR
+    moves[where] = 1.0
+    return Image(
+        "a",
+        Cameras(pose[None], k[None], SIZE, SIZE),
+        rgb,
+        None,
+        None,
+        time,
+        moves=moves,
+        depth=depth,
+    )
 
 
 def noisy(x: torch.Tensor, size: float) -> torch.Tensor:
@@ -70,10 +89,13 @@ def test_tracks_are_compared_with_tracks_at_random() -> None:
     random = torch.Generator().manual_seed(3)
     start = 17 + 14 * torch.rand(30, 2, generator=random)
     end = start + torch.tensor([5.0, 0.0])
-    first, second = image(), image(box_px=5)
+    first = image()
+    second = image(box_px=5)
     assert track_agreement([(first, second, start, end)]).holds
     assert track_agreement([(first, second, start, noisy(end, 0.7))]).holds
-    assert not track_agreement([(first, second, start, end[torch.randperm(30, generator=random)])]).holds
+    assert not track_agreement(
+        [(first, second, start, end[torch.randperm(30, generator=random)])]
+    ).holds
     assert not track_agreement([]).holds
 
 
@@ -101,7 +123,8 @@ def test_depth_that_explains_nothing_is_not_used(kind: str) -> None:
 @pytest.mark.parametrize("shift", [0.0, 0.25])
 def test_masks_are_used_unless_they_are_the_wrong_way_round(shift: float) -> None:
     """From one camera that stands, and from one that moves: parallax is not motion."""
-    first, second = image(), image(shift, box_px=6, time=0.1)
+    first = image()
+    second = image(shift, box_px=6, time=0.1)
     assert first.moves is not None
     assert mask_agreement([(first, second)], 5.0).holds
     assert not mask_agreement([(replace(first, moves=1 - first.moves), second)], 5.0).holds

@@ -19,7 +19,13 @@ KEYS = ("depth_file_path", "flow_file_path", "motion_mask_path")
 
 
 def config_of(root: Path, *changes: str) -> Config:
-    lines = [f"data.root={root}", "data.test_every=0", "train.steps=6", "init.num_random=20", "model.motion_from=0.1"]
+    lines = [
+        f"data.root={root}",
+        "data.test_every=0",
+        "train.steps=6",
+        "init.num_random=20",
+        "model.motion_from=0.1",
+    ]
     return load_config("dynamic", [*lines, *changes])
 
 
@@ -64,7 +70,10 @@ def test_ignored_priors_do_not_change_a_run(tmp_path: Path) -> None:
         if name == "without":
             edit_json(
                 root / "transforms_train.json",
-                lambda c: c.pop("tracks_file_path") and [frame.pop(key) for frame in c["frames"] for key in KEYS],
+                lambda c: (
+                    c.pop("tracks_file_path")
+                    and [frame.pop(key) for frame in c["frames"] for key in KEYS]
+                ),
             )
         trainer = assemble(config_of(root))
         findings = [trainer.step().finding for _ in range(6)]
@@ -75,7 +84,9 @@ def test_ignored_priors_do_not_change_a_run(tmp_path: Path) -> None:
         torch.testing.assert_close(x, trained[1][name], rtol=0, atol=0, equal_nan=True)
 
 
-def test_flow_goes_to_the_next_view_of_its_file_also_in_a_run_on_some_frames(tmp_path: Path) -> None:
+def test_flow_goes_to_the_next_view_of_its_file_also_in_a_run_on_some_frames(
+    tmp_path: Path,
+) -> None:
     """The middle one is left out: what leads there is not used."""
     with_priors(tmp_path, ("a", "b", "c", "d", "e"))
     edit_json(

@@ -33,7 +33,9 @@ def scene(speed: float) -> DynamicScene:
     gaussians = row_of_balls()
     gaussians = gaussians.replace(means=gaussians.means.clone().requires_grad_())
     field = Sliding(speed=speed, setup=SETUP)
-    return DynamicScene(gaussians=gaussians, seen_at=(0.0, 1.0), field=field, moving=torch.tensor(MOVING_ROWS))
+    return DynamicScene(
+        gaussians=gaussians, seen_at=(0.0, 1.0), field=field, moving=torch.tensor(MOVING_ROWS)
+    )
 
 
 def image(**maps: torch.Tensor) -> Image:
@@ -50,10 +52,13 @@ class Seen:
         return 0.0, self._until
 
 
-def look(priors: UsedPriors, of: DynamicScene, own: Image, index: int = 0, until: float = 1.0) -> Look:
+def look(
+    priors: UsedPriors, of: DynamicScene, own: Image, index: int = 0, until: float = 1.0
+) -> Look:
     depth: Literal["none", "expected"] = "expected" if priors.needs_depth(own) else "none"
     rendering = of.render(HERE, 0.0, options=RenderOptions(nonfinite="trust", depth=depth))
-    rgb, model = rendering.rgb[0], cast(Model[Any], Seen(of, until))
+    rgb = rendering.rgb[0]
+    model = cast(Model[Any], Seen(of, until))
     return Look(index, 1, own, Drawn(rendering), rgb, rgb, model, GENERATOR)
 
 
@@ -84,7 +89,8 @@ def test_times_outside_the_window_are_not_looked_at() -> None:
 
 
 def test_only_the_field_learns_from_motion() -> None:
-    of, own = scene(0.5), image(flow=torch.zeros(24, 32, 2))
+    of = scene(0.5)
+    own = image(flow=torch.zeros(24, 32, 2))
     loss = still_flow()(look(still_flow(), of, own))["flow"]
     assert not loss.requires_grad  # this field learns nothing, and the Gaussians have no part
 
@@ -109,12 +115,17 @@ def test_tracks_pair_views_of_other_times_that_share_points() -> None:
 def test_tracks_in_images_of_another_size() -> None:
     """Points of the full images, twice as large, on a ball that does not move."""
     of = row_of_balls().means
-    k, pose = HERE.intrinsics[0], HERE.cam_from_world[0]
+    k = HERE.intrinsics[0]
+    pose = HERE.cam_from_world[0]
     local = of[list(MOVING_ROWS) * 2] @ pose[:3, :3].T + pose[:3, 3]
-    full = Cameras(HERE.cam_from_world, torch.tensor([2.0, 2.0, 1.0])[:, None] * HERE.intrinsics, 64, 48)
+    full = Cameras(
+        HERE.cam_from_world, torch.tensor([2.0, 2.0, 1.0])[:, None] * HERE.intrinsics, 64, 48
+    )
     xy = 2 * (local[:, :2] / local[:, 2:] * k.diagonal()[:2] + k[:2, 2])
     glances = [Glance(full, 0.0), Glance(full, 0.5)]
-    priors = UsedPriors(tracks=PointTracks(xy.expand(2, 4, 2), torch.ones(2, 4, dtype=torch.bool), glances))
+    priors = UsedPriors(
+        tracks=PointTracks(xy.expand(2, 4, 2), torch.ones(2, 4, dtype=torch.bool), glances)
+    )
     assert terms(priors, image(), speed=0.0)["tracks"] < 1e-6
     assert terms(priors, image())["tracks"] > 0.01
 
@@ -157,7 +168,9 @@ def test_a_step_against_the_gradient_brings_a_wrong_depth_nearer() -> None:
 
 
 def test_unknown_transparent_and_masked_pixels_do_not_count() -> None:
-    depth, alpha, mask = true_depth(), torch.ones(12, 16), torch.ones(12, 16)
+    depth = true_depth()
+    alpha = torch.ones(12, 16)
+    mask = torch.ones(12, 16)
     given = depth.clone()
     given[0] = 0
     spoiled = depth.clone()
@@ -188,7 +201,9 @@ def test_what_is_drawn_is_the_displacement_of_the_gaussian_that_shows() -> None:
     wanted = focal * (after[:2] / after[2] - before[:2] / before[2])
     shown = drawn[..., 2] > 0.5
     assert bool(shown.any())
-    torch.testing.assert_close(drawn[shown][:, :2], wanted.expand(int(shown.sum()), 2), rtol=0, atol=1e-3)
+    torch.testing.assert_close(
+        drawn[shown][:, :2], wanted.expand(int(shown.sum()), 2), rtol=0, atol=1e-3
+    )
 
 
 def test_gradients_move_the_gaussians_to_where_flow_says() -> None:
@@ -204,7 +219,9 @@ def test_gradients_move_the_gaussians_to_where_flow_says() -> None:
     (slope,) = torch.autograd.grad(error, end)
     along = here.cam_from_world[0, :3, :3] @ slope[0]
     assert float(along[0]) < 0  # the loss falls where the point goes to the right in the image
-    assert flow_error(drawn.detach(), replace(image, flow=torch.full((24, 32, 2), torch.nan))) is None
+    assert (
+        flow_error(drawn.detach(), replace(image, flow=torch.full((24, 32, 2), torch.nan))) is None
+    )
     assert flow_error(drawn.detach(), replace(image, mask=torch.zeros(24, 32))) is None
 
 
