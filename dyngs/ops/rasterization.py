@@ -1,7 +1,8 @@
 """Tile binning and alpha blending of splats."""
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
-# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import REMEDY, check_memory, check_number, check_size
 from dyngs.ops.native import num_threads
 from dyngs.ops.projection import Projection
