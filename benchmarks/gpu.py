@@ -34,7 +34,7 @@ from dyngs.camera_paths.orbit import frame_orbit_for_points
 from dyngs.compat import rasterization
 from dyngs.ops.device import why_no_gpu
 from dyngs.splats.formats import read_splats
-from dyngs.splats.rotation import axis_of
+from dyngs.splats.similarity import axis_of
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 Arguments = dict[str, Any]

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.capture import all_views
-from dyngs.edit.frame import GeoFrame
+from dyngs.edit.frame import GeoFrame, fitted
 from dyngs.errors import DyngsError
 from dyngs.runs.opened import Opened
-from dyngs.splats.similarity import fitted
 
 FEWEST = 4
 MOST_TILT = 10.0  # degrees that the error of the positions may turn the scene by

@@ -12,8 +12,7 @@ from dyngs.errors import DyngsError, counted
 from dyngs.export.splat_files import splats_at, up_of
 from dyngs.runs.opened import open_scene
 from dyngs.splats.formats import format_to_read, read_splats
-from dyngs.splats.rotation import axis_of, joined, turn_between
-from dyngs.splats.similarity import Similarity
+from dyngs.splats.similarity import Similarity, axis_of, joined, turn_between
 from dyngs.splats.splat_file import SplatFile, splat_options, with_degree
 
 

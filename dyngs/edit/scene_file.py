@@ -42,8 +42,7 @@ from dyngs.splats.formats import (
     undone_file,
     write_splats,
 )
-from dyngs.splats.rotation import axis_of
-from dyngs.splats.similarity import UNMOVED, Similarity
+from dyngs.splats.similarity import UNMOVED, Similarity, axis_of
 from dyngs.splats.splat_file import SplatFile, drawing_options
 from dyngs.static.scene import StaticScene
 

@@ -14,7 +14,7 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.files.write import atomic_file, write_text
 from dyngs.runs.inputs import inputs_of
-from dyngs.splats.ply_header import double_ply
+from dyngs.splats.ply import double_ply
 from dyngs.splats.similarity import Similarity
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"

@@ -28,7 +28,7 @@ from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views
-from dyngs.splats.rotation import AXES
+from dyngs.splats.similarity import AXES
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)

@@ -17,7 +17,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr
 from dyngs.runs.opened import Opened
 from dyngs.splats.formats import Written, read_splats
-from dyngs.splats.rotation import AXES
+from dyngs.splats.similarity import AXES
 from dyngs.splats.splat_file import SplatFile, drawing_options, splat_options
 
 VIEWS = 4

@@ -32,8 +32,7 @@ from dyngs.splats.formats import (
     turned_file,
     write_splats,
 )
-from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
-from dyngs.splats.similarity import UNMOVED, Similarity
+from dyngs.splats.similarity import AXES, UNMOVED, Similarity, axis_of, nearest_axis, turn_between
 from dyngs.splats.sog_levels import write_sog_levels
 from dyngs.splats.splat_file import (
     SplatFile,

@@ -28,7 +28,7 @@ from dyngs.ops.patches import MOST_SEGMENTS
 from dyngs.ops.rays import Space
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.ply_header import double_ply
+from dyngs.splats.ply import double_ply
 from dyngs.splats.similarity import Similarity, far_offset
 from dyngs.triangles import mesh as triangles
 from dyngs.triangles.scene import TriangleScene

@@ -11,8 +11,7 @@ import numpy as np
 
 from dyngs.errors import DyngsError, require_regular
 from dyngs.files.write import write_text
-from dyngs.splats.rotation import AXES
-from dyngs.splats.similarity import UNMOVED, Similarity, similarity_of
+from dyngs.splats.similarity import AXES, UNMOVED, Similarity, similarity_of
 
 FRAME_NAME = "frame.json"
 _MOST_BYTES = 4096

@@ -31,8 +31,7 @@ from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
 from dyngs.splats.formats import all_suffixes, format_to_read, read_splats
-from dyngs.splats.rotation import AXES, inverse
-from dyngs.splats.similarity import UNMOVED, Similarity
+from dyngs.splats.similarity import AXES, UNMOVED, Similarity
 from dyngs.splats.splat_file import Nonfinite, drawing_options
 from dyngs.static.scene import StaticScene
 
@@ -169,7 +168,7 @@ class Opened(LoadedRun):
         less their offset."""
         if self.edited is not None:
             return self.edited.similarity
-        return Similarity(inverse(self.turned), self.info.world_scale)
+        return Similarity(Similarity(self.turned).inverse().turn, self.info.world_scale)
 
     @property
     def world(self) -> Similarity:

@@ -15,8 +15,7 @@ from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.splats.edit_note import note_path, read_note, write_note
-from dyngs.splats.rotation import AXES, axis_of, product, turn_between
-from dyngs.splats.similarity import UNMOVED, Similarity
+from dyngs.splats.similarity import AXES, UNMOVED, Similarity, axis_of, turn_between
 from dyngs.splats.splat_file import (
     GEO_OFFSET,
     Nonfinite,
@@ -294,7 +293,8 @@ def turned_file(
     points up."""
     if splat.edited == UNMOVED:
         gaussians = Similarity(turn).gaussians(splat.gaussians)
-        return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
+        turned = Similarity(turn).after(Similarity(splat.turned)).turn
+        return replace(splat, gaussians=gaussians, up=up, turned=turned)
     return moved_file(splat, Similarity(turn), up)
 
 

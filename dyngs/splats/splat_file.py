@@ -21,8 +21,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.models.renderable import near_plane
 from dyngs.ops.checks import finite_rows
 from dyngs.splats.packing import logit
-from dyngs.splats.rotation import AXES, inverse
-from dyngs.splats.similarity import UNMOVED, Similarity, far_offset, similarity_of
+from dyngs.splats.similarity import AXES, UNMOVED, Similarity, far_offset, similarity_of
 
 Nonfinite = Literal["error", "skip"]
 
@@ -105,7 +104,7 @@ def move_to_origin(splat: SplatFile) -> SplatFile:
     near = replace(splat, gaussians=gaussians, file_offset=(x, y, z), notes=(*splat.notes, note))
     if splat.edited != UNMOVED:
         return replace(near, edited=Similarity(shift=(-x, -y, -z)).after(splat.edited))
-    x, y, z = (Similarity(inverse(splat.turned)).points(offset) + splat.world_offset).tolist()
+    x, y, z = (Similarity(splat.turned).inverse().points(offset) + splat.world_offset).tolist()
     return replace(near, world_offset=(x, y, z))
 
 

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.errors import DyngsError
@@ -25,7 +24,7 @@ from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats.formats import SYSTEM_OF_UP
 from dyngs.splats.packing import largest_and_others, logit, with_largest
-from dyngs.splats.rotation import mirrored, turned
+from dyngs.splats.similarity import Similarity, mirrored, turn_of
 from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
 
 _MAGIC = b"NGSP"
@@ -264,9 +263,10 @@ def _from_system(path: Path, splat: SplatFile, number: int) -> SplatFile:
     if np.linalg.det(axes) < 0:
         gaussians = mirrored(gaussians)
         axes[:, 0] *= -1
-    x, y, z, w = Rotation.from_matrix(axes).as_quat(canonical=True).tolist()
     note = "it states other axes than right, up and back: turned to those"
-    return replace(splat, gaussians=turned(gaussians, (w, x, y, z)), notes=(*splat.notes, note))
+    return replace(
+        splat, gaussians=Similarity(turn_of(axes)).gaussians(gaussians), notes=(*splat.notes, note)
+    )
 
 
 def _zstandard(path: Path) -> Any:

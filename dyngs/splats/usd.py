@@ -23,7 +23,7 @@ from dyngs.files.child import python_command
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats import usd_child
-from dyngs.splats.rotation import joined, placed
+from dyngs.splats.similarity import joined, similarity_of_matrix
 from dyngs.splats.splat_file import SplatFile, described, from_linear, header_comments
 
 _SECONDS = 600.0  # of wall time; the child has less of processor time
@@ -140,9 +140,9 @@ def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     found = from_linear(
         means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3)
     )
-    moved = placed(found, arrays["world"])
-    if moved is None:
+    place = similarity_of_matrix(arrays["world"])
+    if place is None:
         raise DyngsError(
             f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting"
         )
-    return moved
+    return place.gaussians(found.replace(means=found.means.double()))

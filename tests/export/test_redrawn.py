@@ -13,7 +13,7 @@ from dyngs.export.redrawn import Redrawn, capture_cameras, compare_run, compare_
 from dyngs.export.splat_files import Writing, write_run_splats
 from dyngs.runs.opened import open_run
 from dyngs.splats.formats import read_splats, upright, write_splats
-from dyngs.splats.rotation import AXES, turn_between
+from dyngs.splats.similarity import AXES, turn_between
 from dyngs.splats.splat_file import SplatFile
 
 

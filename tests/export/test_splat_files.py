@@ -46,8 +46,7 @@ from dyngs.export.splat_files import (
 from dyngs.gaussians.rendering import render
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
 from dyngs.splats.formats import read_splats
-from dyngs.splats.rotation import AXES, turn_between
-from dyngs.splats.similarity import Similarity
+from dyngs.splats.similarity import AXES, Similarity, turn_between
 from dyngs.static.scene import StaticScene
 
 ALL = (0, 1, 2, 3, 4)

@@ -83,27 +83,6 @@ def test_a_lock_file_that_is_none_is_told_and_left(tmp_path: Path) -> None:
         raise AssertionError
 
 
-@pytest.mark.skipif(
-    not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is"
-)
-def test_a_folder_that_is_renamed_is_found(tmp_path: Path) -> None:
-    (tmp_path / "above").mkdir()
-    with writing(tmp_path / "above" / "a") as held:
-        (tmp_path / "above" / "a").rename(tmp_path / "above" / "b")
-        assert held.folder() == tmp_path / "above" / "b"
-        (tmp_path / "above").rename(tmp_path / "below")
-        (tmp_path / "above" / "b").mkdir(parents=True)  # another one takes its place
-        assert held.folder() == tmp_path / "below" / "b"
-        with pytest.raises(InUseError), writing(tmp_path / "below" / "b"):
-            raise AssertionError
-    assert list((tmp_path / "below" / "b").iterdir()) == []  # the lock went with it
-    with writing(tmp_path / "c") as held:
-        (tmp_path / "c" / LOCK_NAME).unlink()
-        assert held.folder() == tmp_path / "c"
-        (tmp_path / "c").rmdir()
-        assert held.folder() is None
-
-
 def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
     """Also while the lock file is removed and made anew all the time."""
     code = HOLD.partition("\n")[0] + (

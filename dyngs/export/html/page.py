@@ -27,7 +27,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.rotation import AXES
+from dyngs.splats.similarity import AXES
 from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
 from dyngs.triangles.scene import TriangleScene

@@ -500,9 +500,7 @@ def test_arrays_of_objects_are_refused_where_needed_and_left_alone_elsewhere(
     mark = tmp_path / "ran"
     evil = np.array([Evil(os.system, f"touch {mark}")], dtype=object)
     wrong = write_npz(tmp_path / "model.npz", model("smpl") | {"weights": evil})
-    assert "'weights': cannot be read (ValueError: it holds Python objects)" in refusal(
-        wrong
-    )
+    assert "'weights': cannot be read (ValueError: it holds Python objects)" in refusal(wrong)
     read_body(write_npz(tmp_path / "model.npz", model("smpl") | {"part2num": evil}))
     assert not mark.exists()
     objects = np.array([1, 2], dtype=object)
