@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.errors import DyngsError, require_regular
-from dyngs.files.write import write_text
-from dyngs.splats.similarity import AXES, UNMOVED, Similarity, similarity_of
+from dyngs.core.errors import DyngsError, require_regular
+from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, similarity_of
+from dyngs.io.write import write_text
 
 FRAME_NAME = "frame.json"
 _MOST_BYTES = 4096
