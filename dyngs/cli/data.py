@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError, as_word, counted, show
+from dyngs.cli.output import ProgressBar, print_lines, print_notes
+from dyngs.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
@@ -243,9 +243,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
-            show(f"also: {problem}")
+            print_lines(f"also: {problem}")
         raise DyngsError(report.problems[0])
-    show(format_report(report))
+    print_lines(format_report(report))
     if arguments.image is not None:
         from dyngs.capture.inspection.report import draw_cameras
 
@@ -263,7 +263,7 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
             f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first"
         )
     with images_up_to(args.data_section(arguments.overrides).max_megapixels):
-        show(video_report(arguments.path))
+        print_lines(video_report(arguments.path))
     return 0
 
 
@@ -298,7 +298,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
             said = poses_of_videos(images, out, options, report)
         else:
             said = estimate_poses(images, out, options, report).summary()
-    show(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
+    print_lines(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
     print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
     return 0
 
@@ -347,7 +347,9 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
+    print_lines(
+        f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}"
+    )
     return 0
 
 
@@ -362,7 +364,7 @@ def run_people(arguments: argparse.Namespace) -> int:
         result = write_found_person(
             options, arguments.out, detector, report, number=arguments.person
         )
-    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    print_lines(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
 
@@ -396,7 +398,7 @@ def run_motion(arguments: argparse.Namespace) -> int:
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
     write_amass(motion, out)
     print(f"written: {out}\n         {_summary(motion)}")
-    args.print_notes(motion.notes)
+    print_notes(motion.notes)
     return 0
 
 
