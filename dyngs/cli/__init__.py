@@ -26,7 +26,6 @@ from dyngs import __version__
 from dyngs.cli import (
     bench,
     compare,
-    completion,
     config,
     convert,
     data,
@@ -75,7 +74,6 @@ _COMMANDS = {
     "bench": bench,
     "config": config,
     "docs": docs,
-    "completion": completion,
     "doctor": doctor,
 }
 """The module of each command, in the order in which they are listed."""
@@ -99,8 +97,9 @@ dyngs {__version__}: Gaussian splatting of what stands, what moves, and people, 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (default: ``sys.argv``) and return the exit code."""
     if "_ARGCOMPLETE" in os.environ:  # a shell asks, at the Tab key
-        parser = make_parser()
-        completion.finder(parser)(parser, always_complete_options=False)
+        from argcomplete import autocomplete
+
+        autocomplete(make_parser(), always_complete_options=False)
     words, flags = _without_flags(list(sys.argv[1:] if argv is None else argv))
     print_messages(quiet="--quiet" in flags)
     _show_any_name()
