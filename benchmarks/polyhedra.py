@@ -31,8 +31,8 @@ from dyngs.data.synthetic.raytrace import (
     nearest_things,
     sampled_rays,
 )
-from dyngs.files.outputs import new_folder
-from dyngs.files.write import write_image
+from dyngs.io.outputs import new_folder
+from dyngs.io.write import write_image
 
 Rgb = tuple[float, float, float]
 _FACES = 64  # More than any primitive has, for numbers of faces

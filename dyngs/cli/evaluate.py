@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_notes
-from dyngs.errors import counted, escaped
+from dyngs.core.errors import counted, escaped
 
 if TYPE_CHECKING:
     from rich.table import Table

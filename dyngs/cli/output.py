@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from dyngs.errors import LOGGER, escaped, show, warn
+from dyngs.core.errors import LOGGER, escaped, show, warn
 
 if TYPE_CHECKING:
     from rich.table import Table

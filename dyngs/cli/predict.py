@@ -6,7 +6,7 @@ import argparse
 
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.output import ProgressBar, print_lines
-from dyngs.errors import as_word, counted
+from dyngs.core.errors import as_word, counted
 
 _EPILOG = """\
 examples:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines
 from dyngs.cli.view import add_serving_arguments
-from dyngs.errors import DyngsError, as_word, counted
+from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.config import Config

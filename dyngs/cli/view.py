@@ -8,7 +8,7 @@ import threading
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_lines, print_notes
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 _EPILOG = """\
 examples:
