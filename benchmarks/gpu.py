@@ -30,8 +30,8 @@ from torch import Tensor
 
 from dyngs.bench import Workload, garden_workload, random_workload
 from dyngs.camera import Cameras
-from dyngs.camera_paths.orbit import frame_orbit_for_points
 from dyngs.compat import rasterization
+from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.ops.device import why_no_gpu
 from dyngs.splats.formats import read_splats
 from dyngs.splats.rotation import axis_of

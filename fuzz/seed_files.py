@@ -15,11 +15,11 @@ from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
 from dyngs.camera import Cameras
-from dyngs.camera_paths.path import CameraPath, write_path
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
+from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.files.tensor_file import write_tensors
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.motion.amass import write_amass

@@ -97,8 +97,8 @@ def test_no_message_can_steer_a_terminal() -> None:
 
 @pytest.mark.parametrize("text", ["x" * 5000, "9" * 5000, "\x07" * 300, "prune=" + "1" * 5000])
 def test_what_the_command_line_quotes_is_short(text: str) -> None:
-    from dyngs.camera_paths.path import parse_times
     from dyngs.data.times import parse_frames
+    from dyngs.export.camera_paths import parse_times
     from dyngs.tradeoff.table import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import num_cores, train
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
@@ -16,7 +17,6 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import require_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, show
-from dyngs.export.scene_file import write_scene_file
 from dyngs.files.outputs import new_folder
 from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of

@@ -269,8 +269,8 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
-    from dyngs.camera_paths.path import parse_times
     from dyngs.evaluate.temporal import clamped_times
+    from dyngs.export.camera_paths import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
@@ -414,7 +414,7 @@ def _export_tracks(
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
     """Write the run as a .dyngs file and print how much its images change."""
-    from dyngs.export.scene_file import write_scene_file
+    from dyngs.api.scene_file import write_scene_file
     from dyngs.storage.measure import SMALLEST_CHANGE
 
     max_change: float | None = arguments.max_change

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import up_direction
 from dyngs.config import Config, DataConfig, HumanModel, StaticModel
+from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for

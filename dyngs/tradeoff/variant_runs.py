@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.api.prune import prune_run
+from dyngs.api.scene_file import num_bytes_exact, write_scene_file
 from dyngs.api.train import num_cores
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
-from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.kinds import assemble, restored_model
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from dyngs.camera import Cameras
-from dyngs.camera_paths.path import resize_cameras
 from dyngs.conventions import SH_C0
-from dyngs.export.contact_sheet import color_map, depth_to_rgb
+from dyngs.export.camera_paths import resize_cameras
+from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.files.write import to_uint8
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.models.renderable import Rendering, TimeStep

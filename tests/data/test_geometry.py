@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.camera_paths.aim import look_at
+from dyngs.data.aim import look_at
 from dyngs.data.geometry import focus_point, fraction_in_front
 
 

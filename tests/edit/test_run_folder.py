@@ -19,7 +19,7 @@ from dyngs.edit.run_folder import at_end, write_edited_run
 from dyngs.edit.scene_file import Edits, edit_scene
 from dyngs.errors import DyngsError
 from dyngs.export.cameras import write_cameras
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.splat_files import AS_THEY_ARE, splats_at, tracks_of, write_run_splats, writing_of
 from dyngs.gaussians.rendering import render
 from dyngs.models.views import training_cameras

@@ -17,8 +17,8 @@ from tiny_stereo import STEREO, stereo_config, stereo_people
 
 from dyngs.api.predict import predict
 from dyngs.api.train import train
-from dyngs.camera_paths.aim import look_at
 from dyngs.config import DataConfig
+from dyngs.data.aim import look_at
 from dyngs.data.loader import ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture

@@ -10,8 +10,8 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.errors import DyngsError
-from dyngs.export.scene_file import write_scene_file
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.runs.checkpoint import latest_checkpoint, load_run, save_checkpoint
 from dyngs.state import prefixed, tensors_of
