@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError, counted
-from dyngs.files.wrong_place import command_for
+from dyngs.core.errors import DyngsError, counted
+from dyngs.io.wrong_place import command_for
 
 if TYPE_CHECKING:
     from dyngs.export.choose_path import PathOptions

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError, printable
 from dyngs.data.geometry import cam_from_opengl, checked_pose
-from dyngs.errors import DyngsError, printable
-from dyngs.files.fields import first_few, is_number, numbers_of, read_json
-from dyngs.files.limits import require_at_most
-from dyngs.files.write import write_text
+from dyngs.io.fields import first_few, is_number, numbers_of, read_json
+from dyngs.io.limits import require_at_most
+from dyngs.io.write import write_text
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
-from dyngs.errors import DyngsError
 from dyngs.export.camera_paths import (
     CameraPath,
     path_file,
@@ -23,11 +23,11 @@ from dyngs.export.camera_paths import (
 from dyngs.export.images import file_stems
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.io.formats.rotation import AXES
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views
-from dyngs.splats.rotation import AXES
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.aim import (
     look_at,
     look_at_point,
@@ -19,7 +20,6 @@ from dyngs.data.aim import (
     world_from_cam,
 )
 from dyngs.data.geometry import fraction_in_front
-from dyngs.errors import DyngsError
 from dyngs.export.camera_paths import CameraPath
 
 _WIDEST_GAP = math.radians(100)

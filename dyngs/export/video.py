@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.errors import DyngsError
-from dyngs.files.write import atomic_file
+from dyngs.core.errors import DyngsError
+from dyngs.io.write import atomic_file
 
 
 class VideoWriter:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.aim import world_from_cam
 
 _NEAREST_TURN, _NEAREST_TIME = 0.5, 2.0

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
 from dyngs.config import DataConfig
+from dyngs.core.camera import Cameras
 from dyngs.data.aim import look_at_point
 from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader

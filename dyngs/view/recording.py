@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, world_pose
-from dyngs.splats.similarity import Similarity
+from dyngs.io.formats.similarity import Similarity
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.aim import look_at
-from dyngs.errors import DyngsError
 from dyngs.export.camera_paths import (
     CameraPath,
     Keyframes,
@@ -30,7 +30,7 @@ from dyngs.export.camera_paths import (
     with_times,
     write_path,
 )
-from dyngs.files.limits import VARIABLE
+from dyngs.io.limits import VARIABLE
 
 
 def written(folder: Path, document: object) -> Path:

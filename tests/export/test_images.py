@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from moving_scene import Sliding, camera, moving_scene, write_moving_run
 from two_balls import cameras_around, two_balls
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.video import read_frames
-from dyngs.errors import DyngsError
 from dyngs.export.camera_paths import CameraPath, pick_cameras
 from dyngs.export.images import (
     OutputOptions,

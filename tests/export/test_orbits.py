@@ -11,9 +11,9 @@ from camera_rings import UP, assert_rigid, cameras_at, forward_facing, ring_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.aim import look_at, look_at_point, up_direction
-from dyngs.errors import DyngsError
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 
 ORIGIN = np.zeros(3)

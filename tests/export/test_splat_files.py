@@ -27,12 +27,12 @@ from splat_scenes import cloud
 
 from dyngs.cli import main
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, PointCloud
 from dyngs.data.read import read_capture
 from dyngs.deform.bodies.field import BodyField, BodyRest, bodies_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.windows import WindowedField
-from dyngs.errors import DyngsError
 from dyngs.export import splat_files
 from dyngs.export.body_nodes import write_bodies
 from dyngs.export.cameras import NAME, write_cameras
@@ -51,13 +51,13 @@ from dyngs.export.splat_files import (
     write_tracks,
     writing_of,
 )
-from dyngs.files.gltf import GltfFile
 from dyngs.gaussians.rendering import render
+from dyngs.io.formats.formats import read_splats, upright, write_splats
+from dyngs.io.formats.rotation import AXES, turn_between
+from dyngs.io.formats.similarity import Similarity
+from dyngs.io.formats.splat_file import SplatFile
+from dyngs.io.gltf import GltfFile
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
-from dyngs.splats.formats import read_splats, upright, write_splats
-from dyngs.splats.rotation import AXES, turn_between
-from dyngs.splats.similarity import Similarity
-from dyngs.splats.splat_file import SplatFile
 from dyngs.static.scene import StaticScene
 
 ALL = (0, 1, 2, 3, 4)
