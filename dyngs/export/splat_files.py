@@ -81,7 +81,7 @@ def writing_of(
     if up == "keep" or (edited is not None and edited.fixed and up is None):
         own = None if edited is None else edited.up
         known = "" if own is None else f", {own} up"
-        return Writing(up=own, sh_degree=sh_degree), f"axes are those of the {frame}{known}"
+        return Writing(up=own, sh_degree=sh_degree), f"axes are those of the {frame.removesuffix('ed run')}{known}"
     found = up_of(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
@@ -261,11 +261,12 @@ def tracks_of(
 
     Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
     """
-    moves = torch.zeros(len(scene), dtype=torch.bool)
+    moves = torch.zeros(len(scene), dtype=torch.bool, device="cpu")
     moves[scene.rows] = not scene.is_static
     if part == "moving":
         scene_part(scene, "moving")
-    ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene))
+    rows = torch.arange(len(scene), device="cpu")
+    ids = rows[moves] if part == "moving" else rows
     kind = np.float32 if frame == UNMOVED else np.float64
     size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
     if size > MAX_BYTES:
