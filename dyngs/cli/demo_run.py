@@ -15,7 +15,7 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.splat_files import write_run_splats
 from dyngs.io.lock import LOCK_NAME, InUseError, writing
