@@ -9,7 +9,7 @@ import reference
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.ops.projection import Projection
 
 pytestmark = pytest.mark.usefixtures("one_thread")

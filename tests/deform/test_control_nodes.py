@@ -16,9 +16,9 @@ from tiny_fields import HEADS, cloud, tiny_setup
 from torch import Tensor
 
 from dyngs.config import ControlNodesField
+from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)
 

@@ -14,8 +14,8 @@ from tiny_fields import (
     tiny_setup,
 )
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.fields import field_state, restored_field
-from dyngs.state import tensors_of
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)

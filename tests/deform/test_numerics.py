@@ -24,16 +24,16 @@ from tiny_fields import (
 from torch import Tensor
 
 from dyngs.config import DynamicModel, TrainConfig
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
-from dyngs.errors import DyngsError
 from dyngs.gaussians import TopologyEdit
-from dyngs.kinds import assemble, restored_scene
-from dyngs.state import tensors_of
+from dyngs.training.new_trainer import assemble, restored_scene
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -10,13 +10,13 @@ from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.config import DynamicModel
+from dyngs.core.state import tensors_of
 from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import field_state
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.state import tensors_of
 
 ROWS = torch.tensor([1, 4, 5, 8])
 NOTHING = torch.zeros(0, dtype=torch.long)

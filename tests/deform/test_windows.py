@@ -11,10 +11,10 @@ import torch
 from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.deform.windows import EDGE, OPEN, WindowedField
-from dyngs.state import tensors_of
 
 COUNT = 9
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch._C import DispatchKey, DispatchKeySet
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.ops.registration import Gradient, has_kernel, implement, register

@@ -23,6 +23,7 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
+from dyngs.core.state import tensors_of
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
@@ -32,8 +33,7 @@ from dyngs.gaussians.colour.training import (
     opacity_entropy,
     rate_factor,
 )
-from dyngs.kinds import GaussianTrainer, assemble
-from dyngs.state import tensors_of
+from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 
 def gaussians() -> Gaussians:
