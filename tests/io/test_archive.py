@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import errno
-import json
-import os
-import shutil
 import stat
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tiny_captures import edit_json, random_pixels, write_frames, write_image
 
 from dyngs.api.load import read_capture
-from dyngs.api.train import with_capture
 from dyngs.cli import main
+<<<<<<< HEAD
 from dyngs.config.io import load_config
+=======
+>>>>>>> main
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import is_capture
 from dyngs.io import archive
@@ -86,6 +81,7 @@ def test_an_archive_is_unpacked_once_and_anew_after_a_change(tmp_path: Path, roo
     assert len(read_capture(file).splits["train"]) == 3 - 1  # one for testing
 
 
+<<<<<<< HEAD
 def test_folders_that_windows_separates_are_folders(tmp_path: Path, root: Path) -> None:
     file = tmp_path / "scene.zip"
     with zipfile.ZipFile(file, "w") as out:
@@ -173,6 +169,8 @@ def test_the_slower_process_takes_the_folder_of_the_faster(
     assert len(left()) == 1
 
 
+=======
+>>>>>>> main
 BAD_NAMES = (
     "../evil.png",
     "a/../../evil.png",
@@ -271,17 +269,3 @@ def test_damaged_archives_are_one_line(
     assert left() == []
     assert main(["data", "inspect", str(file)]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
-
-
-def test_a_full_disk_leaves_nothing(
-    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = packed(tmp_path / "scene.zip", root)
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("shutil.copyfileobj", full)
-    with pytest.raises(DyngsError, match=r"scene\.zip: cannot be read \(No space left on device\)"):
-        unpacked(file)
-    assert left() == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import site
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +64,7 @@ def test_nothing_of_the_current_folder_runs(
     assert not (folder / "ran").exists()
 
 
+<<<<<<< HEAD
 def test_dyngs_is_found_in_a_checkout_that_is_the_current_folder(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -96,6 +96,8 @@ def test_packages_of_the_parent_are_found_in_its_order(
     assert run(python_command("probe"), tmp_path).stdout == "c\n"
 
 
+=======
+>>>>>>> main
 def test_no_other_place_starts_python() -> None:
     starting = [
         x.relative_to(ROOT).as_posix()

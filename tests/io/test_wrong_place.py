@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 
+<<<<<<< HEAD
 from dyngs.cli import main
+=======
+>>>>>>> main
 from dyngs.io.wrong_place import command_for
 
 
@@ -53,6 +56,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_command_for_a_path(path: str, command: str | None) -> None:
     found = command_for(Path(path))
     assert found is None if command is None else command in (found or "")
+<<<<<<< HEAD
 
 
 @pytest.mark.parametrize(
@@ -90,3 +94,5 @@ def test_wrong_starts_name_the_right_command(
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert command in error
+=======
+>>>>>>> main

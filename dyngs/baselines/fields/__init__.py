@@ -1,3 +1,4 @@
+<<<<<<< HEAD
 """Radiance fields: functions of place and direction, drawn along rays. ``ngp`` looks them up,
 ``nerf`` computes them.
 
@@ -6,3 +7,6 @@ common. ``ngp``, ``occupancy``, ``frusta``, ``thinning``: hash grid and small ne
 that are not empty, those that cameras see, and which samples count. ``nerf``: two large networks.
 ``scene``, ``training``, ``kind``: the seam. ``mesh``: a surface of equal density.
 """
+=======
+"""Radiance fields: NeRF and Instant-NGP."""
+>>>>>>> main

@@ -1,2 +1,6 @@
+<<<<<<< HEAD
 """Trained models in one small file: quantised by how much the image may change, and
 entropy-coded."""
+=======
+"""The quantised scene file `scene.dyngs`."""
+>>>>>>> main

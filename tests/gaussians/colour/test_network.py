@@ -11,6 +11,10 @@ import torch
 from scenes import random_scene
 from torch import Tensor
 
+<<<<<<< HEAD
+=======
+from dyngs.core.camera import Cameras
+>>>>>>> main
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import (
     ColourNetwork,
