@@ -10,12 +10,7 @@ import numpy as np
 
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import read_splats, write_splats
-<<<<<<< HEAD
-from dyngs.io.formats.ply import write_ply
-from dyngs.io.formats.ply_header import header_bytes, read_header
-=======
 from dyngs.io.formats.ply import header_bytes, read_header, write_ply
->>>>>>> main
 from dyngs.io.formats.splat_file import SplatFile
 
 FACTORS = (1e-4, 1e-3, 0.05, 1e3)

@@ -28,10 +28,6 @@ from dyngs.io.formats.formats import (
     turned_file,
     write_splats,
 )
-<<<<<<< HEAD
-from dyngs.io.formats.rotation import AXES, axis_of, nearest_axis, turn_between
-from dyngs.io.formats.similarity import UNMOVED, Similarity
-=======
 from dyngs.io.formats.similarity import (
     AXES,
     UNMOVED,
@@ -40,7 +36,6 @@ from dyngs.io.formats.similarity import (
     nearest_axis,
     turn_between,
 )
->>>>>>> main
 from dyngs.io.formats.sog_levels import write_sog_levels
 from dyngs.io.formats.splat_file import (
     SplatFile,

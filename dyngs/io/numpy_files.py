@@ -11,11 +11,7 @@ from typing import IO
 
 import numpy as np
 
-<<<<<<< HEAD
-from dyngs.core.errors import DyngsError, reading, reason
-=======
 from dyngs.core.errors import DyngsError, reading
->>>>>>> main
 from dyngs.io.containment import inside
 from dyngs.io.fields import entry
 from dyngs.io.limits import require_at_most

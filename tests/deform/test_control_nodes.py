@@ -17,12 +17,7 @@ from torch import Tensor
 
 from dyngs.config import ControlNodesField
 from dyngs.core.state import tensors_of
-<<<<<<< HEAD
 from dyngs.deform.control_nodes import ControlNodes
-=======
-from dyngs.deform.control_nodes import SMOOTHNESS, ControlNodes
-from dyngs.deform.field import Offsets
->>>>>>> main
 from dyngs.gaussians import TopologyEdit
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)

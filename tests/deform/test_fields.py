@@ -15,26 +15,7 @@ from tiny_fields import (
 )
 
 from dyngs.core.state import tensors_of
-<<<<<<< HEAD
 from dyngs.deform.fields import field_state, restored_field
-=======
-from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.fields import field_state, new_field, restored_field
-from dyngs.deform.free import FreePrimitives
-from dyngs.deform.hexplane import Hexplane
-from dyngs.deform.mlp import Mlp
-
-
-def test_options_decide_the_kind() -> None:
-    kinds = {
-        "hexplane": Hexplane,
-        "mlp": Mlp,
-        "control_nodes": ControlNodes,
-        "free": FreePrimitives,
-    }
-    for kind, expected in kinds.items():
-        assert type(tiny_field(kind)) is expected
->>>>>>> main
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)

@@ -9,13 +9,8 @@ import torch
 from tiny_fields import cloud, tiny_setup
 
 from dyngs.config import MlpField
-from dyngs.core.state import tensors_of
 from dyngs.deform.field import Offsets
 from dyngs.deform.mlp import SKIP_LAYER, Mlp, encoded
-<<<<<<< HEAD
-=======
-from dyngs.gaussians import TopologyEdit
->>>>>>> main
 
 
 def outputs(offsets: Offsets) -> list[torch.Tensor]:

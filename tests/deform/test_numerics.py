@@ -23,12 +23,7 @@ from tiny_fields import (
 )
 from torch import Tensor
 
-<<<<<<< HEAD
 from dyngs.config import DynamicModel, TrainConfig
-=======
-from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
-from dyngs.core.camera import Cameras
->>>>>>> main
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
@@ -37,15 +32,7 @@ from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
-<<<<<<< HEAD
 from dyngs.gaussians import TopologyEdit
-=======
-from dyngs.deform.time_window import FRONTIER_VIEWS, TimeWindow
-from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.rendering import render
-from dyngs.ops.planes import PlaneLevel, hexplane_features
-from dyngs.static.scene import StaticScene
->>>>>>> main
 from dyngs.training.new_trainer import assemble, restored_scene
 from dyngs.training.trainer import Trainer
 

@@ -10,10 +10,6 @@ from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.config import DynamicModel
-<<<<<<< HEAD
-=======
-from dyngs.core.errors import DyngsError
->>>>>>> main
 from dyngs.core.state import tensors_of
 from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import field_state
@@ -21,10 +17,6 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
 from dyngs.gaussians.visibility import VisibilityMasks
-<<<<<<< HEAD
-=======
-from dyngs.static.scene import StaticScene
->>>>>>> main
 
 ROWS = torch.tensor([1, 4, 5, 8])
 NOTHING = torch.zeros(0, dtype=torch.long)

@@ -12,16 +12,9 @@ from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.core.state import tensors_of
-<<<<<<< HEAD
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.deform.windows import EDGE, OPEN, WindowedField
-=======
-from dyngs.deform.field import deformed, innermost, with_innermost
-from dyngs.deform.fields import field_state, restored_field
-from dyngs.deform.windows import EDGE, OPEN, WindowedField
-from dyngs.gaussians import TopologyEdit
->>>>>>> main
 
 COUNT = 9
 

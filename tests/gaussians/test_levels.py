@@ -10,10 +10,6 @@ from moving_scene import camera
 from splat_scenes import cloud
 
 from dyngs.core.camera import Cameras
-<<<<<<< HEAD
-=======
-from dyngs.core.errors import DyngsError
->>>>>>> main
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians import levels as module
 from dyngs.gaussians.levels import MERGED, Levels, levels_of, merged

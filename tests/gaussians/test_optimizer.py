@@ -8,11 +8,7 @@ import torch
 from dyngs.config import OptimConfig
 from dyngs.core.state import part_of, tensors_of
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-<<<<<<< HEAD
 from dyngs.gaussians.optimizer import GaussianOptimizer
-=======
-from dyngs.gaussians.optimizer import ADAM_EPS, GaussianOptimizer
->>>>>>> main
 
 
 def _gaussians(n: int, seed: int = 0) -> Gaussians:

@@ -5,10 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from dyngs.gaussians.order import morton_order, storage_order
-<<<<<<< HEAD
-=======
-from dyngs.training.new_trainer import assemble
->>>>>>> main
 
 
 def test_corners_of_a_cube_follow_the_z_curve() -> None:

@@ -15,21 +15,11 @@ from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.config import FixedStrategy, StaticModel
-<<<<<<< HEAD
 from dyngs.core.state import Role, part_of, tensors_of
-=======
-from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, part_of, tensors_of
-from dyngs.data.loader import Image
->>>>>>> main
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene
-<<<<<<< HEAD
-=======
-from dyngs.human.avatar.training import HumanTraining
->>>>>>> main
 from dyngs.training.new_trainer import assemble, restored_scene
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)

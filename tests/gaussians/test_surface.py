@@ -15,10 +15,6 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
-<<<<<<< HEAD
-=======
-from dyngs.core.errors import DyngsError
->>>>>>> main
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.fusion import Mesh, fused
 from dyngs.gaussians.surface import largest_pieces, num_holes, opaque_box, surface_of

@@ -7,12 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-<<<<<<< HEAD
 from dyngs.gaussians.visibility import VisibilityMasks
-=======
-from dyngs.core.state import tensors_of
-from dyngs.gaussians.visibility import VisibilityMasks, matched
->>>>>>> main
 
 TIMES = (0.0, 0.25, 0.5, 1.0)
 

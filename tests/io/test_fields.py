@@ -10,15 +10,7 @@ import pytest
 from measured import cost_of
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-from dyngs.io.fields import first_few, numbers_of, open_text, read_json_object
-
-
-def test_some() -> None:
-    assert (first_few([1, 2]), first_few(range(7))) == ("1, 2", "0, 1, 2, 3, 4 and 2 more")
-=======
 from dyngs.io.fields import numbers_of, open_text, read_json_object
->>>>>>> main
 
 
 def test_numbers_in_another_shape() -> None:

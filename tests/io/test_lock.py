@@ -15,20 +15,10 @@ from pathlib import Path
 
 import pytest
 
-<<<<<<< HEAD
-from dyngs.cli import main
-from dyngs.core.errors import DyngsError
-from dyngs.evaluate.report import evaluate_run
-from dyngs.io import lock as run_lock
-from dyngs.io.lock import LOCK_NAME, InUseError, make_once, writing
-from dyngs.io.outputs import new_folder
-from dyngs.runs.checkpoint import checkpoint_paths, load_run
-=======
 from dyngs.core.errors import DyngsError
 from dyngs.io import lock as run_lock
 from dyngs.io.lock import LOCK_NAME, InUseError, make_once, writing
 from dyngs.io.outputs import new_folder
->>>>>>> main
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 HOLD = "import sys, time; from pathlib import Path; from dyngs.io.lock import writing\n"

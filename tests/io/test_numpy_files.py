@@ -12,11 +12,7 @@ from measured import cost_of
 
 from dyngs.core.errors import DyngsError
 from dyngs.io import numpy_files
-<<<<<<< HEAD
-from dyngs.io.numpy_files import read_arrays, read_npy, read_npz
-=======
 from dyngs.io.numpy_files import read_arrays, read_npz
->>>>>>> main
 
 
 def refusal(path: Path, *names: str) -> str:

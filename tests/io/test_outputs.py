@@ -10,10 +10,6 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-from dyngs.io import outputs
-=======
->>>>>>> main
 from dyngs.io.outputs import SOURCES_NAME, Inputs, new_folder, note_sources, require_new_folder
 
 

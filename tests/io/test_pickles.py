@@ -23,12 +23,7 @@ from measured import cost_of
 from synthetic_bodies import write_python2_pickle
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-from dyngs.io import pickles
-from dyngs.io.pickles import read_pickle, read_pickled_array, require_tree
-=======
 from dyngs.io.pickles import read_pickle, read_pickled_array
->>>>>>> main
 
 
 def pickled(tmp_path: Path, content: bytes) -> Path:

@@ -15,11 +15,6 @@ from op_cases import CASES
 from scenes import random_scene
 from torch import Tensor
 
-<<<<<<< HEAD
-=======
-from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
->>>>>>> main
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.ops import native

@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
 from dyngs.ops.loss import _ssim_map, l1_ssim_loss, reference_l1_ssim, ssim
-=======
-from dyngs.ops.loss import _ssim_map, l1_ssim_loss, l1_ssim_op, reference_l1_ssim, ssim
->>>>>>> main
 
 # Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its
 # gradient; the images have contrast everywhere, so nothing cancels after that. Of 3,300 draws none

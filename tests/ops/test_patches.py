@@ -12,10 +12,6 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-=======
-from dyngs.ops.native import kernel_threads
->>>>>>> main
 from dyngs.ops.patches import (
     Places,
     blend_patches,

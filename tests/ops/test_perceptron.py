@@ -14,10 +14,6 @@ from torch import Tensor
 
 import dyngs.ops.perceptron as ops
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-=======
-from dyngs.ops.native import kernel_threads
->>>>>>> main
 from dyngs.ops.perceptron import (
     Layer,
     perceptron,

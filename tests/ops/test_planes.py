@@ -14,10 +14,6 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-=======
-from dyngs.ops.native import core, kernel_threads
->>>>>>> main
 from dyngs.ops.planes import (
     PlaneLevel,
     hexplane_features,

@@ -15,12 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
 from dyngs.ops.posing import Posed, pose_by_joints
-=======
-from dyngs.ops.native import kernel_threads
-from dyngs.ops.posing import Posed, pose_by_joints, posing_backward_op, posing_op
->>>>>>> main
 from dyngs.ops.quaternions import rotation_matrices
 
 NAN = float("nan")

@@ -14,10 +14,6 @@ from hypothesis import strategies as st
 from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
-<<<<<<< HEAD
-=======
-from dyngs.core.camera import Cameras
->>>>>>> main
 from dyngs.ops.projection import (
     Projection,
     ProjectionOptions,

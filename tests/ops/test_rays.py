@@ -9,10 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-=======
-from dyngs.ops.native import kernel_threads
->>>>>>> main
 from dyngs.ops.rays import (
     Rays,
     Samples,

@@ -12,10 +12,6 @@ import torch
 from torch import Tensor
 from torch._C import DispatchKey, DispatchKeySet
 
-<<<<<<< HEAD
-=======
-import dyngs.ops
->>>>>>> main
 from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features

@@ -13,10 +13,6 @@ from tiny_fields import cloud
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-=======
-from dyngs.ops.native import kernel_threads
->>>>>>> main
 from dyngs.ops.skinning import (
     add_offsets_,
     blend_skinning,

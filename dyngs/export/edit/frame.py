@@ -12,12 +12,7 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError, printable, require_regular
 from dyngs.data.scene_space import MAX_DISTANCE
-<<<<<<< HEAD
-from dyngs.io.formats.rotation import AXES, turn_between
-from dyngs.io.formats.similarity import Similarity, fitted
-=======
 from dyngs.io.formats.similarity import AXES, Similarity, turn_between, turn_of
->>>>>>> main
 from dyngs.io.formats.splat_file import geo_comment
 from dyngs.io.limits import require_at_most
 

@@ -11,12 +11,7 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
-<<<<<<< HEAD
-from dyngs.export.edit.frame import GeoFrame
-from dyngs.io.formats.similarity import fitted
-=======
 from dyngs.export.edit.frame import GeoFrame, fitted
->>>>>>> main
 from dyngs.runs.opened import Opened
 
 FEWEST = 4

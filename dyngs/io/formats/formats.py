@@ -14,12 +14,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading, require_regular
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.edit_note import note_path, read_note, write_note
-<<<<<<< HEAD
-from dyngs.io.formats.rotation import AXES, axis_of, product, turn_between
-from dyngs.io.formats.similarity import UNMOVED, Similarity
-=======
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, axis_of, turn_between
->>>>>>> main
 from dyngs.io.formats.splat_file import (
     GEO_OFFSET,
     Nonfinite,

@@ -21,11 +21,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms
 from dyngs.data.images.colour_space import srgb_decoded
 from dyngs.gaussians import Gaussians
-<<<<<<< HEAD
-from dyngs.io.formats.rotation import joined, placed
-=======
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
->>>>>>> main
 from dyngs.io.formats.splat_file import (
     MOST_GAUSSIANS,
     SplatFile,

@@ -14,14 +14,10 @@ of the capture to those of the file: see ``SplatFile``).
 
 from __future__ import annotations
 
-<<<<<<< HEAD
-from collections.abc import Mapping, Sequence
-=======
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
->>>>>>> main
 from pathlib import Path
 from typing import BinaryIO
 
@@ -29,10 +25,6 @@ import numpy as np
 import torch
 
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
-<<<<<<< HEAD
-from dyngs.core.errors import DyngsError
-=======
->>>>>>> main
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.order import morton_order
 from dyngs.io.formats.packing import (
@@ -42,10 +34,6 @@ from dyngs.io.formats.packing import (
     unpack_fractions,
     whole_rotations,
 )
-<<<<<<< HEAD
-from dyngs.io.formats.ply_header import PlyHeader, header_bytes, read_header
-=======
->>>>>>> main
 from dyngs.io.formats.splat_file import (
     MOST_LOG_SCALE,
     SplatFile,
@@ -82,20 +70,11 @@ def read_ply(path: Path) -> SplatFile:
     properties, and elements other than ``vertex``, are skipped.
     """
     with open(path, "rb") as file:
-<<<<<<< HEAD
-        header = read_header(file, path)
-        if "packed_position" in header.vertex_names:
-            gaussians = _read_compressed(header, file, path)
-        else:
-            degree = _degree(header, path)
-            gaussians = _gaussians(header.read_element(file, path), degree)
-=======
         header = read_header(file)
         if "packed_position" in dict(header.elements["vertex"][1]):
             gaussians = _read_compressed(header, file, path)
         else:
             gaussians = _gaussians(header.read(file, "vertex"))
->>>>>>> main
     return described(SplatFile(gaussians, comments=header.comments), path)
 
 
@@ -126,26 +105,6 @@ def write_ply(
         file.write(np.ascontiguousarray(table).data)
 
 
-<<<<<<< HEAD
-def _degree(header: PlyHeader, path: Path) -> int:
-    present = set(header.vertex_names)
-    missing = [name for name in _REQUIRED if name not in present]
-    if missing:
-        shown = " ".join(missing[:6]) + (
-            f" and {len(missing) - 6} more" if len(missing) > 6 else ""
-        )
-        raise DyngsError(f"{path}: is not a 3DGS .ply, its vertices have no {shown}")
-    rest = {name for name in present if name.startswith("f_rest_")}
-    if len(rest) not in _DEGREE_OF_REST or rest != {f"f_rest_{i}" for i in range(len(rest))}:
-        allowed = ", ".join(map(str, _DEGREE_OF_REST))
-        raise DyngsError(
-            f"{path}: its f_rest properties (there are {len(rest)}) must be f_rest_0.. in counts {allowed}"
-        )
-    return _DEGREE_OF_REST[len(rest)]
-
-
-def _gaussians(rows: np.ndarray, degree: int) -> Gaussians:
-=======
 def _gaussians(rows: np.ndarray) -> Gaussians:
     present = rows.dtype.names or ()
     missing = [name for name in _REQUIRED if name not in present]
@@ -157,7 +116,6 @@ def _gaussians(rows: np.ndarray) -> Gaussians:
             else f"{len(rest_names)} f_rest properties are of no degree that is known"
         )
 
->>>>>>> main
     def columns(names: Sequence[str], dtype: type[np.floating] = np.float32) -> torch.Tensor:
         out = np.empty((len(rows), len(names)), dtype=dtype)
         with np.errstate(over="ignore"):
@@ -166,72 +124,20 @@ def _gaussians(rows: np.ndarray) -> Gaussians:
                 out[:, i] = rows[name]
         return torch.from_numpy(out)
 
-<<<<<<< HEAD
-    terms = num_sh_terms(degree) - 1
-    rest = (
-        columns([f"f_rest_{i}" for i in range(3 * terms)])
-        .reshape(len(rows), 3, terms)
-        .transpose(1, 2)
-    )
-=======
     terms = len(rest_names) // 3
     rest = columns([f"f_rest_{i}" for i in range(3 * terms)])
     sh = [columns(_DC)[:, None], rest.reshape(len(rows), 3, terms).transpose(1, 2)]
->>>>>>> main
     return Gaussians(
         means=columns(("x", "y", "z"), np.float64),
         quats=unit_rotations(columns(_ROT)),
         log_scales=columns(_SCALE),
         logit_opacities=columns(("opacity",))[:, 0],
-<<<<<<< HEAD
-        sh=torch.cat([columns(_DC)[:, None], rest], dim=1).contiguous(),
-=======
         sh=torch.cat(sh, dim=1).contiguous(),
->>>>>>> main
     )
 
 
 def _read_compressed(header: PlyHeader, file: BinaryIO, path: Path) -> Gaussians:
     """Return the Gaussians of a compressed .ply; colours and logits may be infinite."""
-<<<<<<< HEAD
-    missing = [name for name in _PACKED if name not in header.vertex_names]
-    if missing or "chunk" not in header.names:
-        raise DyngsError(
-            f"{path}: is a compressed .ply without {' '.join(missing) or 'chunks'}; export it again"
-        )
-    chunks = header.read_element(file, path, "chunk")
-    vertices = header.read_element(file, path, "vertex")
-    count = len(vertices)
-    if len(chunks) * _PER_CHUNK < count:
-        raise DyngsError(f"{path}: has {len(chunks)} chunks for {count} Gaussians; export it again")
-    require_count(path, count, 16 * count, 16)
-    words = {name: vertices[name].astype(np.uint32) for name in _PACKED}
-
-    def ranged(fractions: np.ndarray, axes: tuple[str, ...]) -> np.ndarray:
-        ends = (
-            _columns(chunks, [f"{end}_{axis}" for axis in axes], path) for end in ("min", "max")
-        )
-        low, high = (x[np.arange(count) // _PER_CHUNK] for x in ends)
-        with np.errstate(all="ignore"):  # ranges of others may be NaN or infinite
-            return (low + fractions * (high - low)).astype(np.float32)
-
-    colour = unpack_fractions(words["packed_color"], _BITS_4)
-    rgb = ranged(colour[:, :3], _COLOUR) if "min_r" in (chunks.dtype.names or ()) else colour[:, :3]
-    base = ((rgb - 0.5) / SH_C0).astype(np.float32)[:, None]
-    return Gaussians(
-        means=torch.from_numpy(
-            ranged(unpack_fractions(words["packed_position"], _BITS_3), _POSITION)
-        ),
-        quats=torch.from_numpy(whole_rotations(words["packed_rotation"])),
-        log_scales=torch.from_numpy(
-            ranged(unpack_fractions(words["packed_scale"], _BITS_3), _SIZE)
-        ),
-        logit_opacities=torch.from_numpy(logit(colour[:, 3])),
-        sh=torch.from_numpy(np.concatenate([base, _read_rest(header, file, path, count)], axis=1)),
-    )
-
-
-=======
     if "chunk" not in header.elements:
         raise ValueError("it is a compressed .ply without chunks")
     chunks = header.read(file, "chunk")
@@ -276,7 +182,6 @@ def _rest(table: np.ndarray) -> np.ndarray:
     return rest.transpose(0, 2, 1).astype(np.float32)
 
 
->>>>>>> main
 def write_compressed(path: Path, splat: SplatFile) -> None:
     """Write a compressed .ply, Gaussians in an order that keeps neighbours in one chunk, harmonics
     up to degree 3."""
@@ -322,29 +227,6 @@ def write_compressed(path: Path, splat: SplatFile) -> None:
         file.write(coded.tobytes())
 
 
-<<<<<<< HEAD
-def _read_rest(header: PlyHeader, file: BinaryIO, path: Path, count: int) -> np.ndarray:
-    if "sh" not in header.names:
-        return np.zeros((count, 0, 3), np.float32)
-    table = header.read_element(file, path, "sh")
-    names = [f"f_rest_{i}" for i in range(len(table.dtype.names or ()))]
-    if len(table) != count or _DEGREE_OF_REST.get(len(names), 4) > 3:
-        raise DyngsError(
-            f"{path}: its element sh has {len(table)} rows of {len(names)} numbers; export it again"
-        )
-    coded = _columns(table, names, path)
-    fraction = np.where(coded == 0, 0, np.where(coded == 255, 1, (coded + 0.5) / 256))
-    return (
-        ((fraction - 0.5) * _SH_RANGE).reshape(count, 3, -1).transpose(0, 2, 1).astype(np.float32)
-    )
-
-
-def _columns(table: np.ndarray, names: Sequence[str], path: Path) -> np.ndarray:
-    missing = [name for name in names if name not in (table.dtype.names or ())]
-    if missing:
-        raise DyngsError(f"{path}: is a compressed .ply without {missing[0]}; export it again")
-    return np.stack([table[name].astype(np.float32) for name in names], axis=1)
-=======
 _SCALARS = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -481,4 +363,3 @@ def double_ply(xyz: np.ndarray, rgb: np.ndarray, faces: np.ndarray | None = None
     corners["rows"] = faces
     elements.append(("face", len(faces), [("list uchar int", "vertex_indices")]))
     return header_bytes(elements) + rows.tobytes() + corners.tobytes()
->>>>>>> main

@@ -1,9 +1,5 @@
 """Similarities: one rotation, one scale and one shift for all that a scene consists of; exact, with
-<<<<<<< HEAD
-an inverse."""
-=======
 an inverse. And the names of axes."""
->>>>>>> main
 
 from __future__ import annotations
 
@@ -12,16 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-<<<<<<< HEAD
-
-from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
-from dyngs.io.formats.rotation import inverse, product, turned
-from dyngs.ops.quaternions import quats_of, rotation_matrices
-
-_STRAIGHT = 1e-4  # second singular value of points, over the first, below which they lie on a line
-=======
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -41,17 +27,13 @@ AXES: dict[str, tuple[float, float, float]] = {
 
 _ALONG_AXIS = 0.866  # a direction within 30 degrees of an axis is taken for the axis
 _DIRECTIONS = 200
->>>>>>> main
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 _FAR = 10.0  # distance from the origin over the spread, up to which points are not far away
 _FARTHEST = 1e30  # coordinates beyond this are mistakes
 _COARSE = 0.05  # largest rounding of coordinates to float32, relative to the detail of a scene
 
-<<<<<<< HEAD
-=======
 Quaternion = tuple[float, float, float, float]
 
->>>>>>> main
 
 @dataclass(frozen=True)
 class Similarity:
@@ -63,11 +45,7 @@ class Similarity:
         shift: (3,) in units of the result.
     """
 
-<<<<<<< HEAD
-    turn: tuple[float, float, float, float] = _NO_TURN
-=======
     turn: Quaternion = _NO_TURN
->>>>>>> main
     scale: float = 1.0
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -83,19 +61,6 @@ class Similarity:
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3) go, float64."""
-<<<<<<< HEAD
-        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + np.array(
-            self.shift
-        )
-
-    def after(self, first: Similarity) -> Similarity:
-        """Return ``first`` followed by this one."""
-        x, y, z = self.points(np.array(first.shift)).tolist()
-        return Similarity(product(self.turn, first.turn), self.scale * first.scale, (x, y, z))
-
-    def inverse(self) -> Similarity:
-        back = Similarity(inverse(self.turn), 1 / self.scale)
-=======
         turned = np.asarray(points, np.float64) @ self.rotation.T
         return self.scale * turned + np.array(self.shift)
 
@@ -110,7 +75,6 @@ class Similarity:
     def inverse(self) -> Similarity:
         w, x, y, z = self.turn
         back = Similarity((w, -x, -y, -z), 1 / self.scale)
->>>>>>> main
         x, y, z = (-back.points(np.array(self.shift))).tolist()
         return replace(back, shift=(x, y, z))
 
@@ -119,12 +83,6 @@ class Similarity:
 
         A 3D filter must be fused already, as in ``GaussianScene.at``.
         """
-<<<<<<< HEAD
-        shift = (
-            torch.tensor(self.shift, dtype=torch.float64, device="cpu") if any(self.shift) else None
-        )
-        return turned(gaussians, self.turn, self.scale, shift)
-=======
         if self == UNMOVED:
             return gaussians
         means = gaussians.means.double()
@@ -145,7 +103,6 @@ class Similarity:
             log_scales=gaussians.log_scales + float(np.log(self.scale)),
             sh=sh,
         )
->>>>>>> main
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras that see the moved scene as ``cameras`` see the scene: depths are
@@ -174,32 +131,6 @@ def similarity_of(numbers: Sequence[float]) -> Similarity:
     return Similarity((a, b, c, d), scale, (x, y, z))
 
 
-<<<<<<< HEAD
-def fitted(points: np.ndarray, wanted: np.ndarray) -> Similarity:
-    """Return the similarity that brings points nearest to where they are wanted, least squares
-    (Umeyama 1991).
-
-    ``points``, ``wanted``: (P, 3) float64. Raises DyngsError: fewer than three, or on a line: they
-    leave the rotation about it open.
-    """
-    if len(points) < 3:
-        raise DyngsError(
-            f"{len(points)} control points do not determine a similarity; give three or more"
-        )
-    middles = points.mean(axis=0), wanted.mean(axis=0)
-    here = points - middles[0]
-    there = wanted - middles[1]
-    for rows, where in ((here, "the scene"), (there, "the world")):
-        spread = np.linalg.svd(rows, compute_uv=False)
-        if not spread[1] > _STRAIGHT * spread[0]:
-            raise DyngsError(f"the control points lie on one line in {where}; give one beside it")
-    left, spread, right = np.linalg.svd(there.T @ here)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    w, x, y, z = quats_of(torch.from_numpy((left * signs) @ right)).tolist()
-    found = Similarity((w, x, y, z), float((spread * signs).sum() / np.square(here).sum()))
-    x, y, z = (middles[1] - found.points(middles[0])).tolist()
-    return replace(found, shift=(x, y, z))
-=======
 def similarity_of_matrix(world: np.ndarray) -> Similarity | None:
     """Return the similarity of an affine matrix (4, 4), None where that distorts or mirrors."""
     linear = world[:3, :3]
@@ -218,7 +149,6 @@ def turn_of(rotation: np.ndarray) -> Quaternion:
     """Return the quaternion wxyz of a rotation (3, 3)."""
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True).tolist()
     return w, x, y, z
->>>>>>> main
 
 
 def far_offset(points: np.ndarray, detail: float) -> np.ndarray:
@@ -239,8 +169,6 @@ def far_offset(points: np.ndarray, detail: float) -> np.ndarray:
     # Multiples of a power of two: subtracting them from float32 and adding them again is exact.
     step = 2.0 ** np.ceil(np.log2(max(spread, detail, distance * 2**-40)))
     return step * np.round(middle / step)
-<<<<<<< HEAD
-=======
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
@@ -320,4 +248,3 @@ def nearest_axis(direction: tuple[float, ...]) -> str | None:
         if length > 0 and float(np.dot(direction, axis)) / length >= _ALONG_AXIS:
             return name
     return None
->>>>>>> main

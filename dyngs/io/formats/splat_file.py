@@ -18,12 +18,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.io.formats.packing import logit
-<<<<<<< HEAD
-from dyngs.io.formats.rotation import AXES, inverse
-from dyngs.io.formats.similarity import UNMOVED, Similarity, far_offset, similarity_of
-=======
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, far_offset, similarity_of
->>>>>>> main
 from dyngs.io.limits import require_at_most
 from dyngs.models.renderable import near_plane
 from dyngs.ops.checks import finite_rows

@@ -23,11 +23,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import SYSTEM_OF_UP
 from dyngs.io.formats.packing import largest_and_others, logit, with_largest
-<<<<<<< HEAD
-from dyngs.io.formats.rotation import mirrored, turned
-=======
 from dyngs.io.formats.similarity import Similarity, mirrored, turn_of
->>>>>>> main
 from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
 from dyngs.io.limits import require_at_most
 

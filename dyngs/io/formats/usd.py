@@ -22,11 +22,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.io.child import python_command
 from dyngs.io.formats import usd_child
-<<<<<<< HEAD
-from dyngs.io.formats.rotation import joined, placed
-=======
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
->>>>>>> main
 from dyngs.io.formats.splat_file import SplatFile, described, from_linear, header_comments
 from dyngs.io.limits import require_at_most
 

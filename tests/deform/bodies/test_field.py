@@ -16,10 +16,6 @@ from dyngs.core.state import tensors_of
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state, restored_field
-<<<<<<< HEAD
-=======
-from dyngs.gaussians import TopologyEdit
->>>>>>> main
 
 CENTERS = torch.tensor([[0.2, -0.1, 0.3], [-0.4, 0.0, 0.1]])
 RADII = torch.tensor([0.2, 0.3])

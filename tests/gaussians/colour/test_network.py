@@ -11,10 +11,6 @@ import torch
 from scenes import random_scene
 from torch import Tensor
 
-<<<<<<< HEAD
-=======
-from dyngs.core.camera import Cameras
->>>>>>> main
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import (
     ColourNetwork,

@@ -33,12 +33,7 @@ from dyngs.gaussians.colour.training import (
     opacity_entropy,
     rate_factor,
 )
-<<<<<<< HEAD
 from dyngs.training.new_trainer import GaussianTrainer, assemble
-=======
-from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.training.new_trainer import GaussianTrainer, assemble, restored_scene
->>>>>>> main
 
 
 def gaussians() -> Gaussians:

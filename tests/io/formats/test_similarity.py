@@ -13,11 +13,6 @@ from splat_scenes import AROUND, cloud, seen
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-<<<<<<< HEAD
-from dyngs.gaussians.filters import filtered
-from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.io.formats.similarity import Similarity, far_offset, fitted
-=======
 from dyngs.export.edit.frame import fitted
 from dyngs.gaussians.filters import filtered
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -31,7 +26,6 @@ from dyngs.io.formats.similarity import (
     turn_between,
 )
 from dyngs.ops.quaternions import rotate
->>>>>>> main
 
 _LENGTH = (0.3**2 + 0.7**2 + 0.2**2 + 0.6**2) ** 0.5
 ODD = Similarity(
