@@ -28,9 +28,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo and print the results and the paths of the files."""
     from rich.console import Console
 
+    from dyngs.cli.training_progress import TrainingProgress
     from dyngs.demo import DemoOptions, result_table, run_demo
 
-    result = run_demo(arguments.out, DemoOptions(steps=arguments.steps, threads=arguments.threads))
+    options = DemoOptions(steps=arguments.steps, threads=arguments.threads)
+    with TrainingProgress() as progress:
+        result = run_demo(arguments.out, options, [progress])
     Console().print(result_table(result))
     print(f"truth, render, error  {result.images / 'sheet.png'}")
     print(f"test views            {result.images}")

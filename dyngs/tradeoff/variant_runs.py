@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dyngs.api.prune import prune_run
+from dyngs.api.prune import pruningrun
 from dyngs.api.train import num_cores
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
@@ -17,7 +17,7 @@ from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.kinds import assemble, restored_model
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.stage import prune_
+from dyngs.prune.stage import pruning
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     Checkpoint,
@@ -129,7 +129,7 @@ class VariantRuns:
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, read_capture_of(config.data, checkpoint.info), restored=True)
             trainer.restore(checkpoint)
-            prune_(trainer)
+            trainer.apply(pruning(trainer))
             return trainer.checkpoint(), config
 
 
