@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dyngs.api.prune import pruningrun
+from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
