@@ -22,24 +22,24 @@ from torch import Tensor
 from dyngs.api.first_scene import first_of
 from dyngs.config import BudgetConfig, Config, DynamicModel, FreeField, PruneConfig, StaticModel
 from dyngs.config.io import load_config, packaged_preset
+from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.metrics import psnr
+from dyngs.core.section import Section
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
-from dyngs.errors import DyngsError, counted, show
-from dyngs.files.write import write_text
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.kinds import GaussianTrainer, assemble, with_points
-from dyngs.metrics import psnr
+from dyngs.io.write import write_text
 from dyngs.models.kind import kind_of
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.section import Section
 from dyngs.training.corrections.camera_refinement import fitted_to_image
 from dyngs.training.loop import Interrupts
+from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
 
 PairScore = Callable[[GaussianTrainer, GaussianTrainer, int], tuple[float, float]]
 """Returns the PSNR, dB, of a training view by two models that were not trained on it."""

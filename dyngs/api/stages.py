@@ -18,9 +18,9 @@ from dyngs.config import (
     StaticModel,
 )
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.conventions import ReportProgress
+from dyngs.core.conventions import ReportProgress
+from dyngs.core.errors import DyngsError, counted, show, warn
 from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
-from dyngs.errors import DyngsError, counted, show, warn
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.views import training_times
@@ -81,7 +81,7 @@ def find_poses(report: ReportProgress) -> Stage:
         else:
             if is_unposed(data):
                 # late: other kinds need no detector
-                from dyngs.human.detection.find_person import with_found_person
+                from dyngs.human.detect.find_person import with_found_person
 
                 data = with_found_person(data, say=show, report=report)
             if isinstance(model, HumanModel):

@@ -11,6 +11,9 @@ from itertools import count as counted_from
 from pathlib import Path
 from typing import Any
 
+from dyngs.api.budget.count import CountLimit
+from dyngs.api.budget.size import has_file, write_within
+from dyngs.api.budget.time import TimeLimit, fit_minutes
 from dyngs.api.choose import write_choices
 from dyngs.api.following import Leader
 from dyngs.api.stages import (
@@ -24,21 +27,17 @@ from dyngs.api.stages import (
     set_limits,
     share_views,
 )
-from dyngs.budget.count import CountLimit
-from dyngs.budget.size import has_file, write_within
-from dyngs.budget.time import TimeLimit, fit_minutes
+from dyngs.compress.prune.floaters import remove_floaters
+from dyngs.compress.prune.stage import prune_stage
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, as_word, counted, show, warn
 from dyngs.data.loader import ImageLoader
-from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
-from dyngs.files.lock import Held, writing
-from dyngs.kinds import build
+from dyngs.io.lock import Held, writing
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.floaters import remove_floaters
-from dyngs.prune.stage import prune_stage
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -77,6 +76,7 @@ from dyngs.training.events import (
 from dyngs.training.limits import require_possible
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
 from dyngs.training.memory import memory_forecasts, require_room
+from dyngs.training.new_trainer import build
 from dyngs.training.plan import RunPlan
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
-from dyngs.errors import as_word
+from dyngs.core.errors import as_word
 
 
 def add_parser(commands: Commands) -> None:
@@ -28,8 +28,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo and print the results and the paths of the files."""
     from rich.console import Console
 
+    from dyngs.cli.demo_run import DemoOptions, result_table, run_demo
     from dyngs.cli.training_progress import TrainingProgress
-    from dyngs.demo import DemoOptions, result_table, run_demo
 
     options = DemoOptions(steps=arguments.steps, threads=arguments.threads)
     with TrainingProgress() as progress:

@@ -8,7 +8,7 @@ import time
 from contextlib import suppress
 from typing import IO, Any
 
-from dyngs.errors import escaped
+from dyngs.core.errors import escaped
 from dyngs.models.schedule import image_divisor
 from dyngs.runs.log import record_of
 from dyngs.training.clock import Forecast

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
