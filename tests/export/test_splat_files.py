@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from dyngs.io.formats.rotation import AXES, turn_between
 from moving_scene import (
     MOVING_ROWS,
     TRAIN_TIMES,
@@ -53,7 +54,6 @@ from dyngs.export.splat_files import (
 )
 from dyngs.gaussians.rendering import render
 from dyngs.io.formats.formats import read_splats, upright, write_splats
-from dyngs.io.formats.rotation import AXES, turn_between
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
