@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.capture.first_points import AROUND_ORIGIN
+from dyngs.capture.initial_points import AROUND_ORIGIN
 from dyngs.config import (
     DefaultStrategy,
     FixedStrategy,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dyngs.capture import first_points, plane_sweep
-from dyngs.capture.first_points import with_first_points
+from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.plane_sweep import (
     MIN_NEIGHBOURS,
     NEIGHBOURS,

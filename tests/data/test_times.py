@@ -17,7 +17,6 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.times import (
     SECONDS_FILE,
-    Taken,
     clip_seconds,
     distinct_times,
     hold_out_frames,
@@ -29,7 +28,6 @@ from dyngs.data.times import (
     span_in_files,
     split_by_camera,
     still_if_constant,
-    taken_frames,
     times_by_name,
     unit_times,
     videos,
@@ -469,43 +467,3 @@ def test_a_frame_rate_makes_seconds_of_numbers() -> None:
 def test_what_has_no_order_is_one_line(names: tuple[str, ...]) -> None:
     with pytest.raises(DyngsError, match=r"data\.times=order"):
         _times(*names)
-
-
-def _taken(*clips: tuple[float, float, int], most: int | None = None) -> tuple[list[Taken], str]:
-    """The frames taken of videos, each with its start in seconds, frames per second, and number of
-    frames."""
-    clocks = [start + np.arange(count) / rate for start, rate, count in clips]
-    return taken_frames(Path("rig"), clocks, [rate for _, rate, _ in clips], most)
-
-
-def test_frames_of_one_time_step_have_one_time() -> None:
-    taken, line = _taken((0.0, 10, 30), (0.5, 10, 30))
-    assert list(taken[0].numbers) == list(range(5, 30))
-    assert list(taken[1].numbers) == list(range(25))
-    assert taken[0].seconds == pytest.approx(0.5 + np.arange(25) / 10)
-    assert np.array_equal(taken[0].seconds, taken[1].seconds)
-    assert "25 time steps of 2.40 s" in line
-
-
-def test_different_rates_share_the_time_steps_of_the_slower_one() -> None:
-    taken, _ = _taken((0.0, 50, 100), (0.0, 25, 50))
-    assert list(taken[0].numbers) == list(range(0, 100, 2))
-    assert list(taken[1].numbers) == list(range(50))
-
-
-def test_frames_between_time_steps_keep_their_own_time() -> None:
-    taken, _ = _taken((0.0, 10, 20), (0.04, 10, 20))
-    assert taken[1].seconds - taken[0].seconds == pytest.approx(np.full(20, 0.04))
-
-
-def test_the_number_of_time_steps_is_bounded_and_said() -> None:
-    films = ((0.0, 30, 3000), (0.0, 30, 3000))
-    taken, line = _taken(*films)
-    assert len(taken[0].numbers) == 300
-    assert "of 3000" in line
-    assert len(_taken(*films, most=12)[0][0].numbers) == 12
-
-
-def test_videos_of_different_events_are_refused() -> None:
-    with pytest.raises(DyngsError, match="share no two time steps"):
-        _taken((0.0, 10, 20), (5.0, 10, 20))

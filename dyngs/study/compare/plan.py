@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from dyngs.capture.unposed import is_unposed
+from dyngs.capture.sfm.unposed import is_unposed
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import find_preset, load_config
 from dyngs.core.errors import DyngsError, as_word, printable

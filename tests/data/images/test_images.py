@@ -16,10 +16,10 @@ from PIL import Image, ImageOps
 from PIL.TiffImagePlugin import IFDRational
 from tiny_captures import random_pixels, write_image
 
-from dyngs.capture.photos import gather_photos, lay_out
+from dyngs.capture.sfm.photos import gather_photos, lay_out
+from dyngs.core.conventions import srgb_encoded
 from dyngs.core.errors import DyngsError
 from dyngs.data.images import images
-from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from tiny_captures import write_colmap
 
-from dyngs.capture import unposed
-from dyngs.capture.sfm import SfmResult
-from dyngs.capture.sfm_work import SfmOptions
-from dyngs.capture.unposed import with_poses
+from dyngs.capture.sfm import unposed
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import SfmResult
+from dyngs.capture.sfm.unposed import with_poses
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import save_config
@@ -30,7 +30,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     def estimate(source: Path, out: Path, options: SfmOptions, report: object) -> SfmResult:
         sources.append(source)
         write_colmap(out)
-        return SfmResult(out, 3, 3, (), 8, 0.5, 3.0, "global", {}, ())
+        return SfmResult(out, 3, 3, (), 8, 0.5, ())
 
     def several(source: Path, out: Path, options: SfmOptions, report: object) -> str:
         sources.append(source)

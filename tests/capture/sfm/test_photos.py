@@ -12,8 +12,8 @@ from hdr_clips import BT2020, PQ, encoded, patches
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from dyngs.capture.photos import copied, gather_photos, lay_out
-from dyngs.capture.sfm import estimate_poses
+from dyngs.capture.sfm.estimate import estimate_poses
+from dyngs.capture.sfm.photos import copied, gather_photos, lay_out
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_header, read_image
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dyngs.capture.sfm_work import working
+from dyngs.capture.sfm.colmap import working
 from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 

@@ -13,8 +13,8 @@ from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 from skimage.transform import resize_local_mean
 
 from dyngs.api.load import read_capture
-from dyngs.capture.sfm import SfmResult, _frames_of, estimate_poses
-from dyngs.capture.sfm_work import SfmOptions
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import SfmModel, SfmResult, _frames_of, better, estimate_poses
 from dyngs.core.conventions import report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
@@ -200,3 +200,27 @@ def test_photos_that_are_links_are_followed_only_if_asked(tmp_path: Path) -> Non
             photos, tmp_path / "out", replace(FAST, follow_links=True, max_megapixels=9e-5)
         )
     assert not (tmp_path / "out").exists()
+
+
+def _model(focal: float, known: bool = False) -> SfmModel:
+    found = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, 480, 270)
+    camera.has_prior_focal_length = known
+    found.add_camera(camera)
+    return SfmModel(found, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("focal", "known", "real"), [(400, False, True), (6100, False, False), (6100, True, True)]
+)
+def test_a_focal_length_of_many_widths_is_no_lens_unless_exif_says_so(
+    focal: float, known: bool, real: bool
+) -> None:
+    assert _model(focal, known).has_real_lens == real
+
+
+def test_the_model_with_a_real_lens_is_taken() -> None:
+    real = _model(400)
+    unreal = _model(6100)
+    assert better(unreal, real) is real
+    assert better(real, unreal) is real
