@@ -42,7 +42,7 @@ MUTATIONS = (
     ("io/formats/spz.py", "others < 0", "others > 0", "io/formats/test_formats.py"),
     ("io/formats/gltf.py", '"colorSpace": "srgb_rec709_display"', '"colorSpace": "lin_rec709_display"', "io/formats/test_formats.py"),
     ("io/formats/gltf.py", 'for key in ("kernel", "colorSpace")', 'for key in ("kernel",)', "io/formats/test_formats.py"),
-    ("data/images/colour_space.py", "((signal + 0.055) / 1.055) ** 2.4", "signal", "io/formats/test_formats.py"),
+    ("core/conventions.py", "((signal + 0.055) / 1.055) ** 2.4", "signal", "io/formats/test_formats.py"),
     ("io/formats/ply.py", "_SH_RANGE = 8.0", "_SH_RANGE = 4.0", "io/formats/test_ply.py io/formats/test_formats.py"),
     ("io/formats/ply.py", "+ 0.5) / 256))", ") / 256))", "io/formats/test_ply.py io/formats/test_formats.py"),
     ("io/formats/ply.py", "_BITS_3 = (11, 10, 11)", "_BITS_3 = (10, 11, 11)", "io/formats/test_formats.py"),

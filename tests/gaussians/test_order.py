@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.gaussians.order import morton_order, storage_order
+from dyngs.core.gaussians import morton_order, storage_order
 from dyngs.training.new_trainer import assemble
 
 

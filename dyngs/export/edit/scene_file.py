@@ -27,6 +27,7 @@ from dyngs.export.splat_files import (
     up_of,
     write_moving,
 )
+from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     all_suffixes,
@@ -40,7 +41,7 @@ from dyngs.io.formats.formats import (
     write_splats,
 )
 from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
-from dyngs.io.formats.splat_file import SplatFile, drawing_options
+from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.frame import RunFrame
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened, open_scene, opened_scene

@@ -14,7 +14,7 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import quat_product, rotation_matrices
 

@@ -21,10 +21,9 @@ from dyngs.export.edit.frame import Frame, geo_frame
 from dyngs.export.edit.run_folder import at_end, write_edited_run
 from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import AS_THEY_ARE, splats_at, tracks_of, write_run_splats, writing_of
-from dyngs.gaussians.rendering import render
+from dyngs.gaussians.rendering import render, splat_options
 from dyngs.io.formats.formats import read_splats
 from dyngs.io.formats.similarity import Similarity
-from dyngs.io.formats.splat_file import splat_options
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, open_run
 from dyngs.view.recording import Keyframe, Recording

@@ -20,6 +20,7 @@ from splat_scenes import cameras_turned, cloud, psnr, readable, seen
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.edit_note import note_path
 from dyngs.io.formats.formats import (
     FORMATS,
@@ -35,7 +36,7 @@ from dyngs.io.formats.formats import (
 )
 from dyngs.io.formats.gltf import add_gaussians
 from dyngs.io.formats.similarity import UNMOVED, Similarity
-from dyngs.io.formats.splat_file import SplatFile, splat_options
+from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.limits import VARIABLE
 
