@@ -22,8 +22,8 @@ from dyngs.api.choose import Choice, choose, write_choices
 from dyngs.api.following import Leader
 from dyngs.api.from_scene import first_of, settled
 from dyngs.capture.unposed import is_unposed, with_poses
-from dyngs.compress.prune.floaters import FloaterRemoval
-from dyngs.compress.prune.stage import PruneStage
+from dyngs.compress.floaters import FloaterRemoval
+from dyngs.compress.stage import PruneStage
 from dyngs.config import Config, HumanModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ReportProgress, report_nothing
@@ -36,7 +36,7 @@ from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.io.lock import Held, writing
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
-from dyngs.ops.native import kernel_threads
+from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import changed_files, named, write_record
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -504,14 +504,6 @@ def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -
 def _num_threads(config: Config, processes: Processes) -> int:
     """Return the number of threads of the kernels in each process."""
     return config.run.threads or max(1, num_cores() // processes.local_size)
-
-
-def num_cores() -> int:
-    """Return the number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on Linux
-        return os.cpu_count() or 1
 
 
 def with_capture(

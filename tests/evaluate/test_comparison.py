@@ -8,9 +8,9 @@ import pytest
 from tiny_fields import busy_config
 
 from dyngs.api.train import train
+from dyngs.compress.scene_file import write_scene_file
 from dyngs.evaluate.comparison import compared
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.scene_file import write_scene_file
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.api.budget.run import LimitedRun
-from dyngs.compress.prune.stage import highest, scores_of
+from dyngs.compress.stage import highest, scores_of
 from dyngs.core.errors import counted
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE, most_gaussians

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from dyngs.compress.prune.stage import quality_of
+from dyngs.compress.stage import quality_of
 from dyngs.config import Config
 from dyngs.training.events import Message, TopologyChanged
 from dyngs.training.loop import Loop

@@ -9,15 +9,14 @@ from pathlib import Path
 from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores
 from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.compress.prune.stage import prune_
-from dyngs.compress.storage.file import write_scene
+from dyngs.compress.scene_file import num_bytes_exact, write_scene_file
+from dyngs.compress.stage import prune_
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.schema import section_class
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
-from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -31,6 +30,7 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.config_file import write_config
+from dyngs.runs.stored_file import write_scene
 from dyngs.study.runs import finished
 from dyngs.study.tradeoff.measure import with_render_settings
 from dyngs.study.tradeoff.variants import Settings, Value, Variant

@@ -12,9 +12,9 @@ from scaled_files import FACTORS, scaled
 from splat_scenes import cloud
 
 from dyngs.api.train import train
+from dyngs.compress.clean import Suspects, by_shape, cleaned_file, cleaned_run, lone
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.clean import Suspects, by_shape, cleaned_file, cleaned_run, lone
 from dyngs.gaussians import Gaussians
 from dyngs.runs.checkpoint import load_run
 

@@ -15,7 +15,7 @@ from tiny_fields import ALL_KINDS, busy_config, cloud, tiny_setup
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.compress.prune.stage import (
+from dyngs.compress.stage import (
     Importance,
     Pruned,
     PruneStage,

@@ -11,6 +11,8 @@ import pytest
 import torch
 from moving_scene import MOVING_ROWS, moved_x, row_of_balls, write_moving_run
 
+from dyngs.api.edit import Edits, edit_scene
+from dyngs.api.edited_run import at_end, write_edited_run
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -18,8 +20,6 @@ from dyngs.export.cameras import write_cameras
 from dyngs.export.chosen_path import PathOptions, choose_path
 from dyngs.export.edit.crop import Sphere
 from dyngs.export.edit.frame import Frame, geo_frame
-from dyngs.export.edit.run_folder import at_end, write_edited_run
-from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import AS_THEY_ARE, splats_at, tracks_of, write_run_splats, writing_of
 from dyngs.gaussians.rendering import render, splat_options
 from dyngs.io.formats.formats import read_splats

@@ -9,19 +9,19 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
-from dyngs.compress.storage.file import decoded
-from dyngs.compress.storage.measure import (
+from dyngs.compress.measure import (
     COMPARED,
     FACTORS,
     StoragePlan,
     coarsest_file,
     storage_plan,
 )
-from dyngs.compress.storage.precision import assumed_precision
+from dyngs.compress.precision import assumed_precision
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.runs.stored_file import decoded
 from dyngs.training.new_trainer import restored_scene
 
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dyngs.api.edited_run import write_edited_run
+from dyngs.compress.clean import cleaned_file, cleaned_run
 from dyngs.core.errors import DyngsError, counted, show
-from dyngs.export.edit.clean import cleaned_file, cleaned_run
 from dyngs.export.edit.crop import Region, held_by
 from dyngs.export.edit.frame import Frame, GeoFrame
 from dyngs.export.edit.gps import gps_frame
 from dyngs.export.edit.merge import merged
-from dyngs.export.edit.run_folder import write_edited_run
 from dyngs.export.redrawn import Redrawn, compare_run, compare_splats
 from dyngs.export.splat_files import (
     SUFFIX,

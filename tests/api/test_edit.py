@@ -13,10 +13,10 @@ from moving_scene import MOVING_ROWS, moved_x, row_of_balls, write_moving_run
 from scaled_files import FAR, write_far_ply
 from splat_scenes import cloud, readable
 
+from dyngs.api.edit import Edits, edit_scene
 from dyngs.core.errors import DyngsError
 from dyngs.export.edit.crop import Box, Sphere
 from dyngs.export.edit.frame import Distance, Frame, geo_frame
-from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import read_moment
 from dyngs.io.formats.formats import Format, read_splats, write_splats
 from dyngs.io.formats.splat_file import SplatFile

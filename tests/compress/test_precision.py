@@ -10,14 +10,17 @@ from moving_scene import camera
 from scenes import random_scene
 from torch import Tensor
 
-from dyngs.compress.storage.precision import (
+from dyngs.compress.precision import (
     Draw,
     Precision,
     assumed_precision,
     coarseness_of,
     measured_precision,
 )
-from dyngs.compress.storage.tensors import (
+from dyngs.core.state import part_of
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import render
+from dyngs.runs.stored_tensors import (
     MAX_COARSENESS,
     TensorKind,
     coding_of,
@@ -25,9 +28,6 @@ from dyngs.compress.storage.tensors import (
     drawable,
     restored,
 )
-from dyngs.core.state import part_of
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import render
 from dyngs.static.scene import StaticScene
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tiny_fields import busy_config
 
-from dyngs.compress.prune.cut import Cut, FieldSize, apply_cut, cut_config, field_size, with_field
+from dyngs.compress.cut import Cut, FieldSize, apply_cut, cut_config, field_size, with_field
 from dyngs.config import Config, DynamicModel
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.scene import DynamicScene

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config
 
-from dyngs.compress.prune.cut import Cut
-from dyngs.compress.prune.search import (
+from dyngs.compress.cut import Cut
+from dyngs.compress.search import (
     Candidate,
     Search,
     SearchLimit,
