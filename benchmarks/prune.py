@@ -23,7 +23,7 @@ from statistics import median
 import torch
 
 from dyngs.api.prune import file_of, prune_run, prune_within
-from dyngs.compress.scene_file import write_scene_file
+from dyngs.api.scene_file import write_scene_file
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.comparison import Cost, compared

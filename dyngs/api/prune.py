@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.compress.scene_file import write_scene_file
 from dyngs.compress.search import Promise, Search, unseen_images
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved

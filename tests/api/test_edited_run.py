@@ -17,7 +17,7 @@ from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.export.cameras import write_cameras
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.edit.crop import Sphere
 from dyngs.export.edit.frame import Frame, geo_frame
 from dyngs.export.splat_files import AS_THEY_ARE, splats_at, tracks_of, write_run_splats, writing_of

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.compress.scene_file import write_scene_file
 from dyngs.evaluate.comparison import compared
 from dyngs.evaluate.report import evaluate_run
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import dyngs
+from dyngs.api.scene_file import write_scene_file
 from dyngs.cli import main
-from dyngs.compress.scene_file import write_scene_file
 from dyngs.config import Config
 from dyngs.config.io import load_resolved, save_config
 from dyngs.core.errors import DyngsError

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from dyngs.api.prune import prune_run
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.cli.demo_run import is_unused
-from dyngs.compress.scene_file import write_scene_file
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError

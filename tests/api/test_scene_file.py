@@ -10,8 +10,8 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.compress.precision import Precision
-from dyngs.compress.scene_file import write_scene_file
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import prefixed, tensors_of
 from dyngs.gaussians.visibility import VisibilityMasks
