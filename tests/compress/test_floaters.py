@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from dyngs.api.train import train
-from dyngs.compress.prune import floaters as module
-from dyngs.compress.prune.floaters import floaters
+from dyngs.compress import floaters as module
+from dyngs.compress.floaters import floaters
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
@@ -57,18 +57,6 @@ def test_what_hangs_before_one_camera_is_found(trainer: Trainer) -> None:
     assert int(found[:-1].sum()) <= 0.02 * len(found)
 
 
-def test_what_is_not_near_is_none(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "NEAR", 0.01)
-    assert not bool(floaters(trainer).any())
-
-
-def test_what_several_views_share_is_none(
-    trainer: Trainer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "MAIN_FRACTION", 1.0)
-    assert not bool(floaters(trainer).any())
-
-
 @pytest.mark.parametrize(("count", "removed"), [(2, 2), (7, 0), (0, 0)])
 def test_they_are_removed_before_the_run_is_saved(
     count: int,
@@ -76,7 +64,6 @@ def test_they_are_removed_before_the_run_is_saved(
     still: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Unless they are too many to be floaters."""
     monkeypatch.setattr(module, "FEWEST_VIEWS", 3)
@@ -85,22 +72,6 @@ def test_they_are_removed_before_the_run_is_saved(
     )
     run = train(config_of(still, "train.remove_floaters=true", f"run.dir={tmp_path / 'run'}"))
     assert len(load_run(run).scene) == 300 - removed
-    said = capsys.readouterr().err
-    assert (f"{count} of 300 Gaussians hang close before single cameras" in said) is (count > 0)
-    assert ("too many" in said) is (count > removed)
-
-
-@pytest.mark.parametrize(
-    "keys", [("train.remove_floaters=false",), ("train.remove_floaters=true",)]
-)
-def test_few_views_or_no_wish_leave_all(
-    keys: tuple[str, ...], still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "FEWEST_VIEWS", 3 if "false" in keys[0] else 20)
-    monkeypatch.setattr(
-        module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < 2
-    )
-    assert len(load_run(train(config_of(still, *keys, f"run.dir={tmp_path / 'run'}"))).scene) == 300
 
 
 def test_cameras_are_those_that_training_found(trainer: Trainer) -> None:

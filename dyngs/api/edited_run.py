@@ -9,20 +9,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.api.train import num_cores
+from dyngs.compress.clean import at_end
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.io.outputs import new_folder
-from dyngs.models.checkpoint import read_capture_of
 from dyngs.ops.device import deterministic, device_for
-from dyngs.ops.native import kernel_threads
+from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     has_only_scene_file,
     latest_checkpoint,
-    load_run,
     save_checkpoint,
     seconds_at,
 )
@@ -30,23 +28,6 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import require_empty
 from dyngs.runs.frame import RunFrame, write_frame
 from dyngs.runs.log import LOG_NAME
-from dyngs.training.new_trainer import GaussianTrainer, assemble
-
-
-def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
-    """Return the trainer of a run where it ended; without checkpoints with nothing but its
-    scene."""
-    run = load_run(run_dir, config.data.root)
-    trainer: GaussianTrainer = assemble(
-        config, read_capture_of(config.data, run.info), restored=True
-    )
-    if has_only_scene_file(run_dir):
-        scene = run.scene.to(trainer.device)
-        trainer.model.begin_with(scene, trainer.model.training)
-        trainer.model.exchange(scene)
-    else:
-        trainer.restore(latest_checkpoint(run_dir))
-    return trainer
 
 
 def write_edited_run(

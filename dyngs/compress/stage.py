@@ -1,7 +1,7 @@
 """The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and
 training goes on with them.
 
-The fraction that goes is input here; ``dyngs.compress.prune.search`` finds it, and what else can go, with
+The fraction that goes is input here; ``dyngs.compress.search`` finds it, and what else can go, with
 the same functions.
 
 It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that

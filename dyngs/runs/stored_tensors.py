@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
+from dyngs.core.gaussians import storage_order
 from dyngs.core.state import tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.order import storage_order
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.models.renderable import Renderable
 from dyngs.ops.quaternions import quat_product

@@ -11,8 +11,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from dyngs.compress.storage.file import decoded, encoded
-from dyngs.compress.storage.precision import (
+from dyngs.compress.precision import (
     GREY_LEVELS,
     Precision,
     assumed_precision,
@@ -20,7 +19,6 @@ from dyngs.compress.storage.precision import (
     measured_precision,
     rounded,
 )
-from dyngs.compress.storage.tensors import COARSENESS, TRIANGLES, completed, drawable, step_below
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -31,6 +29,8 @@ from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
+from dyngs.runs.stored_file import decoded, encoded
+from dyngs.runs.stored_tensors import COARSENESS, TRIANGLES, completed, drawable, step_below
 from dyngs.training.new_trainer import restored_model, restored_scene
 
 LOSS_DB = 0.025

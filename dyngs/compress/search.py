@@ -21,12 +21,12 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from dyngs.compress.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
-from dyngs.compress.prune.stage import PROBED_VIEWS, probe_images, quality_of, scores_of
-from dyngs.compress.storage.measure import CoarseFile, coarsest_file
+from dyngs.compress.cut import Cut, FieldSize, apply_cut, field_size, with_field
+from dyngs.compress.measure import CoarseFile, coarsest_file
+from dyngs.compress.stage import PROBED_VIEWS, probe_images, quality_of, scores_of
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.loader import Image
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint
@@ -120,6 +120,20 @@ def evenly_held_out(count: int) -> tuple[int, ...]:
     none of one view."""
     chosen = min(max(1, round(HELD_OUT_FRACTION * count)), MOST_HELD_OUT) if count > 1 else 0
     return tuple((2 * i + 1) * count // (2 * chosen) for i in range(chosen))
+
+
+def unseen_images(trainer: GaussianTrainer) -> list[Image]:
+    """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people
+    none.
+
+    They play other motions there, in which poses are not refined.
+    """
+    views = trainer.capture.splits.get("val", ())
+    if not views or trainer.config.model.is_posed:
+        return []
+    loader = ImageLoader(views, trainer.config.data)
+    loader.device = trainer.device
+    return [loader[i] for i in evenly_spaced(len(loader), MOST_HELD_OUT)]
 
 
 class Search:

@@ -13,10 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
-from dyngs.compress.storage.file import (
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import part_of
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.runs.stored_file import (
     MAGIC,
     MAX_HEADER,
-    Packing,
     compressed,
     decoded,
     decompressed,
@@ -26,12 +30,7 @@ from dyngs.compress.storage.file import (
     unpacked,
     write_scene,
 )
-from dyngs.compress.storage.tensors import COARSENESS
-from dyngs.core.errors import DyngsError
-from dyngs.core.state import part_of
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.static_scene import StaticScene
-from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.runs.stored_tensors import COARSENESS
 
 INFO = CheckpointInfo(7, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic")
 STEPS = {
@@ -117,13 +116,6 @@ def test_values_come_back_within_their_steps() -> None:
         assert error <= tolerance + 1e-6
 
 
-def test_a_crowd_of_equals_can_be_read_again() -> None:
-    tensors = {name: x[:1].expand(80_000, *x.shape[1:]) for name, x in small_scene().items()}
-    tensors["gaussians.sh"] = torch.zeros(80_000, 25, 3)
-    data = stored(tensors)
-    assert len(decoded(data).tensors["gaussians.sh"]) == 80_000
-
-
 def test_every_cut_and_every_flip_is_an_error(tmp_path: Path) -> None:
     data = stored(small_scene())
     for end in range(len(data)):
@@ -203,26 +195,7 @@ def test_numbers_come_back(whole: np.ndarray) -> None:
     assert np.array_equal(back, whole)
 
 
-def test_smooth_numbers_are_stored_as_differences() -> None:
-    ramp = np.arange(3000, dtype=np.int64)[:, None] * 7 + np.array([0, 100])
-    packing, data = packed(ramp)
-    assert packing.axis == 0
-    assert len(data) < 100  # bytes, for 6,000 numbers
-
-
 @pytest.mark.parametrize("size", [0, 9, 11])
 def test_another_length_is_an_error(size: int) -> None:
     with pytest.raises(DyngsError, match="not as long as it says"):
         decompressed(compressed(b"0123456789"), size)
-
-
-@given(st.binary(max_size=64))
-def test_noise_is_an_error_and_nothing_else(data: bytes) -> None:
-    with pytest.raises(DyngsError):
-        decompressed(data, 2**40)
-
-
-@pytest.mark.parametrize("wrong", [{"axis": 2}, {"axis": -2}, {"planes": 0}, {"planes": 9}])
-def test_only_possible_packings(wrong: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="no such packing"):
-        Packing(**({"axis": -1, "by_rows": True, "signed": False, "planes": 1} | wrong))  # type: ignore[arg-type]

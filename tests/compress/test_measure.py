@@ -9,19 +9,18 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
-from dyngs.compress.storage.file import decoded
-from dyngs.compress.storage.measure import (
-    COMPARED,
+from dyngs.compress.measure import (
     FACTORS,
     StoragePlan,
     coarsest_file,
     storage_plan,
 )
-from dyngs.compress.storage.precision import assumed_precision
+from dyngs.compress.precision import assumed_precision
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.runs.stored_file import decoded
 from dyngs.training.new_trainer import restored_scene
 
 
@@ -46,19 +45,6 @@ def test_what_is_stored_changes_images_by_what_is_allowed(tmp_path: Path, moves:
     steps = [(step, coarse.precision.steps[name]) for name, step in fine.precision.steps.items()]
     assert all(a <= b for a, b in steps)
     assert any(a < b for a, b in steps)
-
-
-def test_the_images_that_are_compared_are_those_of_the_run(tmp_path: Path) -> None:
-    run_dir = write_moving_run(tmp_path)
-    scene = load_run(run_dir).scene
-    plan = plan_of(run_dir, 0.5)
-    assert plan.images is not None
-    drawn = plan.images(scene)
-    assert len(drawn) == min(COMPARED, 5)
-    assert all(x.shape == (16, 16, 3) and not x.requires_grad for x in drawn)
-    assert all(torch.equal(a, b) for a, b in zip(drawn, plan.images(scene), strict=True))
-    without = plan.images(scene.select(torch.tensor([0, 2, 4])))
-    assert any(not torch.equal(a, b) for a, b in zip(drawn, without, strict=True))
 
 
 def test_what_is_not_said_follows_the_errors_of_the_images(tmp_path: Path) -> None:

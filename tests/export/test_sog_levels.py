@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from dyngs.core.errors import DyngsError
+from dyngs.export import sog_levels
+from dyngs.export.sog_levels import write_sog_levels
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import levels_of
-from dyngs.io.formats import sog_levels
 from dyngs.io.formats.formats import SOG_INDEX, read_splats
-from dyngs.io.formats.sog_levels import write_sog_levels
 from dyngs.io.formats.splat_file import SplatFile
 
 N = 20_000

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dyngs.api.edited_run import write_edited_run
+from dyngs.compress.clean import cleaned_file, cleaned_run
 from dyngs.core.errors import DyngsError, counted, show
-from dyngs.export.edit.clean import cleaned_file, cleaned_run
 from dyngs.export.edit.crop import Region, held_by
 from dyngs.export.edit.frame import Frame, GeoFrame
 from dyngs.export.edit.gps import gps_frame
 from dyngs.export.edit.merge import merged
-from dyngs.export.edit.run_folder import write_edited_run
 from dyngs.export.redrawn import Redrawn, compare_run, compare_splats
 from dyngs.export.splat_files import (
     SUFFIX,
@@ -27,6 +27,7 @@ from dyngs.export.splat_files import (
     up_of,
     write_moving,
 )
+from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import (
@@ -41,7 +42,7 @@ from dyngs.io.formats.formats import (
     write_splats,
 )
 from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
-from dyngs.io.formats.splat_file import SplatFile, drawing_options
+from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.frame import RunFrame
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened, open_scene, opened_scene

@@ -8,13 +8,11 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config
 
-from dyngs.compress.prune.cut import Cut
-from dyngs.compress.prune.search import (
+from dyngs.compress.cut import Cut
+from dyngs.compress.search import (
     Candidate,
     Search,
     SearchLimit,
-    _fewest,
-    _halved,
     evenly_held_out,
 )
 from dyngs.config import PruneConfig
@@ -88,13 +86,6 @@ def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> No
     whole = search.accepted(-100.0)[0]
     assert [candidate.cut for candidate in whole] == [Cut()]
     assert whole[0].psnr == search._reference
-
-
-def test_sizes_of_a_field() -> None:
-    assert _halved(30, 1) == [21, 15, 11, 8, 6, 4, 3, 2, 1]
-    assert _halved(8, 8) == []
-    losses = {21: 0.01, 15: 0.02, 11: 0.4, 8: 0.05}
-    assert [_fewest(losses, most, 30) for most in (0.0, 0.1, 1.0)] == [30, 15, 8]
 
 
 def test_what_views_trained_on_lose_counts_too(

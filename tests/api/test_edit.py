@@ -9,18 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from moving_scene import MOVING_ROWS, moved_x, row_of_balls, write_moving_run
+from moving_scene import MOVING_ROWS, moved_x, write_moving_run
 from scaled_files import FAR, write_far_ply
 from splat_scenes import cloud, readable
 
+from dyngs.api.edit import Edits, edit_scene
 from dyngs.core.errors import DyngsError
 from dyngs.export.edit.crop import Box, Sphere
-from dyngs.export.edit.frame import Distance, Frame, geo_frame
-from dyngs.export.edit.scene_file import Edits, edit_scene
+from dyngs.export.edit.frame import Frame, geo_frame
 from dyngs.export.splat_files import read_moment
 from dyngs.io.formats.formats import Format, read_splats, write_splats
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.runs.opened import open_scene
 
 HALF = Edits(frame=Frame(up=(0.0, 0.0, 1.0), origin=(0.5, 0.0, 0.0), scale=0.5))
 
@@ -58,28 +57,6 @@ def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: P
     assert not (tmp_path / "back.ply.edit.json").exists()
 
 
-def test_edits_add_up(plain: Path, tmp_path: Path) -> None:
-    """Distances are those that are asked for, also after another edit; what programs wrote in
-    comments stays."""
-    means = read_splats(plain).gaussians.means.double().numpy()
-    a, b = (tuple(x.tolist()) for x in means[:2])
-    edit_scene(
-        plain, tmp_path / "a.ply", Edits(frame=Frame(scale=Distance(a, b, 1.25))), tell=silent
-    )
-    first = read_splats(tmp_path / "a.ply")
-    assert float((first.gaussians.means[0] - first.gaussians.means[1]).norm()) == pytest.approx(
-        1.25, abs=1e-5
-    )
-    edit_scene(tmp_path / "a.ply", tmp_path / "b.ply", HALF, tell=silent)
-    second = read_splats(tmp_path / "b.ply")
-    np.testing.assert_allclose(
-        second.edited.points(means), second.gaussians.means.numpy(), atol=1e-5
-    )
-    assert "mine" in second.comments
-    opened = open_scene(tmp_path / "b.ply")
-    assert (opened.turned, tuple(opened.world_offset)) == ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-
-
 def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     world = 2 * points[:, [1, 2, 0]] + [691000.0, 5334000.0, 500.0]
@@ -110,16 +87,6 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
     torch.testing.assert_close(part.gaussians.means, found.gaussians.means, rtol=0, atol=0)
     edit_scene(tmp_path / "a.ply", tmp_path / "b.ply", Edits(undo=True), tell=silent)
     assert comment not in read_splats(tmp_path / "b.ply").comments
-
-
-def test_a_run_with_an_offset_is_meant_in_the_coordinates_of_its_capture(tmp_path: Path) -> None:
-    """It lies 1000 away; its cameras say what is up."""
-    run = write_moving_run(tmp_path, moves=False, offset=(1000.0, 0.0, 0.0))
-    region = Box(np.array([999.7, -1, -1]), np.array([1001.5, 1, 1]))
-    edits = Edits(region=region, frame=Frame(up="auto", origin=(1000.0, 0.0, 0.0), scale=2.0))
-    edit_scene(run, tmp_path / "a.ply", edits, tell=silent)
-    found = read_splats(tmp_path / "a.ply").gaussians.means.norm(dim=1)
-    torch.testing.assert_close(found, 2 * row_of_balls().means[2:].norm(dim=1), rtol=0, atol=1e-5)
 
 
 def test_a_file_far_from_the_origin_is_edited_in_its_own_coordinates(tmp_path: Path) -> None:

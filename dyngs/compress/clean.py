@@ -11,20 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.api.prune import unseen_images
-from dyngs.api.train import num_cores
-from dyngs.compress.prune.floaters import FEWEST_VIEWS, floaters
-from dyngs.compress.prune.search import evenly_held_out
-from dyngs.compress.prune.stage import importance, quality_of, scoring_views
+from dyngs.compress.floaters import FEWEST_VIEWS, floaters
+from dyngs.compress.search import evenly_held_out, unseen_images
+from dyngs.compress.stage import importance, quality_of, scoring_views
+from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.loader import Image
-from dyngs.export.edit.run_folder import at_end
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.ops.device import deterministic, device_for
-from dyngs.ops.native import kernel_threads
-from dyngs.training.new_trainer import GaussianTrainer
+from dyngs.ops.native import kernel_threads, num_cores
+from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
+from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 NEEDLE = 20.0  # longest axis over the second longest
 # opacity below which large Gaussians veil what is behind; size over the median size
@@ -132,6 +132,22 @@ def cleaned_run(
         lost = f"{max(judge.loss_of(kept), 0):.3f} of {max_loss:g} dB lost, with training views"
         tell(f"{gone}; {cost}; {lost}")
         return kept.cpu()
+
+
+def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
+    """Return the trainer of a run where it ended; without checkpoints with nothing but its
+    scene."""
+    run = load_run(run_dir, config.data.root)
+    trainer: GaussianTrainer = assemble(
+        config, read_capture_of(config.data, run.info), restored=True
+    )
+    if has_only_scene_file(run_dir):
+        scene = run.scene.to(trainer.device)
+        trainer.model.begin_with(scene, trainer.model.training)
+        trainer.model.exchange(scene)
+    else:
+        trainer.restore(latest_checkpoint(run_dir))
+    return trainer
 
 
 def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]:

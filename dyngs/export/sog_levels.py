@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.gaussians.levels import MERGED, Levels, levels_of
 from dyngs.io.formats.formats import SOG_INDEX
 from dyngs.io.formats.sog import sog_parts

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.compress.prune.stage import removal
+from dyngs.compress.stage import removal
 from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import innermost, with_innermost

@@ -25,7 +25,12 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from dyngs.compress.storage.tensors import (
+from dyngs.core.errors import DyngsError, printable, require_regular
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.write import atomic_file
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.renderable import Renderable
+from dyngs.runs.stored_tensors import (
     COARSENESS,
     Coding,
     TensorKind,
@@ -39,11 +44,6 @@ from dyngs.compress.storage.tensors import (
     stored_edit,
     to_whole,
 )
-from dyngs.core.errors import DyngsError, printable, require_regular
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.write import atomic_file
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
-from dyngs.models.renderable import Renderable
 
 _SAMPLE = 2**15  # number of values by which the layout of an array is chosen
 _FEW = 512  # number of values below which the layout is not changed
@@ -259,7 +259,7 @@ def encoded(
     """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is
     not finite.
 
-    ``steps`` are of groups of tensors, see ``dyngs.compress.storage.precision``; others are stored in half
+    ``steps`` are of groups of tensors, see ``dyngs.compress.precision``; others are stored in half
     precision. ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are
     stored alike.
     """

@@ -12,9 +12,9 @@ from scaled_files import FACTORS, scaled
 from splat_scenes import cloud
 
 from dyngs.api.train import train
+from dyngs.compress.clean import by_shape, cleaned_file, cleaned_run, lone
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.clean import Suspects, by_shape, cleaned_file, cleaned_run, lone
 from dyngs.gaussians import Gaussians
 from dyngs.runs.checkpoint import load_run
 
@@ -73,13 +73,6 @@ def test_the_same_goes_in_any_unit(factor: float) -> None:
     assert torch.equal(cleaned_file(scaled(spoiled(), factor), lambda _: None), wanted)
 
 
-def test_what_contributes_least_goes_first() -> None:
-    found = Suspects.of(
-        "faint", torch.tensor([True, False, True, True]), torch.tensor([3.0, 0.0, 1.0, 3.0])
-    )
-    assert found.rows.tolist() == [2, 0, 3]
-
-
 @pytest.mark.parametrize("allowed", [0.0, 0.2, 50.0])
 def test_no_more_is_lost_than_allowed(allowed: float, run_dir: Path) -> None:
     told: list[str] = []
@@ -94,10 +87,3 @@ def test_no_more_is_lost_than_allowed(allowed: float, run_dir: Path) -> None:
     gone = [re.findall(r"([\d,]+) of ([\d,]+) Gaussian", line)[0] for line in told[:-1]]
     assert (allowed < 50) or all(went == there for went, there in gone)
     assert sum(int(went) for went, _ in gone) == int((~kept).sum()) > 0
-
-
-def test_what_cannot_be_cleaned(run_dir: Path, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="not a run folder"):
-        cleaned_run(tmp_path, 0.1, 1, None, print)
-    with pytest.raises(DyngsError, match="elsewhere"):
-        cleaned_run(run_dir, 0.1, 1, tmp_path / "elsewhere", print)
