@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from pydantic import TypeAdapter
 
 from dyngs.core.errors import DyngsError
 from dyngs.human.motion.bvh import read_bvh
@@ -17,8 +16,8 @@ from dyngs.io.formats.edit_note import read_note
 from dyngs.io.limits import VARIABLE, allowed, read_limited, require_at_most
 from dyngs.runs.checkpoint import seconds_at
 from dyngs.runs.frame import read_frame
-from dyngs.study.compare.curve import read_curve
-from dyngs.study.stored import read_stored, require_same_study
+from dyngs.study.measure import read_measurement
+from dyngs.study.runs import require_same_study
 
 
 def test_what_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,10 +64,9 @@ READERS: dict[str, Callable[[Path], object]] = {
     "timing.json": lambda file: seconds_at(file.parent, 4),
     "transforms.json": read_json_object,
     "model.spz.edit.json": lambda file: read_note(file.parent / "model.spz"),
-    "result.json": lambda file: read_stored(file, TypeAdapter(dict[str, float]), "result"),
-    "study.json": lambda file: require_same_study(file, {}, ()),
+    "result.json": read_measurement,
+    "study.json": lambda file: require_same_study(file.parent, {}, ()),
     "walk.bvh": read_bvh,
-    "log.jsonl": lambda file: read_curve(file.parent, "test"),
 }
 
 

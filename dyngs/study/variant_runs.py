@@ -17,7 +17,7 @@ from dyngs.config.schema import section_class
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
-from dyngs.export.scene_file import num_bytes_exact, write_scene_file
+from dyngs.export.scene_file import write_scene_file
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -31,9 +31,9 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.config_file import write_config
+from dyngs.study.measure import Subject
 from dyngs.study.runs import finished
-from dyngs.study.tradeoff.measure import with_render_settings
-from dyngs.study.tradeoff.variants import Settings, Value, Variant
+from dyngs.study.variants import Settings, Value, Variant
 from dyngs.training.new_trainer import assemble, restored_model
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width"}
@@ -71,6 +71,9 @@ class VariantRuns:
         if not (folder / RESOLVED_NAME).is_file():
             self._make(wanted, folder)
         return folder
+
+    def folder_of(self, subject: Subject) -> Path:
+        return self.folder(subject.variant)
 
     def _make(self, wanted: Variant, folder: Path) -> None:
         if wanted.storage is not None:
@@ -167,14 +170,6 @@ def run_settings(run_dir: Path) -> Settings:
     return own | ({"field_size": 1.0} if model.deform.kind in FIELD_SIZE else {})
 
 
-def megabytes_on_disk(folder: Path) -> float:
-    """Return the size of the .dyngs file, or of what rendering needs of a checkpoint as float32, in
-    1e6 bytes."""
-    if has_only_scene_file(folder):
-        return 1e-6 * (folder / SCENE_FILE).stat().st_size
-    return 1e-6 * num_bytes_exact(load_run(folder).renderable)
-
-
 def write_chosen(models: VariantRuns, variant: Variant) -> Path:
     """Write a run folder that every command renders with the settings of the variant; return it.
 
@@ -183,7 +178,10 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
     made = models.folder(variant)
     out = models.out / "chosen" / variant.slug
     config = load_resolved(made)
-    model = with_render_settings(variant, config.model)
+    changes = {
+        "rasterize_mode" if name == "mode" else name: value for name, value in variant.drawn.items()
+    }
+    model = config.model.model_copy(update=changes)
     data = config.data
     if variant.scale < 1:
         longest = (
