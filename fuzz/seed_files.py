@@ -21,7 +21,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import tensors_of
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
-from dyngs.export.camera_paths.path import CameraPath, write_path
+from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass
@@ -412,6 +412,8 @@ def write_keyframes(root: Path) -> None:
 
 def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
+    from dataclasses import asdict
+
     from dyngs.study.measure import Measurement, Quartiles, Speed
     from dyngs.study.runs import write_stored
 

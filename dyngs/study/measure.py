@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from pydantic import Field, TypeAdapter
 
+from dyngs.api.scene_file import num_bytes_exact
 from dyngs.api.train import num_cores
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import load_lpips, psnr, ssim
@@ -21,7 +22,6 @@ from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.regions import Regions
 from dyngs.evaluate.report import images_of_split
 from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
-from dyngs.export.scene_file import num_bytes_exact
 from dyngs.io.write import write_image
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.renderable import Renderable
