@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.core.errors import DyngsError
-from dyngs.study.tradeoff.variants import (
+from dyngs.study.variants import (
     SETTINGS,
     Variant,
     Varied,

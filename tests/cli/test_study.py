@@ -1,4 +1,4 @@
-"""``dyngs compare`` as a user calls it."""
+"""``dyngs compare`` and ``dyngs tradeoff`` as a user calls them."""
 
 from __future__ import annotations
 
@@ -7,22 +7,27 @@ import csv
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from moving_scene import write_moving_run
 from PIL import Image
 from refused import error_line
 from tiny_stereo import stereo_config, stereo_people
 from toy_kind import registered
 
+from dyngs.api.budget import time as budget_time
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.study.compare import result
-from dyngs.study.compare.result import TRUTH
+from dyngs.evaluate.report import evaluate_run
+from dyngs.io.lock import LOCK_NAME, writing
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.study import models
+from dyngs.study.measure import TRUTH
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 OPTIONS = ("--steps", "20", "--threads", "1", "init.num_random=100", "--views", "2")
@@ -49,16 +54,14 @@ def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_table_curves_and_a_page(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = list(csv.DictReader((finished / "comparison.csv").read_text().splitlines()))
-    assert {row["model"] for row in rows} == {"static", "mip"}
+    assert {row["name"] for row in rows} == {"static", "mip"}
     assert all(
         float(row["psnr"]) > 5 and float(row["fps"]) > 0 and row["steps"] == "20" for row in rows
     )
-    stored = json.loads((finished / "results" / "static.json").read_text())
-    assert (
-        stored["psnr"]
-        == json.loads((finished / "runs" / "static" / "metrics.json").read_text())["psnr"]
-    )
-    assert [point["step"] for point in stored["curve"]] == [10, 20]
+    stored = json.loads((finished / "points" / "static.json").read_text())
+    report = evaluate_run(finished / "runs" / "static", threads=1)
+    assert (stored["psnr"], stored["ssim"]) == (report.psnr, report.ssim)
+    assert stored["psnr_foreground"] == report.psnr_foreground
     assert "Left out: dynamic: the images have no times" in (finished / "comparison.md").read_text()
     assert (finished / "comparison.png").read_bytes().startswith(b"\x89PNG")
 
@@ -98,7 +101,7 @@ def test_the_same_command_trains_nothing(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.delattr(result, "finished")
+    monkeypatch.delattr(models, "finished")
     words = [
         "compare",
         str(capture),
@@ -108,9 +111,11 @@ def test_the_same_command_trains_nothing(
         "--out",
         str(finished),
     ]
-    assert main(words) == 0
-    said = capsys.readouterr().out
-    assert "holds just this comparison, finished: nothing was trained" in said
+    capsys.readouterr()
+    assert main([*words, "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert {row["name"] for row in values["rows"]} == {"static", "mip"}
+    assert "dynamic" in values["left_out"]
     before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     said = error_line(capsys, *words, "init.half_extent=2", "--split", "train")
     assert "split is test there and train here" in said
@@ -127,19 +132,19 @@ def test_what_was_stopped_goes_on(
     """As if killed while the second model was trained, and before the report."""
     out = tmp_path / "comparison"
     shutil.copytree(finished, out)
-    (out / "results" / "mip.json").unlink()
+    (out / "points" / "mip.json").unlink()
     (out / "comparison.html").unlink()
     shutil.rmtree(out / "runs" / "mip")
     kept = checkpoint_paths(out / "runs" / "static")[-1].stat().st_mtime_ns
-    note = json.loads((out / "comparison.json").read_text())
-    (out / "comparison.json").write_text(json.dumps(note | {"settings": {}}))
+    note = json.loads((out / "study.json").read_text())
+    (out / "study.json").write_text(json.dumps(note | {"settings": {}}))
     words = ["compare", str(capture), "--models", "static,mip,dynamic", *OPTIONS, "--out", str(out)]
     assert "settings" in error_line(capsys, *words), "a preset was changed meanwhile"
-    (out / "comparison.json").unlink()
+    (out / "study.json").unlink()
     assert main(words) == 0
     assert "mip (2 of 2)" in capsys.readouterr().out
     assert checkpoint_paths(out / "runs" / "static")[-1].stat().st_mtime_ns == kept
-    again, first = (json.loads((f / "results" / "mip.json").read_text()) for f in (out, finished))
+    again, first = (json.loads((f / "points" / "mip.json").read_text()) for f in (out, finished))
     assert (again["psnr"], again["steps"]) == (first["psnr"], first["steps"])
     assert (out / "comparison.html").is_file()
 
@@ -216,9 +221,8 @@ def test_what_is_not_made_of_gaussians_takes_part(
             capsys, *words, "--max-mb", "1"
         )
         assert main([*words, "--steps", "20", "--threads", "1"]) == 0
-    stored = json.loads((out / "results" / "grid.json").read_text())
-    assert (stored["kind"], stored["gaussians"], stored["steps"]) == ("toy", 0, 20)
-    assert len(stored["curve"]) == 2
+    stored = json.loads((out / "points" / "grid.json").read_text())
+    assert stored["steps"] == 20
 
 
 def test_a_model_whose_images_were_shrunk_is_left_out(
@@ -227,7 +231,7 @@ def test_a_model_whose_images_were_shrunk_is_left_out(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("dyngs.api.budget.time.SMALLEST_SIDE", 8)
+    monkeypatch.setattr(budget_time, "FIT", replace(budget_time.FIT, smallest_side=8))
     words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
     assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
     said = "static: too few steps fit into 0.001 minutes of training, so its images were shrunk to 8 px"
@@ -262,7 +266,7 @@ def test_to_the_same_size(capture: Path, tmp_path: Path) -> None:
         str(tmp_path / "out"),
     ]
     assert main(["compare", str(capture), *words]) == 0
-    stored = json.loads((tmp_path / "out" / "results" / "static.json").read_text())
+    stored = json.loads((tmp_path / "out" / "points" / "static.json").read_text())
     file = tmp_path / "out" / "runs" / "static" / "export" / "scene.dyngs"
     assert stored["mb"] == pytest.approx(1e-6 * file.stat().st_size)
     assert 0 < stored["mb"] <= 0.05
@@ -283,3 +287,77 @@ def test_networks_are_compared_on_people(
     assert "--spread goes with --predict" in error_line(
         capsys, *[*given[:4], "--spread", "--steps", "3"]
     )
+
+
+def test_variants_and_a_chosen_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.study.measure.peak_megabytes", lambda *_: None)
+    run = str(write_moving_run(tmp_path))
+    out = tmp_path / "out"
+    words = [
+        "tradeoff",
+        run,
+        "--out",
+        str(out),
+        "--vary",
+        "scale=0.5",
+        "--vary",
+        "storage=2",
+        "--rounds",
+        "1",
+    ]
+    assert (
+        main([*words, "--threads", "1", "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
+    )
+    text = capsys.readouterr().out
+    for word in (
+        "as it is",
+        "scale=0.5",
+        "storage=2",
+        "each setting alone",
+        "tradeoff.csv",
+        "chosen:",
+    ):
+        assert word in text
+    assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 100
+    assert {f.name for f in out.iterdir()} >= {
+        f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html", "png")
+    }
+    (chosen,) = (out / "chosen").iterdir()
+    assert len(load_run(chosen).scene) == 5
+    error = error_line(capsys, *words, "--require", "mb<=0.000001", begun=True)
+    assert "no measured variant has mb<=1e-06; mb<=1e-06 is too strict" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("nowhere", "nowhere: no such preset"),
+        ("nowhere", "nor is it the folder of a run"),
+        ("static data.root=x", "give --out DIR"),
+        (". --vary prun", "no such setting"),
+        (". --require psnr>30", "is no condition"),
+        (". --minimize size", "no such metric"),
+        (". --rounds 0", "argument --rounds: '0' is not a number; write a whole number from 1"),
+        (". ", "not a run folder"),
+        (". --minimize mb --maximize psnr", "not allowed with"),
+    ],
+)
+def test_wrong_usage_of_tradeoff_ends_in_one_line(
+    words: str, part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = [] if "static" in words else ["--out", "x"]
+    assert part in error_line(capsys, "tradeoff", *words.split(), *out)
+    assert list(Path().iterdir()) == []
+
+
+def test_two_sweeps_do_not_mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_moving_run(tmp_path)
+    out = tmp_path / "out"
+    with writing(out):
+        assert main(["tradeoff", str(run), "--out", str(out), "--vary", "scale=0.5"]) == 2
+        assert [path.name for path in out.iterdir()] == [LOCK_NAME]
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "has been writing there since" in told

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.api.prune import prune_run
-from dyngs.api.scene_file import num_bytes_exact, write_scene_file
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import num_cores
 from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.compress.stage import pruning
@@ -31,9 +31,9 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.config_file import write_config
 from dyngs.runs.stored_file import write_scene
+from dyngs.study.measure import Subject
 from dyngs.study.runs import finished
-from dyngs.study.tradeoff.measure import with_render_settings
-from dyngs.study.tradeoff.variants import Settings, Value, Variant
+from dyngs.study.variants import Settings, Value, Variant
 from dyngs.training.new_trainer import assemble, restored_model
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width"}
@@ -71,6 +71,9 @@ class VariantRuns:
         if not (folder / RESOLVED_NAME).is_file():
             self._make(wanted, folder)
         return folder
+
+    def folder_of(self, subject: Subject) -> Path:
+        return self.folder(subject.variant)
 
     def _make(self, wanted: Variant, folder: Path) -> None:
         if wanted.storage is not None:
@@ -167,14 +170,6 @@ def run_settings(run_dir: Path) -> Settings:
     return own | ({"field_size": 1.0} if model.deform.kind in FIELD_SIZE else {})
 
 
-def megabytes_on_disk(folder: Path) -> float:
-    """Return the size of the .dyngs file, or of what rendering needs of a checkpoint as float32, in
-    1e6 bytes."""
-    if has_only_scene_file(folder):
-        return 1e-6 * (folder / SCENE_FILE).stat().st_size
-    return 1e-6 * num_bytes_exact(load_run(folder).renderable)
-
-
 def write_chosen(models: VariantRuns, variant: Variant) -> Path:
     """Write a run folder that every command renders with the settings of the variant; return it.
 
@@ -183,7 +178,10 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
     made = models.folder(variant)
     out = models.out / "chosen" / variant.slug
     config = load_resolved(made)
-    model = with_render_settings(variant, config.model)
+    changes = {
+        "rasterize_mode" if name == "mode" else name: value for name, value in variant.drawn.items()
+    }
+    model = config.model.model_copy(update=changes)
     data = config.data
     if variant.scale < 1:
         longest = (

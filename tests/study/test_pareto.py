@@ -6,17 +6,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.study.speed import Quartiles, Speed
-from dyngs.study.tradeoff.measure import Measurement, on_front, pareto_mask
-from dyngs.study.tradeoff.pareto import combinations, exchange_rates, rate, slope
-from dyngs.study.tradeoff.variants import Variant
+from dyngs.study.measure import Measurement, Quartiles, Speed
+from dyngs.study.sweep import combinations, exchange_rates, pareto_mask, slope, table_rows
+from dyngs.study.variants import Variant
 
 GOALS = st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=12)
 
 
 def measurement(variant: Variant, psnr: float, gain: float = 1.0, mb: float = 8.0) -> Measurement:
     speed = Speed(Quartiles(10 / gain, 9 / gain, 11 / gain), Quartiles(gain, gain, gain))
-    return Measurement(variant, 4, psnr, 0.9, None, 100, mb, None, speed)
+    return Measurement(
+        name=variant.name, changes=variant.changes, num_views=4, psnr=psnr, ssim=0.9, lpips=None,
+        psnr_foreground=None, psnr_moving=None, gaussians=100, mb=mb, memory_mb=None, steps=1,
+        seconds=1.0, speed=speed,
+    )  # fmt: skip
 
 
 BASE = measurement(Variant(), 30.0)
@@ -48,12 +51,7 @@ def test_speed_size_and_quality_count() -> None:
         measurement(Variant(prune=0.5), 29.0, 2.0, 4.0),
         measurement(Variant(scale=0.5), 28.0, 2.0, 8.0),
     ]
-    assert on_front(points) == [True, True, False]
-
-
-@given(st.floats(-3, 3), st.floats(1.1, 16))
-def test_slope_of_one_point_is_its_rate(loss: float, factor: float) -> None:
-    assert slope([(loss, factor)]) == pytest.approx(rate(loss, factor))
+    assert [row["on_front"] for row in table_rows(points)] == [True, True, False]
 
 
 @given(st.floats(-3, 3), st.lists(st.integers(1, 4), min_size=1, max_size=5))
@@ -64,10 +62,9 @@ def test_slope_of_points_on_a_line_is_that_line(per_doubling: float, doublings: 
 
 
 def test_no_gain_has_no_price() -> None:
-    assert rate(1.0, 1.01) is None
-    assert rate(1.0, 0.5) is None
+    assert slope([(1.0, 1.01)]) is None
     assert slope([(1.0, 0.9), (2.0, 1.0)]) is None
-    assert rate(1.0, 4.0) == 0.5
+    assert slope([(1.0, 4.0)]) == 0.5
 
 
 def test_exchange_rates_are_those_of_single_settings() -> None:
@@ -78,7 +75,7 @@ def test_exchange_rates_are_those_of_single_settings() -> None:
         measurement(Variant(storage="auto"), 30.0, 1.0, 1.0),
         measurement(Variant(storage="auto", prune=0.5), 20.0, 2.0, 0.5),
     ]
-    prune, storage = exchange_rates(BASE, points)
+    prune, storage = exchange_rates(points)
     assert (prune.setting, prune.db_per_speed, prune.db_per_size) == (
         "prune",
         pytest.approx(1.0),

@@ -4,6 +4,7 @@ given."""
 from __future__ import annotations
 
 import csv
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.human.predict.gps.pairs import angle
-from dyngs.study.compare.people import PeopleBench, compare_people, task_of
+from dyngs.study.people import PeopleBench, compare_people, task_of
 
 
 @pytest.fixture(scope="module")
@@ -31,25 +32,26 @@ def network(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("spread", [False, True])
 def test_nobody_is_given_what_is_compared_with(folder: Path, spread: bool) -> None:
     views = read_capture(captures_in(DataConfig(root=folder, test_every=0))[0]).splits["train"]
-    task = task_of(views, (), 3, 5, spread)
-    assert len(task.sources) == len(set(task.sources)) == 3
-    assert len(task.targets) == (3 if spread else 2)
-    assert not {views[i].name for i in task.sources} & {view.name for view in task.targets}
-    apart = [
-        angle(views[a], views[b]) for a, b in zip(task.sources, task.sources[1:], strict=False)
-    ]
+    sources, targets = task_of(views, (), 3, 5, spread)
+    assert len(sources) == len(set(sources)) == 3
+    assert len(targets) == (3 if spread else 2)
+    assert not {views[i].name for i in sources} & {view.name for view in targets}
+    apart = [angle(views[a], views[b]) for a, b in pairwise(sources)]
     # directions tilt towards the person, which makes angles less than those around the ring
     assert all((90 if spread else 25) < x < (121 if spread else 31) for x in apart)
-    nearest = [min(angle(views[i], view) for i in task.sources) for view in task.targets]
+    nearest = [min(angle(views[i], view) for i in sources) for view in targets]
     assert all((45 if spread else 12) < x < (61 if spread else 16) for x in nearest)
 
 
-def test_a_table_scores_and_pictures(network: Path, folder: Path, tmp_path: Path) -> None:
+def test_a_table_scores_and_pictures(
+    network: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The same views give the same scores; what does not suit is told and left out."""
-    said: list[str] = []
     bench = PeopleBench(folder, [network], (2, 3), data=("longest_side=32",))
-    head, ((name, two, three, *_),) = compare_people(bench, tmp_path / "out", said.append)
-    assert (head[:3], name, said) == (["method", "2 views", "3 views"], "net", [])
+    table = compare_people(bench, tmp_path / "out")
+    ((name, two, three, *_),) = table.cells
+    assert (table.head[:3], name) == (["method", "2 views", "3 views"], "net")
+    assert "left out" not in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "out" / "comparison.csv").read_text().splitlines()))
     assert [row["count"] for row in rows] == ["2", "3", "3"] * PEOPLE.people
     assert two.startswith(
@@ -59,10 +61,9 @@ def test_a_table_scores_and_pictures(network: Path, folder: Path, tmp_path: Path
     assert len([*(tmp_path / "out" / "pictures").iterdir()]) == len(rows)
     assert f"| net | {two} | {three} |" in (tmp_path / "out" / "comparison.md").read_text()
     with pytest.raises(DyngsError, match="nothing could be predicted"):
-        compare_people(
-            PeopleBench(folder, [network], (2,), spread=True), tmp_path / "other", said.append
-        )
-    assert all("net left out: " in line and "degrees apart" in line for line in said)
+        compare_people(PeopleBench(folder, [network], (2,), spread=True), tmp_path / "other")
+    said = [line for line in capsys.readouterr().out.splitlines() if "net left out: " in line]
+    assert all("degrees apart" in line for line in said)
     assert len(said) == PEOPLE.people
     assert not (tmp_path / "other").exists()
 
