@@ -26,8 +26,7 @@ from dyngs.compress.storage.file import (
 from dyngs.compress.storage.tensors import Coding, TensorKind
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.core.state import prefixed, tensors_of
-from dyngs.deform.fields import field_state
-from dyngs.deform.windows import WindowedField
+from dyngs.deform.fields import WindowedField, field_state
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.deform.bodies.field import BodyField, BodyRest, bodies_of
+from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.windows import WindowedField
 from dyngs.export.body_nodes import write_bodies
 from dyngs.export.splat_files import Writing, splats_at
 from dyngs.io.formats.formats import read_splats
