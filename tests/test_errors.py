@@ -98,7 +98,7 @@ def test_no_message_can_steer_a_terminal() -> None:
 @pytest.mark.parametrize("text", ["x" * 5000, "9" * 5000, "\x07" * 300, "prune=" + "1" * 5000])
 def test_what_the_command_line_quotes_is_short(text: str) -> None:
     from dyngs.data.times import parse_frames
-    from dyngs.export.camera_paths.path import parse_times
+    from dyngs.export.camera_paths import parse_times
     from dyngs.study.tradeoff.table import parse_requirements
     from dyngs.study.tradeoff.variants import parse_variations
 

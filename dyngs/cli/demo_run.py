@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +15,12 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.splat_files import write_run_splats
 from dyngs.io.lock import LOCK_NAME, InUseError, writing
 from dyngs.runs.opened import open_run
+from dyngs.training.events import Listener
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -58,7 +59,9 @@ class DemoResult:
     seconds: float
 
 
-def run_demo(out: Path, options: DemoOptions = DemoOptions()) -> DemoResult:
+def run_demo(
+    out: Path, options: DemoOptions = DemoOptions(), listeners: Sequence[Listener] = ()
+) -> DemoResult:
     """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty. Raises
     DyngsError."""
     start = time.perf_counter()
@@ -69,9 +72,9 @@ def run_demo(out: Path, options: DemoOptions = DemoOptions()) -> DemoResult:
         show(f"[1/4] ray tracing the images of the demo scene into {capture}")
         moving = DynamicOptions(size=options.size, num_times=options.num_times, samples=3)
         write_dynamic_capture("spin", capture, moving)
-        show(f"[2/4] training {counted(options.steps, 'step')} into {run_dir}")
-        train(demo_config(capture, run_dir, options))
-        show("[3/4] evaluating on held-out views")
+        print(f"[2/4] training {counted(options.steps, 'step')} into {run_dir}", flush=True)
+        train(demo_config(capture, run_dir, options), listeners=listeners)
+        print("[3/4] evaluating on held-out views", flush=True)
         report = evaluate_run(run_dir, threads=options.threads)
         show("[4/4] rendering the test views and an orbit around the moving scene")
         opened = open_run(run_dir)

@@ -271,7 +271,7 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
     from dyngs.evaluate.temporal import clamped_times
-    from dyngs.export.camera_paths.path import parse_times
+    from dyngs.export.camera_paths import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
@@ -415,8 +415,8 @@ def _export_tracks(
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
     """Write the run as a .dyngs file and print how much its images change."""
+    from dyngs.api.scene_file import write_scene_file
     from dyngs.compress.storage.measure import SMALLEST_CHANGE
-    from dyngs.export.scene_file import write_scene_file
 
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:

@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError, counted
 from dyngs.io.wrong_place import command_for
 
 if TYPE_CHECKING:
-    from dyngs.export.chosen_path import PathOptions
+    from dyngs.export.choose_path import PathOptions
     from dyngs.runs.opened import Opened
 
 _EPILOG = """\
@@ -143,7 +143,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     with heavy_imports():
         import torch
 
-        from dyngs.export.chosen_path import choose_path
+        from dyngs.export.choose_path import choose_path
         from dyngs.export.images import OutputOptions, write_path_images, write_split_images
         from dyngs.runs.opened import open_run
 
@@ -200,8 +200,8 @@ def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 
 def _path_options(arguments: argparse.Namespace) -> PathOptions:
-    from dyngs.export.camera_paths.path import parse_times
-    from dyngs.export.chosen_path import PathOptions
+    from dyngs.export.camera_paths import parse_times
+    from dyngs.export.choose_path import PathOptions
 
     times = None if arguments.time is None else (arguments.time,)
     num_frames = arguments.frames

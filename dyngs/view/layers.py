@@ -13,8 +13,8 @@ from torch.nn import functional
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
-from dyngs.export.camera_paths.path import resize_cameras
-from dyngs.export.contact_sheet import color_map, depth_to_rgb
+from dyngs.export.camera_paths import resize_cameras
+from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep

@@ -17,7 +17,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.opened import open_run
