@@ -18,13 +18,15 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
+from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
-from dyngs.io.formats.splat_file import Nonfinite, drawing_options
+from dyngs.io.formats.splat_file import Nonfinite
 from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.renderable import Renderable
@@ -33,7 +35,6 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""

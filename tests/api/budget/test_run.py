@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from limited import limited, said
 
-from dyngs.compress.prune.stage import quality_of
+from dyngs.compress.stage import quality_of
 from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, StaticModel, TrainConfig
 from dyngs.training.events import Event, Message, TopologyChanged
 from dyngs.training.new_trainer import assemble
