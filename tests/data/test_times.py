@@ -24,7 +24,6 @@ from dyngs.data.times import (
     parse_frames,
     read_seconds,
     select_frames,
-    sequence_warnings,
     span_in_files,
     split_by_camera,
     still_if_constant,
@@ -118,13 +117,6 @@ def test_span_and_seconds() -> None:
     assert span_in_files(train(view("a", None)), train(view("a", None))) is None
 
 
-def test_without_times() -> None:
-    splits = train(view("a", None), view("b", None))
-    assert unit_times(ROOT, splits) == (splits, [])
-    assert still_if_constant(splits) == (splits, [])
-    assert sequence_warnings(splits) == []
-
-
 @pytest.mark.parametrize("time", [0.0, 0.25, 7.0])
 def test_constant_times_are_a_still_scene(time: float) -> None:
     splits, notes = unit_times(ROOT, train(view("a", time), view("b", time)))
@@ -132,38 +124,6 @@ def test_constant_times_are_a_still_scene(time: float) -> None:
     still, notes = still_if_constant(splits)
     assert times_of(still) == [None, None]
     assert notes == [f"all images have time {time:g}: treated as a static scene"]
-
-
-@pytest.mark.parametrize(("time", "kept"), [(0.25, 0.25), (1.0, 1.0), (7.0, 0.0)])
-def test_a_single_image_is_fine(time: float, kept: float) -> None:
-    splits, notes = unit_times(ROOT, train(view("a", time)))
-    splits, more = still_if_constant(splits)
-    assert (times_of(splits), notes, more) == ([kept], [], [])
-
-
-def test_images_that_differ_by_chance() -> None:
-    views = [view("a", 0.0), view("b", 0.5), view("c", 0.5), view("d", 1.0)]
-    (warning,) = sequence_warnings({"train": tuple(views[:2]), "test": tuple(views[2:])})
-    assert (
-        "2 images share camera, pose and time with another one, first b and c at time 0.5"
-        in warning
-    )
-
-
-def test_images_that_may_share_a_time() -> None:
-    """Other cameras, other poses of one camera, and the same file listed twice are no
-    repetitions."""
-    poses = [opengl_pose(angle) for angle in (0.0, 1.0)]
-    moving = [
-        view("a", 0.0, pose=poses[0]),
-        view("b", 0.0, pose=poses[1]),
-        view("c", 1.0, pose=poses[1]),
-    ]
-    assert sequence_warnings(train(*moving)) == []
-    several = [
-        view(f"{camera}/{time}", time, camera, poses[0]) for camera in (0, 1) for time in (0.0, 1.0)
-    ]
-    assert sequence_warnings({"train": tuple(several), "test": (several[0],)}) == []
 
 
 def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View, ...]]:
@@ -231,17 +191,6 @@ def test_cameras_that_keep_their_numbers(case: str) -> None:
         "beside": {"train": tuple(walk), "test": rig([9])["test"]},
     }[case]
     assert number_cameras(splits) is splits
-
-
-def test_different_numbers_of_frames() -> None:
-    assert sequence_warnings(rig([5, 5, 5])) == []
-    assert sequence_warnings(rig([1, 1, 1])) == []
-    (warning,) = sequence_warnings(rig([24, 24, 24, 22]))
-    assert warning == "cameras have different numbers of frames: cam03 has 22 frames, others 24"
-    (warning,) = sequence_warnings(rig([20, 24, 24, 22], folder="images/"))
-    assert "camera 0 has 20, camera 3 has 22 frames, others 24" in warning
-    (warning,) = sequence_warnings(rig([3] * 9 + list(range(4, 12))))
-    assert "(3 more cameras differ)" in warning
 
 
 def test_videos_are_those_of_fixed_cameras_or_of_the_one_that_moves() -> None:
@@ -322,11 +271,6 @@ def test_bad_slices(text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_step_zero() -> None:
-    with pytest.raises(DyngsError, match="step must not be 0"):
-        parse_frames("0:10:0")
-
-
 def test_times_are_counted_over_all_splits() -> None:
     """Uneven times keep their proportions; files rounded differently agree; order in the files does
     not matter."""
@@ -355,19 +299,6 @@ def test_a_hair_apart_is_one_time() -> None:
         1.0,
     ]
     assert len(select_frames(ROOT, splits(times, []), "1:2")["train"]) == 3
-
-
-def test_what_cannot_be_selected() -> None:
-    with pytest.raises(DyngsError, match=r"data\.frames=0:1 picks times, but the capture has none"):
-        select_frames(ROOT, {"train": (_at("a", None),)}, "0:1")
-    with pytest.raises(DyngsError, match="picks 1 of 2 times, none of them with training views"):
-        select_frames(ROOT, splits([0.0], [1.0]), "1:")
-
-
-def test_nothing_but_time_changes() -> None:
-    before = splits([0.0, 0.25, 0.5], [])["train"]
-    after = select_frames(ROOT, {"train": before}, ":2")["train"]
-    assert after == (before[0], replace(before[1], time=1.0))
 
 
 def filmed(camera: int, split: Split) -> dict[Split, tuple[View, ...]]:
