@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.capture.background import with_background_masks
 from dyngs.capture.fixed_camera import (
     FORMAT,
     is_plain_clip,
@@ -22,7 +21,8 @@ from dyngs.capture.fixed_camera import (
     silhouettes_of,
     zoomed,
 )
-from dyngs.capture.photos import digest_of
+from dyngs.capture.masks import with_background_masks
+from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig, HumanModel
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted, reading, show

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
-from dyngs.capture.sfm_work import working
-from dyngs.cli import main
+from dyngs.capture.sfm.colmap import working
 from dyngs.core.errors import DyngsError
 
 
@@ -46,31 +42,3 @@ def test_an_error_leaves_nothing_and_two_at_once_are_refused(tmp_path: Path) -> 
     ):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
-def test_a_disk_without_room_is_told_in_one_line(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """By the process itself: no file may take more than 20 KB, the database of features needs
-    more."""
-    import resource
-
-    pytest.importorskip("pycolmap")
-    photos = tmp_path / "photos"
-    out = tmp_path / "capture"
-    photos.mkdir()
-    for number in range(3):
-        noise = np.random.default_rng(number).integers(0, 256, (64, 64, 3), np.uint8)
-        Image.fromarray(noise).save(photos / f"{number}.png")
-    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, usual[1]))
-    try:
-        code = main(["data", "sfm", str(photos), str(out)])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
-    told = capfd.readouterr().err
-    assert code == 2, told
-    assert told.count("dyngs: error") == 1
-    assert "free some space" in told
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]

@@ -7,11 +7,10 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from dyngs.capture.multi_video.estimate import poses_of_videos
-from dyngs.capture.multi_video.films import VIDEOS_FILE
-from dyngs.capture.photos import digest_of, photos_below
-from dyngs.capture.sfm import estimate_poses
-from dyngs.capture.sfm_work import SfmOptions
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import estimate_poses
+from dyngs.capture.sfm.photos import digest_of, photos_below
+from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, as_word, counted, reading, show

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from dyngs.capture.background import (
+from dyngs.capture.fixed_camera import read_fixed_camera
+from dyngs.capture.masks import (
     background_of,
     outlined,
     person_mask,
     separation,
     with_background_masks,
 )
-from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
@@ -100,33 +100,12 @@ def test_a_moving_camera_has_no_outlines_and_nobody_no_mask() -> None:
     assert not nobody.any()
 
 
-def test_gaps_between_legs_stay_open() -> None:
-    """A hole that the outline closes is filled where a detector sees the person, not where it does
-    not."""
-    images, true = clip(16.0)
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    background = background_of(images)
-    image = images[3].copy()
-    mask = true[3].copy()
-    hole = (abs(rows - 56) < 8) & (abs(columns - 78) < 8)
-    image[hole] = np.clip(background.colours[hole].round(), 0, 255).astype(np.uint8)
-    mask &= ~hole
-    assert (person_mask(background, image)[hole]).all(), "without a detector holes are clothes"
-    assert (~person_mask(background, image, mask)[hole]).mean() > 0.5
-
-
 @pytest.mark.parametrize("speed", [0.0, 1.0])
 def test_who_stays_is_not(speed: float) -> None:
     images, _ = clip(speed)
     background = background_of(images)
     found = np.stack([person_mask(background, image) for image in images])
     assert not separation(background, images, found).is_clear
-
-
-def test_nobody_is_not_found() -> None:
-    images, _ = clip(16.0)
-    empty = np.repeat(images[:1, :, 120:], 5, axis=0)
-    assert not person_mask(background_of(empty), empty[0]).any()
 
 
 SIZE = (60, 90)

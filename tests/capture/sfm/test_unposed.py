@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from tiny_captures import write_colmap
 
-from dyngs.capture import unposed
-from dyngs.capture.sfm import SfmResult
-from dyngs.capture.sfm_work import SfmOptions
-from dyngs.capture.unposed import with_poses
+from dyngs.capture.sfm import unposed
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import SfmResult
+from dyngs.capture.sfm.unposed import with_poses
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import save_config
@@ -30,7 +30,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     def estimate(source: Path, out: Path, options: SfmOptions, report: object) -> SfmResult:
         sources.append(source)
         write_colmap(out)
-        return SfmResult(out, 3, 3, (), 8, 0.5, 3.0, "global", {}, ())
+        return SfmResult(out, 3, 3, (), 8, 0.5, ())
 
     def several(source: Path, out: Path, options: SfmOptions, report: object) -> str:
         sources.append(source)
@@ -77,23 +77,6 @@ def test_masks_beside_the_images_are_no_photos(tmp_path: Path, asked: list[Path]
     assert asked == [tmp_path / "scan" / "images"]
 
 
-def test_masks_that_come_later_give_new_poses(tmp_path: Path, asked: list[Path]) -> None:
-    data = DataConfig(root=tmp_path)
-    _photos(tmp_path / "images")
-    before = with_poses(data, say=lambda _: None)
-    _photos(tmp_path / "masks")
-    assert with_poses(data, say=lambda _: None).root != before.root
-    assert len(asked) == 2
-
-
-def test_a_video_gets_poses_and_has_times(tmp_path: Path, asked: list[Path]) -> None:
-    with VideoWriter(tmp_path / "clip.mp4", fps=10) as video:
-        for i in range(3):
-            video.add(np.full((16, 16, 3), 50 * i, np.uint8))
-    with_poses(DataConfig(root=tmp_path / "clip.mp4"), needs_times=True, say=lambda _: None)
-    assert asked == [tmp_path / "clip.mp4"]
-
-
 def test_no_output_replaces_the_video_that_a_run_is_made_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,19 +105,6 @@ def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> Non
     assert with_poses(data, needs_times=True, say=lambda _: None).root != first.root, (
         "offsets are given now"
     )
-
-
-def test_captures_and_other_folders_stay_as_they_are(tmp_path: Path, asked: list[Path]) -> None:
-    write_colmap(tmp_path / "capture")
-    (tmp_path / "empty").mkdir()
-    for data in (
-        DataConfig(root=tmp_path / "capture"),
-        DataConfig(root=tmp_path / "empty"),
-        DataConfig(root=tmp_path / "nowhere"),
-        DataConfig(root=_photos(tmp_path / "photos"), format="colmap"),
-    ):
-        assert with_poses(data, say=print) is data
-    assert asked == []
 
 
 def test_what_cannot_work_is_said_before_poses_are_estimated(

@@ -9,16 +9,13 @@ import numpy as np
 import OpenImageIO as oiio
 import pycolmap
 import pytest
-from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 from skimage.transform import resize_local_mean
 
 from dyngs.api.load import read_capture
-from dyngs.capture.sfm import SfmResult, _frames_of, estimate_poses
-from dyngs.capture.sfm_work import SfmOptions
-from dyngs.core.conventions import report_nothing
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import SfmModel, SfmResult, better, estimate_poses
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
-from dyngs.data.images.images import read_image
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
 from dyngs.export.video import VideoWriter
 from dyngs.io.write import write_image
@@ -102,16 +99,6 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     )
 
 
-def test_frames_of_hdr_video_are_tone_mapped_with_a_note(tmp_path: Path) -> None:
-    write_clip(tmp_path / "a.mp4", encoded(patches(), BT2020, HLG), (BT2020, HLG, BT2020))
-    found = _frames_of(
-        tmp_path / "a.mp4", tmp_path / "work" / "capture", SfmOptions(), report_nothing
-    )
-    image = read_image(tmp_path / "work" / "capture" / "images" / found.photos[0].name).numpy()
-    assert np.sqrt(np.mean((image - 255 * patches()) ** 2)) < 2.5
-    assert any("1 video: HLG is tone-mapped to SDR" in note for note in found.notes)
-
-
 def test_real_photos_register_and_repeat_bytewise(tmp_path: Path) -> None:
     images = Path(__file__).parents[3] / "../shared/data/colmap_small/images"
     if not images.is_dir():
@@ -181,22 +168,25 @@ def test_bad_requests_are_one_line(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["photos", "text.mp4"]
 
 
-def test_photos_that_are_links_are_followed_only_if_asked(tmp_path: Path) -> None:
-    """What they lead to would be copied into a folder that is given away."""
-    photos = tmp_path / "photos"
-    for i in range(3):
-        write_image(photos / f"{i}.png", np.zeros((8, 12, 3), np.uint8))
-    (photos / "0.png").rename(tmp_path / "private.png")
-    (photos / "0.png").symlink_to("../private.png")
-    with pytest.raises(
-        DyngsError, match=r"0\.png: leads to .*private\.png.*data\.follow_links=true"
-    ):
-        estimate_poses(photos, tmp_path / "out", FAST)
-    with pytest.raises(DyngsError, match="no poses could be found"):
-        estimate_poses(photos, tmp_path / "out", replace(FAST, follow_links=True))
-    assert (tmp_path / "private.png").is_file()
-    with pytest.raises(DyngsError, match=r"12x8 .*data\.max_megapixels is 9e-05"):
-        estimate_poses(
-            photos, tmp_path / "out", replace(FAST, follow_links=True, max_megapixels=9e-5)
-        )
-    assert not (tmp_path / "out").exists()
+def _model(focal: float, known: bool = False) -> SfmModel:
+    found = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, 480, 270)
+    camera.has_prior_focal_length = known
+    found.add_camera(camera)
+    return SfmModel(found, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("focal", "known", "real"), [(400, False, True), (6100, False, False), (6100, True, True)]
+)
+def test_a_focal_length_of_many_widths_is_no_lens_unless_exif_says_so(
+    focal: float, known: bool, real: bool
+) -> None:
+    assert _model(focal, known).has_real_lens == real
+
+
+def test_the_model_with_a_real_lens_is_taken() -> None:
+    real = _model(400)
+    unreal = _model(6100)
+    assert better(unreal, real) is real
+    assert better(real, unreal) is real

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from dyngs.capture.multi_video.films import STANDS, displaced_by
+from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, shrunk
 from dyngs.core.errors import DyngsError, show
 from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
@@ -147,12 +147,8 @@ def outlined(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
         images: (F, H, W, 3) uint8, of one camera.
         masks: (F, H, W) bool.
     """
-    if (
-        displaced_by(
-            np.where(masks, np.median(images[..., 1], axis=0).astype(np.uint8), images[..., 1])
-        )
-        > STANDS
-    ):
+    static = np.where(masks[..., None], np.median(images, axis=0).astype(np.uint8), images)
+    if _moves(static):
         return None
     heights = [np.ptp(mask.any(1).nonzero()[0]) + 1 for mask in masks if mask.any()]
     radius = max(2, round(UNSURE * float(np.mean(heights)))) if heights else 2
@@ -182,6 +178,11 @@ def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
     """Return the connected parts of a mask (H, W) that hold a pixel of ``core``."""
     labels, _ = ndimage.label(mask)  # pyright: ignore[reportGeneralTypeIssues]
     return np.isin(labels, np.unique(labels[core & mask]))
+
+
+def _moves(images: np.ndarray) -> bool:
+    """Whether the camera of images (F, H, W, 3) uint8 moves."""
+    return displaced_by(np.stack([shrunk(image) for image in images])) > STANDS
 
 
 def separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
@@ -370,7 +371,7 @@ def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Bac
         colours = area_downscale_uint8(pixels, *camera.size).numpy().astype(np.float32)
         spread = background_of(sampled).noise
         return Background(colours, np.full_like(spread, float(np.median(spread))))
-    if displaced_by(sampled[..., 1]) > STANDS:
+    if _moves(sampled):
         raise DyngsError(f"{camera.where}: the camera {_MOVES}")
     return background_of(sampled)
 

@@ -1,4 +1,4 @@
-"""First points: checked against the images, triangulated, or none."""
+"""Initial points: triangulated, of the visual hull, or none."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ import torch
 from room_surfaces import distances_to_surface
 
 import dyngs
-from dyngs.capture.first_points import (
+from dyngs.capture.initial_points import (
+    ENOUGH,
     OVERLAPPING,
     TIME_STEPS,
     clip_pairs,
-    groups_of,
-    points_fault,
+    points_in_silhouettes,
     points_over_clip,
     triangulated_points,
     views_of_a_time_step,
     with_first_points,
 )
-from dyngs.capture.inspection.report import report_on
 from dyngs.config import DataConfig, PointsInit
-from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import projected
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.data.synthetic.captures import (
+    DynamicOptions,
+    StillOptions,
+    write_dynamic_capture,
+    write_still_capture,
+)
 from dyngs.io.write import write_image
 
 
@@ -62,48 +65,9 @@ def shifted(root: Path, out: Path) -> Path:
     return out
 
 
-def write_noise(path: Path, count: int = 500) -> None:
-    rng = np.random.default_rng(0)
-    rows = np.column_stack([rng.uniform(-1.3, 1.3, (count, 3)), rng.integers(0, 256, (count, 3))])
-    header = [
-        "ply",
-        "format ascii 1.0",
-        f"element vertex {count}",
-        *[f"property float {x}" for x in "xyz"],
-    ]
-    header += [*[f"property uchar {c}" for c in ("red", "green", "blue")], "end_header"]
-    path.write_text("\n".join(header + [" ".join(f"{x:g}" for x in row) for row in rows]) + "\n")
-
-
 def test_around_the_origin_random_points_stay(root: Path) -> None:
     capture, lines = begin(read_capture(root))
     assert (capture.points, lines) == (None, [])
-
-
-def test_noise_is_not_used_and_the_scene_is_elsewhere(root: Path, tmp_path: Path) -> None:
-    """As 4DGaussians leaves it in a folder, here around the origin, where no camera looks; and
-    around the scene."""
-    write_noise(root / "points3d.ply")
-    near, lines = begin(read_capture(root))
-    assert (near.points, lines) == (
-        None,
-        ["points3d.ply: 500 points, not used: no better than random ones"],
-    )
-    (root / "points3d.ply").rename(tmp_path / "points3d.ply")
-    elsewhere = shifted(root, tmp_path / "shifted")
-    (tmp_path / "points3d.ply").rename(elsewhere / "points3d.ply")
-    options = DataConfig(root=elsewhere, follow_links=True)
-    capture = read_capture(options)
-    assert capture.warnings == ("times run from 0 to 0.055 and were scaled to [0, 1]",)
-    begun, lines = with_first_points(capture, options, PointsInit(triangulate=0))
-    assert (begun.points, begun.points_file) == (None, None)
-    assert lines[0].startswith("points3d.ply: 500 points, not used: ")
-    assert lines[1:] == [
-        "the scene does not lie around the origin, where Blender scenes do by custom: the cameras look at (7, -3, 11)",
-    ]
-    assert lines[0] in report_on(capture).problems
-    assert capture.points is not None
-    assert dict(report_on(capture).facts)["points"] == "500 (points3d.ply)"
 
 
 def test_real_points_are_used(shared: Path) -> None:
@@ -132,44 +96,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], PointClo
     return views, PointCloud(xyz[near][inside], rgb)
 
 
-def fault(views: list[View], xyz: np.ndarray, rgb: np.ndarray) -> str | None:
-    return points_fault(PointCloud(xyz, rgb), views, DataConfig(root=Path()))
-
-
-def test_real_points_fit(room: tuple[list[View], PointCloud]) -> None:
-    views, points = room
-    assert len(points.xyz) > 100
-    grey = np.full_like(points.rgb, 128)
-    for rgb in (points.rgb, grey):
-        assert fault(views, points.xyz, rgb) is None
-    still = [replace(view, time=None) for view in views]
-    assert fault(still, points.xyz, points.rgb) is None
-
-
-@pytest.mark.parametrize("timed", [True, False])
-def test_noise_does_not(room: tuple[list[View], PointCloud], timed: bool) -> None:
-    """In the box of the real points, with random colours or theirs; and far off."""
-    views = [view if timed else replace(view, time=None) for view in room[0]]
-    points = room[1]
-    low = points.xyz.min(0)
-    high = points.xyz.max(0)
-    xyz = RNG.uniform(low, high, points.xyz.shape)
-    for rgb in (points.rgb, RNG.integers(0, 256, points.rgb.shape).astype(np.uint8)):
-        assert fault(views, xyz, rgb) == "no better than random ones"
-    assert fault(views, points.xyz + 100.0, points.rgb) == "0% of them are in any camera's view"
-
-
-def test_groups_are_of_a_moment_or_of_neighbours(room: tuple[list[View], PointCloud]) -> None:
-    views = [replace(room[0][0], time=i / 19) for i in range(20)]
-    assert groups_of(views[::-1]) == [[19, 18, 17, 16, 15], [12, 11, 10, 9, 8], [4, 3, 2, 1, 0]]
-    assert groups_of(views[:2]) == [[0, 1]]
-    assert [len(group) for group in groups_of([replace(view, time=None) for view in views])] == [
-        5,
-        5,
-        5,
-    ]
-
-
 @pytest.fixture(scope="module")
 def furnished(tmp_path_factory: pytest.TempPathFactory) -> DataConfig:
     """A furnished corner, a moment from eight cameras."""
@@ -189,6 +115,9 @@ def test_points_lie_on_the_surfaces(furnished: DataConfig) -> None:
     assert len(found.xyz) > 50
     assert found.rgb.shape == found.xyz.shape
     assert found.rgb.dtype == np.uint8
+    again = triangulated_points(views, furnished)
+    assert again is not None
+    np.testing.assert_array_equal(again.xyz, found.xyz)
     distances = distances_to_surface(found.xyz, views, views[0].time or 0.0)
     # A pixel covers 0.02, and far more in depth; tiles and wallpaper repeat, so some matches join
     # different ones.
@@ -196,42 +125,6 @@ def test_points_lie_on_the_surfaces(furnished: DataConfig) -> None:
     assert np.mean(distances < 0.1) > 0.7
     shifted = found.xyz + np.array([0.3, -0.3, 0.3])
     assert np.mean(distances_to_surface(shifted, views, 0.0) < 0.1) < 0.4
-
-
-def test_the_same_images_give_the_same_points(furnished: DataConfig) -> None:
-    views = views_of_a_time_step(train_views(furnished), 24)
-    first, second = (triangulated_points(views, furnished) for _ in range(2))
-    assert first is not None
-    assert second is not None
-    np.testing.assert_array_equal(first.xyz, second.xyz)
-    np.testing.assert_array_equal(first.rgb, second.rgb)
-
-
-def test_two_places_are_too_few(furnished: DataConfig) -> None:
-    views = views_of_a_time_step(train_views(furnished), 24)
-    assert triangulated_points(views[:2] * 3, furnished) is None
-    assert triangulated_points([], furnished) is None
-
-
-def test_images_without_features_have_no_points(blender_root: Path) -> None:
-    options = DataConfig(root=blender_root)
-    assert triangulated_points(train_views(options), options) is None
-
-
-def test_a_handful_of_points_is_none(
-    furnished: DataConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A model that begins with them would have to grow all the rest."""
-    views = views_of_a_time_step(train_views(furnished), 24)
-    monkeypatch.setattr("dyngs.capture.first_points.MIN_POINTS", 100_000)
-    assert triangulated_points(views, furnished) is None
-
-
-def test_a_missing_image_is_named(furnished: DataConfig, tmp_path: Path) -> None:
-    views = views_of_a_time_step(train_views(furnished), 24)
-    views[1] = replace(views[1], image_path=tmp_path / "gone.png")
-    with pytest.raises(DyngsError, match=r"gone\.png"):
-        triangulated_points(views, furnished)
 
 
 def test_the_moment_is_the_middle_one_of_those_with_most_views(furnished: DataConfig) -> None:
@@ -242,19 +135,11 @@ def test_the_moment_is_the_middle_one_of_those_with_most_views(furnished: DataCo
     assert views_of_a_time_step(views, 0) == views_of_a_time_step([], 24) == []
 
 
-def test_without_times_the_views_are_evenly_chosen(furnished: DataConfig) -> None:
-    views = [
-        replace(view, time=None, name=str(i))
-        for i, view in enumerate((train_views(furnished) * 2)[:12])
-    ]
-    assert [view.name for view in views_of_a_time_step(views, 4)] == ["0", "3", "6", "9"]
-
-
 def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
     furnished: DataConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One camera, at another place at each time; a patch that moves about violates the poses."""
-    monkeypatch.setattr("dyngs.capture.first_points.MIN_CLIP_POINTS", 30)
+    monkeypatch.setattr("dyngs.capture.initial_points.MIN_CLIP_POINTS", 30)
     patch = np.kron(np.random.default_rng(0).random((12, 12, 3)), np.ones((4, 4, 1)))
     corners = [(8, 100), (90, 20), (40, 60), (100, 110), (20, 30), (70, 90), (55, 10), (30, 70)]
     views = []
@@ -276,11 +161,11 @@ def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
         offset = 160 * places - corner
         on_patch += inside & (offset > 4).all(axis=1) & (offset < 44).all(axis=1)
     assert (on_patch >= len(views) - 2).mean() < 0.05
-    monkeypatch.setattr("dyngs.capture.first_points.MIN_CLIP_POINTS", len(found.xyz))
+    monkeypatch.setattr("dyngs.capture.initial_points.MIN_CLIP_POINTS", len(found.xyz))
     again = points_over_clip(views, furnished)
     assert again is not None
     np.testing.assert_array_equal(again.xyz, found.xyz)
-    monkeypatch.setattr("dyngs.capture.first_points.MIN_CLIP_POINTS", len(found.xyz) + 1)
+    monkeypatch.setattr("dyngs.capture.initial_points.MIN_CLIP_POINTS", len(found.xyz) + 1)
     assert points_over_clip(views, furnished) is None
 
 
@@ -296,3 +181,58 @@ def test_pairs_of_a_clip_are_bounded(furnished: DataConfig) -> None:
     many = [replace(views[i % len(views)], time=i / 39) for i in range(40)]
     pairs = clip_pairs(many)
     assert len(set(pairs)) == len(pairs) <= 40 * (len(TIME_STEPS) + OVERLAPPING)
+
+
+RADIUS, FOCAL, SIDE, DISTANCE = 0.4, 60.0, 64, 4.0
+HALF_SIDE = 1.3  # of the cube in which points are drawn
+
+
+def _views(folder: Path, alpha: float = 0.0) -> list[View]:
+    """An orange ball around the origin from the six sides of a cube; ``alpha`` is that of the
+    background."""
+    views = []
+    rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2
+    rays = np.stack([columns / FOCAL, rows / FOCAL, np.ones_like(rows)], axis=-1)
+    nearest = DISTANCE * np.sqrt(1 - (rays[..., 2] / np.linalg.norm(rays, axis=-1)) ** 2)
+    image = np.zeros((SIDE, SIDE, 4), np.float32)
+    image[...] = (0, 0, 0, alpha)
+    image[nearest < RADIUS] = (1.0, 0.5, 0.0, 1.0)
+    intrinsics = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
+    for i in range(6):
+        axis = np.eye(3)[i // 2] * (1 if i % 2 else -1)
+        turn = np.eye(4)
+        turn[:3, :3] = np.stack(
+            [np.roll(np.abs(axis), 1), np.cross(axis, np.roll(np.abs(axis), 1)), axis]
+        )
+        turn[2, 3] = DISTANCE
+        path = folder / f"{i}.png"
+        write_image(path, image)
+        views.append(View(path.stem, path, turn, intrinsics, SIDE, SIDE))
+    return views
+
+
+def test_points_lie_in_the_ball_with_its_colour(tmp_path: Path) -> None:
+    views = _views(tmp_path)
+    found = points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
+    assert found is not None
+    # The hull of six views is larger than the ball, up to the corners of the cube around it; a
+    # pixel is 1/15.
+    assert np.abs(found.xyz).max() < RADIUS * 1.15 + 1 / 15
+    assert np.linalg.norm(found.xyz, axis=1).max() < RADIUS * 3**0.5
+    assert (found.rgb == (255, 128, 0)).all()
+    assert len(found.xyz) >= ENOUGH, "150 of 10,000 in the cube lie in the hull: more were drawn"
+    again = points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
+    assert again is not None
+    assert np.array_equal(found.xyz, again.xyz)
+
+
+def test_a_still_blender_scene_begins_in_its_silhouettes(tmp_path: Path) -> None:
+    root = write_still_capture(
+        tmp_path / "still", StillOptions(size=32, num_train=8, num_test=1, samples=1)
+    )
+    capture = read_capture(root)
+    begun, lines = with_first_points(capture, DataConfig(root=root), PointsInit())
+    assert begun.points is not None
+    assert lines == [
+        f"{len(begun.points.xyz):,} first points were drawn at random in the silhouettes of the images"
+    ]

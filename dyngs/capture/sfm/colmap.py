@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dyngs.capture.photos import Photo
+from dyngs.capture.sfm.photos import Photo
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.io.containment import MAX_MEGAPIXELS
@@ -37,8 +37,6 @@ class SfmOptions:
         matching: pairs that are compared; auto = all of up to 60 photos or 24 frames, beyond that
             neighbours by name (some far ones, too) and those that look alike; sequential = the same
             without what looks alike.
-        mapper: COLMAP's mapping; auto = global for a video, incremental for photos, the other where
-            that finds less.
         num_frames: images to take at most from a video, None = 100; of several videos time steps,
             None = ``times.MOST_STEPS``, fewer for many cameras.
         masks: folder of masks of the photos, named as in captures; white = keep. None without.
@@ -51,7 +49,6 @@ class SfmOptions:
     """
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    mapper: Literal["auto", "global", "incremental"] = "auto"
     num_frames: int | None = None
     masks: Path | None = None
     starts: Mapping[str, float] | None = None

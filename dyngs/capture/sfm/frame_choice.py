@@ -1,5 +1,5 @@
-"""Frames of a video for structure from motion: chosen by what the camera's motion shows, and by
-sharpness."""
+"""Motion of the camera in a video: frames for structure from motion are chosen by it and by
+sharpness; fixed cameras are recognised."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+
+from dyngs.data.times import evenly_spaced
 
 STILL = 0.003
 """Largest motion since the first frame, as a fraction of the image's width, below which the camera
@@ -161,3 +163,39 @@ def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float]
     if not found:
         return 0.0, 0.0
     return float(np.median(found)) / before.shape[1], max(found) / before.shape[1]
+
+
+STANDS = 0.002
+"""A camera is fixed if its image is never displaced by more than this fraction of its longer
+side."""
+SAMPLES = 16  # images that are compared with the median one
+
+
+def displaced_by(small: np.ndarray) -> float:
+    """Return how far the small images (F, h, w) of a video are displaced against their median, in
+    fractions of the longer side; see ``STANDS``.
+
+    That is the lower quartile of the optical flow of the pixels with the largest gradients, so that
+    what moves before a fixed camera does not count. A camera that jumps far leaves no sharp median, and
+    does not fit.
+    """
+    from skimage.registration import optical_flow_ilk
+
+    chosen = small[evenly_spaced(len(small), SAMPLES)].astype(np.float32)
+    typical = np.asarray(np.median(chosen, axis=0))
+    # brightness may change
+    chosen -= np.median(chosen - typical, axis=(1, 2), keepdims=True)
+    if len(small) < 2 or min(typical.shape) < 2:
+        return 0.0
+    down, across = np.gradient(typical)
+    slope = np.hypot(down, across)
+    if slope.max() < 2.0:
+        return 0.0  # nothing could show a displacement
+    shows = slope >= max(float(np.quantile(slope, 0.6)), 1.0)
+    side = max(typical.shape)
+    moved = []
+    for image in chosen:
+        flow = np.linalg.norm(optical_flow_ilk(typical, image, radius=side // 13), axis=0)
+        moved.append(float(np.quantile(flow[shows], 0.25)) / side)
+    # A single image may be spoiled, by a flash or a hand before the lens.
+    return float(np.quantile(moved, 0.95, method="lower"))

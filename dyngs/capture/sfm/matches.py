@@ -4,7 +4,6 @@ are of movers."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -71,58 +70,13 @@ def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
     return np.array(angles)
 
 
-def turning_fraction(database: Path) -> float:
-    """Return the fraction of matched pairs that a homography explains: rotating on the spot, or one
-    flat surface."""
-    import pycolmap
-
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    flat = {int(kinds.PLANAR_OR_PANORAMIC), int(kinds.PANORAMIC), int(kinds.PLANAR)}
-    with pycolmap.Database.open(database) as opened:
-        found = [
-            int(g.config)
-            for g in opened.read_two_view_geometries()[1]
-            if len(g.inlier_matches) >= _WELL
-        ]
-    return sum(kind in flat for kind in found) / len(found) if found else 0.0
-
-
 _MOST_PAIRS, _MOST_MATCHES = 120, 200  # pairs, and matches of each, that are looked at
 _FOCALS = np.geomspace(0.4, 3.0, 13)
 """Focal lengths that are tried, as fractions of the image's longest side."""
 _FINE = 9  # focal lengths that are tried between the neighbours of the best of these
 _ROUNDS = 3  # how often a turn is found anew from the matches that it explains best
 _WIDEST, _FAR = 90, 75  # percentiles: of the pairs, and of the matches of a pair
-_NONE, _NONE_PX = 0.0015, 1.0
-"""Parallax below which the camera did not move: fraction of the longest side, and pixels."""
-_SMALL, _SMALL_PX = 0.008, 2.0  # the same, below which it hardly moved
-_COVERED, _CELLS = 0.5, 8
-"""Fraction of the image that matches must cover to tell that, in cells of which the longest side
-has so many."""
-
-
-class Parallax(Enum):
-    """Whether the camera moved."""
-
-    NONE = "it rotated on the spot"
-    SMALL = "it hardly moved"
-    ENOUGH = "it moved"
-
-
-@dataclass(frozen=True)
-class SeenParallax:
-    """Parallax as a fraction of the longest side, what it says, and ``MatchedPair.covered`` (median
-    over pairs)."""
-
-    fraction: float
-    kind: Parallax
-    covered: float = 1.0
-
-    @property
-    def may_follow_a_mover(self) -> bool:
-        """Whether so little of the images matches that it may be a thing that moves: clips at hand
-        have 62 to 94 %."""
-        return self.covered < _COVERED
+_CELLS = 8  # cells, of which the longest side has so many, in which matches are counted
 
 
 @dataclass(frozen=True)
@@ -139,36 +93,29 @@ class MatchedPair:
     covered: float = 1.0
 
 
-def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
-    """Return the parallax of the pairs that have most of it (90 % have less).
+def parallax_of(pairs: list[MatchedPair]) -> tuple[float, float]:
+    """Return the parallax of the pairs that have most of it (90 % have less), as a fraction of the
+    longest side, and ``MatchedPair.covered`` (median over pairs).
 
     The parallax of a pair is the distance that three quarters of its matches stay below after the
     turn of the camera that explains them best, with the focal length, common to all, that leaves
     least. It is that of noise where the camera only rotated, however far, and about the focal
     length times the shift over the depth where it moved. Without pairs nothing is known, and it is
-    1. Nor is it where matches cover less than half of the images: what else is in them may be
-      elsewhere in the other ones, and the matches those of a thing that moves. Noise of matches is
-    about half a pixel.
+    1. Where matches cover less than half of the images, they may be those of a thing that moves.
+    Noise of matches is about half a pixel.
     """
     if not pairs:
-        return SeenParallax(1.0, Parallax.ENOUGH)
+        return 1.0, 1.0
 
     def left_with(focals: np.ndarray) -> np.ndarray:
         return np.array([[_left(pair, focal) for pair in pairs] for focal in focals])
 
-    coarse = left_with(_FOCALS)
-    best = int(coarse.mean(1).argmin())
+    best = int(left_with(_FOCALS).mean(1).argmin())
     low = _FOCALS[max(best - 1, 0)]
     high = _FOCALS[min(best + 1, len(_FOCALS) - 1)]
     fine = left_with(np.linspace(low, high, _FINE))
     fraction = float(np.percentile(fine[fine.mean(1).argmin()], _WIDEST))
-    covered = float(np.median([pair.covered for pair in pairs]))
-    if covered < _COVERED:
-        return SeenParallax(fraction, Parallax.ENOUGH, covered)
-    if fraction < max(_NONE, _NONE_PX / longest_side):
-        return SeenParallax(fraction, Parallax.NONE, covered)
-    small = fraction < max(_SMALL, _SMALL_PX / longest_side)
-    return SeenParallax(fraction, Parallax.SMALL if small else Parallax.ENOUGH, covered)
+    return fraction, float(np.median([pair.covered for pair in pairs]))
 
 
 def matched_pairs(database: Path) -> list[MatchedPair]:
