@@ -70,7 +70,7 @@ def read_gltf(path: Path) -> SplatFile:
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
     return described(
-        SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras)), path
+        SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras))
     )
 
 

@@ -280,9 +280,7 @@ def _read(path: Path, member: _Members) -> SplatFile:
         sh=torch.from_numpy(sh),
     )
     mode = RasterizeMode.ANTIALIASED if meta.antialias else RasterizeMode.CLASSIC
-    return described(
-        SplatFile(gaussians, mode, comments=stored_comments(meta.asset.comments)), path
-    )
+    return described(SplatFile(gaussians, mode, comments=stored_comments(meta.asset.comments)))
 
 
 def _rest(path: Path, member: _Members, rest: _Rest, labels: np.ndarray) -> np.ndarray:
