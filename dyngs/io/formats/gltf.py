@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms, srgb_decoded
 from dyngs.core.gaussians import Gaussians
@@ -174,6 +173,8 @@ def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
 
 def _matrix(node: Node) -> np.ndarray:
     """Return the transform (4, 4) of a node; a rotation of zeros counts as none."""
+    from scipy.spatial.transform import Rotation
+
     if node.matrix is not None:
         return np.array(node.matrix).reshape(4, 4).T
     matrix = np.eye(4)

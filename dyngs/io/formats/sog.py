@@ -21,7 +21,6 @@ import torch
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians, morton_order
-from dyngs.io.formats.formats import SOG_META
 from dyngs.io.formats.packing import (
     codebook,
     largest_and_others,
@@ -39,6 +38,7 @@ from dyngs.io.formats.splat_file import (
 )
 from dyngs.io.limits import read_limited, require_at_most
 
+SOG_META = "meta.json"  # of a .sog, which may lie in a folder
 _PER_ROW = 64
 _MOST_META_BYTES = 1 << 20
 _MOST_PIXELS = 1 << 27
