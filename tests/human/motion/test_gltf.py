@@ -452,7 +452,7 @@ def test_buffers_elsewhere_are_not_touched(tmp_path: Path, uri: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("uri", "problem"), [("none.bin", "cannot be read"), ("data:;base64,?", "not base64")]
+    ("uri", "problem"), [("none.bin", "is not a file"), ("data:;base64,?", "not base64")]
 )
 def test_buffers_that_cannot_be_read(tmp_path: Path, uri: str, problem: str) -> None:
     glb = two_joints()
