@@ -15,12 +15,13 @@ from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.gps.keys import GpsModel
 from dyngs.gps.rectification import RectifiedPair
 from dyngs.gps.stereo import Encoder, StereoNetwork, offsets_of, sweep
 from dyngs.models.convolution import ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
 
+WIDTHS = (24, 40, 64)
+"""Channels of the features of images at 1/4, 1/8 and 1/16 of the resolution."""
 HEADS = {"rotation": 4, "scale": 3, "opacity": 1}
 """Outputs per pixel and their number of channels."""
 LARGEST = 4.0
@@ -35,8 +36,8 @@ _LEAST = 0.2  # Smallest disparity, relative to that of the middle of the person
 
 
 @dataclass(frozen=True)
-class Surface:
-    """What the network says of two views."""
+class PredictedSurface:
+    """Prediction of the network for two views."""
 
     offsets: list[Tensor]  # (2, 1, H, W), of which the last are the finest, px
     raw: Tensor | None  # (2, 8, H, W) in the order of ``HEADS``; None: only depth was asked for
@@ -49,13 +50,13 @@ class GpsNetwork(nn.Module):
     returns four as one.
     """
 
-    def __init__(self, model: GpsModel, generator: torch.Generator) -> None:
+    def __init__(self, generator: torch.Generator) -> None:
         """Weights are drawn from ``generator`` on the CPU."""
         super().__init__()
-        half, quarter, _ = model.widths
+        half, quarter, _ = WIDTHS
         with torch.device("cpu"):
-            self.encoder = Encoder(16, model.widths)
-            self.stereo = StereoNetwork(model.widths)
+            self.encoder = Encoder(16, WIDTHS)
+            self.stereo = StereoNetwork(WIDTHS)
             self.depth_encoder = Encoder(8, _DEPTH_WIDTHS)
             below = quarter + _DEPTH_WIDTHS[1] + _DEPTH_WIDTHS[2]
             self.up = nn.ModuleList(
@@ -68,7 +69,7 @@ class GpsNetwork(nn.Module):
         for layer in (self.heads, self.stereo.change, self.stereo.weights):
             nn.init.zeros_(layer.weight)
 
-    def forward(self, pair: RectifiedPair, *, with_gaussians: bool = True) -> Surface:
+    def forward(self, pair: RectifiedPair, *, with_gaussians: bool = True) -> PredictedSurface:
         """Return the offsets of ``pair``, and what makes Gaussians of its pixels."""
         inside = pair.solid.float()
         images = pixel_unshuffle(torch.cat([(2 * pair.rgb - 1) * inside, pair.alpha], dim=1), 2)
@@ -76,16 +77,16 @@ class GpsNetwork(nn.Module):
         around = offsets_of(pair.shift)
         offsets, fused = self.stereo(levels, sweep(pair.rgb, pair.alpha, around), around, inside)
         if not with_gaussians:
-            return Surface(offsets, None)
+            return PredictedSurface(offsets, None)
         depth = pixel_unshuffle(torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1), 2)
         halves, quarters, eighths = self.depth_encoder(depth)
         features = self.up[0](torch.cat([fused, quarters, upsampled(eighths)], dim=1))
         features = self.up[1](torch.cat([upsampled(features), levels[0], halves], dim=1))
         features = self.last(torch.cat([upsampled(features), images, depth[:, :4]], dim=1))
-        return Surface(offsets, pixel_shuffle(self.heads(features), 2))
+        return PredictedSurface(offsets, pixel_shuffle(self.heads(features), 2))
 
 
-def gaussians_of(pair: RectifiedPair, surface: Surface) -> Gaussians:
+def gaussians_of(pair: RectifiedPair, surface: PredictedSurface) -> Gaussians:
     """Return the Gaussians of the pixels of the person in both views, differentiable in
     ``surface``.
 

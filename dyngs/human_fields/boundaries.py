@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.human.template.mesh import Fragments, rasterize, vertex_normals
-from dyngs.human_fields.people import Body
+from dyngs.human_fields.people import PosedBody
 
 OUTWARDS, INWARDS = 0.06, 0.04  # How far the copies are from the mesh, m
 _NEAREST = 0.05  # Least depth of what is drawn, m
@@ -36,7 +36,7 @@ class Interval:
 class Boundaries:
     """The meshes of a body."""
 
-    def __init__(self, body: Body) -> None:
+    def __init__(self, body: PosedBody) -> None:
         self._body = body
 
     @cached_property

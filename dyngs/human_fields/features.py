@@ -56,7 +56,7 @@ class ImageEncoder(nn.Module):
 
 
 @dataclass(frozen=True)
-class Look:
+class PointFeatures:
     """What V images show at M points."""
 
     features: Tensor  # (V, M, C + FINE)
@@ -65,19 +65,21 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SourceFeatures:
     """Images with their features."""
 
     sources: Sources
     coarse: Tensor  # (V, C, H/4, W/4)
     fine: Tensor  # (V, FINE, H/2, W/2)
 
-    def look(self, points: Tensor) -> Look:
+    def look(self, points: Tensor) -> PointFeatures:
         """Return what the images show at points (M, 3); differentiable in the features."""
         grid = self.grid(points)
         rgba = at_pixels(self.sources.rgba, grid)
         features = torch.cat([at_pixels(self.coarse, grid), at_pixels(self.fine, grid)], -1)
-        return Look(features, rgba[..., :3] / rgba[..., 3:].clamp_min(_CLEAR), rgba[..., 3])
+        return PointFeatures(
+            features, rgba[..., :3] / rgba[..., 3:].clamp_min(_CLEAR), rgba[..., 3]
+        )
 
     def alpha(self, points: Tensor) -> Tensor:
         """Return the opacities (V, M) of points (M, 3) in the images, 0 beside them."""

@@ -6,22 +6,22 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human_fields.features import ImageEncoder, Seen
-from dyngs.human_fields.people import Body, Sources
+from dyngs.human_fields.features import ImageEncoder, SourceFeatures
+from dyngs.human_fields.people import PosedBody, Sources
 
 NEAR = 0.1  # Nearest distance that is drawn, m
 CHUNK = 1 << 12  # Rays drawn together where nothing is learned
 
 
 @dataclass(frozen=True)
-class Picture:
+class FieldPicture:
     """What a camera sees, (H, W, ...), before black."""
 
     colour: Tensor  # (H, W, 3)
@@ -31,46 +31,43 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Known:
+class EncodedPerson:
     """A person, as a network knows it."""
 
-    seen: Seen
-    body: Body
+    seen: SourceFeatures
+    body: PosedBody
     own: Any  # what else the network has found out
 
 
 class FieldNetwork(nn.Module, ABC):
     """A network that predicts a field of a person from images and a body."""
 
+    needs_depth: ClassVar[bool] = False  # whether it is trained on depth maps
+
     def __init__(self, features: int) -> None:
         super().__init__()
         self.encoder = ImageEncoder(features)
 
-    @property
-    def needs_depth(self) -> bool:
-        """Whether it is trained on depth maps."""
-        return False
-
-    def look(self, sources: Sources, body: Body) -> Known:
+    def look(self, sources: Sources, body: PosedBody) -> EncodedPerson:
         """Return what is known of a person; differentiable."""
-        seen = Seen(sources, *self.encoder(sources.rgba))
-        return Known(seen, body, self.prepared(seen, body))
+        seen = SourceFeatures(sources, *self.encoder(sources.rgba))
+        return EncodedPerson(seen, body, self.prepared(seen, body))
 
     @abstractmethod
-    def prepared(self, seen: Seen, body: Body) -> Any:
-        """Return ``Known.own``."""
+    def prepared(self, seen: SourceFeatures, body: PosedBody) -> Any:
+        """Return ``EncodedPerson.own``."""
 
     @abstractmethod
     def picture(
-        self, known: Known, camera: Cameras, generator: torch.Generator | None = None
-    ) -> Picture:
+        self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
+    ) -> FieldPicture:
         """Return what one camera sees, in a world of metres; differentiable where gradients are
         enabled.
 
         ``generator`` places samples at random, as in training; None: evenly.
         """
 
-    def penalty(self, picture: Picture, image: Image, scale: float) -> Tensor:
+    def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
         """Return what the loss has besides the error of the picture of ``image``.
 
         ``scale``: units of its depth map in a metre.

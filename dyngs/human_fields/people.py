@@ -34,7 +34,7 @@ MISFIT = 0.25  # Of the size of a silhouette, how far its box may be from that o
 
 
 @dataclass(frozen=True)
-class Body:
+class PosedBody:
     """A posed body in a world of metres."""
 
     key_points: Tensor  # (J, 3)
@@ -76,7 +76,7 @@ class Person:
     template: BodyTemplate  # in the person's shape
     motion: CapturedMotion
     images: ImageLoader
-    _bodies: dict[int | None, tuple[Body, float]] = field(default_factory=dict)
+    _bodies: dict[int | None, tuple[PosedBody, float]] = field(default_factory=dict)
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -87,13 +87,13 @@ class Person:
             self.motion.clip, self.motion.rows[-1 if view.frame is None else view.frame]
         )
 
-    def body_in(self, view: View) -> tuple[Body, float]:
+    def body_in(self, view: View) -> tuple[PosedBody, float]:
         """Return the body in the pose of ``view``, and how many world units are a metre; kept."""
         if view.frame not in self._bodies:
             self._bodies[view.frame] = self._posed(view)
         return self._bodies[view.frame]
 
-    def _posed(self, view: View) -> tuple[Body, float]:
+    def _posed(self, view: View) -> tuple[PosedBody, float]:
         pose = self.pose_in(view)
         body = self.template
         vertices = body.vertices
@@ -104,7 +104,7 @@ class Person:
         shift = pose.trans / pose.scale
         joints = apply_transforms(moves, body.joints)[:KEY_POINTS] + shift
         posed = apply_transforms(blend_transforms(body.weights, moves), vertices) + shift
-        return Body(joints, posed, body.faces), float(pose.scale)
+        return PosedBody(joints, posed, body.faces), float(pose.scale)
 
 
 def person_of(data: DataConfig, template: BodyTemplate) -> Person:
@@ -170,7 +170,7 @@ def sources_of(images: Sequence[Image], scale: float) -> Sources:
     return Sources(rgba, poses, intrinsics)
 
 
-def require_shown(name: str, image: Image, body: Body, scale: float) -> None:
+def require_shown(name: str, image: Image, body: PosedBody, scale: float) -> None:
     """Raise DyngsError, for the capture ``name``, unless an image shows a person where the body is
     (world units in m).
 

@@ -22,6 +22,7 @@ from dyngs.human.avatar.corrections import (
     learned_light,
     new_corrections,
 )
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (
     LEFT_OUT,
     TERMS,
@@ -276,6 +277,22 @@ class HumanScene(GaussianScene):
                 "shapes.faces": self.shapes.faces.int(),
             }
         return state | {name: StateTensor(x, Role.SHARED) for name, x in given.items()}
+
+
+def first_scene(
+    gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
+) -> HumanScene:
+    """Return the scene of the first Gaussians: nothing is learned yet; light only with their
+    ``normals`` (N, 3)."""
+    clip = subject.motion.clip
+    return HumanScene(
+        gaussians=gaussians,
+        anchors=subject.anchors,
+        skeleton=subject.skeleton,
+        clip=clip,
+        learned=new_corrections(clip, subject.skeleton, subject.anchors, normals),
+        shapes=subject.shapes,
+    )
 
 
 def avatar_of(scene: Renderable) -> HumanScene | None:

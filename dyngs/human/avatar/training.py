@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,7 +21,6 @@ from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.corrections import (
     OF_FRAMES,
     correction_penalties,
-    new_corrections,
     share_sides,
 )
 from dyngs.human.avatar.neighbours import (
@@ -33,7 +32,6 @@ from dyngs.human.avatar.neighbours import (
     strains,
     trust_in,
 )
-from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.pose_refit import PoseRefit
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
@@ -41,16 +39,28 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, with_role
 
-NEIGHBOURS = 5
-FRAMES_FROM = 0.25
-"""Fraction of the run after which poses of single frames are learned: what all frames share comes
-first."""
+
+@dataclass(frozen=True)
+class AvatarParams:
+    """When and how strongly an avatar is regularised; distances in cm."""
+
+    refine_from: float = 0.1  # fraction of the run after which corrections are learned
+    # fraction after which those of single frames are: what all frames share comes first
+    frames_from: float = 0.25
+    offset_weight: float = 2e-4  # of squared distances from the scaffold
+    scale_weight: float = 1e-2  # of the squared excess of log-scales over the size of the texel
+    rigidity: float = 1e-2  # of squared changes, by posing, of distances between neighbours
+    smoothness: float = 1e-3  # of squared differences between the offsets of neighbours
+    neighbours: int = 5
+    # of the squared difference between colours of both sides, where light is learned
+    sides_weight: float = 0.1
+    views: int = 100  # training views, at most, in which it is counted how much they show
+    # fraction of Gaussians that are hardly seen from which on a message says so
+    worth_telling: float = 0.01
+
+
+PARAMS = AvatarParams()
 CENTIMETRE = 0.01
-# of the squared difference between colours of both sides, where light is learned, in the loss
-SIDES_WEIGHT = 0.1
-# number of training views, at most, in which it is counted how much they show of each Gaussian
-LOOKS = 100
-WORTH_TELLING = 0.01  # least fraction of Gaussians that are hardly seen at which a line says so
 
 
 class HumanTraining(SceneTraining[HumanScene]):
@@ -74,30 +84,14 @@ class HumanTraining(SceneTraining[HumanScene]):
         refit: PoseRefit | None = None,
     ) -> None:
         self.options, self.rates, self.views, self.colour_loss = options, rates, views, outlines
-        self._finding = None if outlines is None else outlines.finding
-        self.refines_from = round(options.refine_from * rates.steps)
-        self.frames_from = round(FRAMES_FROM * rates.steps)
+        self.refines_from = round(PARAMS.refine_from * rates.steps)
+        self.frames_from = round(PARAMS.frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
+        self._has_refined = False
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
         self._refit = refit
-
-    def first_scene(
-        self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
-    ) -> HumanScene:
-        """Return the scene of the first Gaussians: nothing is learned yet; light only with their
-        ``normals`` (N, 3)."""
-        clip = subject.motion.clip
-        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
-        return HumanScene(
-            gaussians=gaussians,
-            anchors=subject.anchors,
-            skeleton=subject.skeleton,
-            clip=clip,
-            learned=learned,
-            shapes=subject.shapes,
-        )
 
     def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
         """Return the Gaussians in the pose of ``image``, and the regularizers.
@@ -113,7 +107,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         if self._refines(step):
             penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
-                penalties["sides"] = SIDES_WEIGHT * difference_of_sides(
+                penalties["sides"] = PARAMS.sides_weight * difference_of_sides(
                     scene.gaussians, *self._images_in(scene)
                 )
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
@@ -124,6 +118,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         """Update the corrections."""
         if not self._refines(step):
             return 0
+        self._has_refined = True
         progress = self.rates.progress(step, since=self.refines_from)
         share_sides(scene.learned)
         if step <= self.frames_from:
@@ -141,8 +136,8 @@ class HumanTraining(SceneTraining[HumanScene]):
         After the first step with a line about outlines, if there is one. In between poses may be
         fitted again.
         """
-        if step == 1 and self._finding is not None:
-            return scene, EditResult(None, finding=self._finding)
+        if step == 1 and self.colour_loss is not None:
+            return scene, EditResult(None, finding=self.colour_loss.finding)
         if step == self.rates.steps:
             return (
                 self._filled(scene, step)
@@ -153,7 +148,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
 
     def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
-        shown = [self.views[i] for i in evenly_spaced(len(self.views), LOOKS)]
+        shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
         last = len(scene.clip) - 1
         with torch.no_grad():
             drawn = (
@@ -173,17 +168,19 @@ class HumanTraining(SceneTraining[HumanScene]):
             )
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
-        finding = line if hardly >= WORTH_TELLING else None
+        finding = line if hardly >= PARAMS.worth_telling else None
         return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
 
-    def follow(self, edit: TopologyEdit) -> None:
+    def follow(self, edit: TopologyEdit | None = None) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
         self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+        self.follow()
         self._near = tensors.get("near")
-        self._given_weights = None
-        self._images = None
+        if "refines_from" in tensors:  # the run may have become longer since
+            self._has_refined = True
+            self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
         if self._refit is not None:
             self._refit.goes_on = "poses_stay" not in tensors
         return HumanScene.restored(gaussians, tensors)
@@ -192,6 +189,8 @@ class HumanTraining(SceneTraining[HumanScene]):
         kept = {} if self._near is None else {"near": self._near}
         if self._refit is not None and not self._refit.goes_on:
             kept["poses_stay"] = torch.ones(1, device="cpu")
+        if self._has_refined:
+            kept["refines_from"] = torch.tensor(self.refines_from, device="cpu")
         return with_role(kept, Role.TRAINING)
 
     def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
@@ -212,16 +211,13 @@ class HumanTraining(SceneTraining[HumanScene]):
 
     def _penalties(self, scene: HumanScene) -> dict[str, Tensor]:
         """Return penalties for Gaussians far from their scaffolds, or larger than their texels."""
-        terms = {}
-        options = self.options
         now = scene.gaussians
-        if options.offset_weight > 0:
-            away = (now.means - scene.anchors.points) / CENTIMETRE
-            terms["offset"] = options.offset_weight * away.square().sum() / len(away)
-        if options.scale_weight > 0:
-            longer = now.log_scales - scene.anchors.size.log()[:, None]
-            terms["scale"] = options.scale_weight * longer.clamp_min(0).square().sum() / len(longer)
-        return terms
+        away = (now.means - scene.anchors.points) / CENTIMETRE
+        longer = now.log_scales - scene.anchors.size.log()[:, None]
+        return {
+            "offset": PARAMS.offset_weight * away.square().sum() / len(away),
+            "scale": PARAMS.scale_weight * longer.clamp_min(0).square().sum() / len(longer),
+        }
 
     def _between_neighbours(
         self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int
@@ -231,15 +227,16 @@ class HumanTraining(SceneTraining[HumanScene]):
 
         Rigidity: distances do not change. Smoothness: offsets from the scaffold are alike.
         """
-        options = self.options
         means = scene.gaussians.means
-        if options.rigidity == 0 and options.smoothness == 0:
-            return {}
         if self._near is None:
-            self._near = linked_neighbours(scene.anchors.points, scene.given_weights(), NEIGHBOURS)
+            self._near = linked_neighbours(
+                scene.anchors.points, scene.given_weights(), PARAMS.neighbours
+            )
         if not self._near.shape[1]:
             return {}
         near = self._near[:, step % self._near.shape[1]]
         strain, uneven = strains(means, moved.means, scene.anchors.points, near, scale)
-        terms = {"rigidity": options.rigidity * strain, "smoothness": options.smoothness * uneven}
-        return {name: x / CENTIMETRE**2 for name, x in terms.items() if getattr(options, name) > 0}
+        return {
+            "rigidity": PARAMS.rigidity * strain / CENTIMETRE**2,
+            "smoothness": PARAMS.smoothness * uneven / CENTIMETRE**2,
+        }

@@ -6,7 +6,6 @@ Local letters: D input channels, K scaffolds, S texels per side.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,14 +13,17 @@ import torch
 from torch import Tensor, nn
 
 from dyngs.conventions import SH_C0
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.prediction.person import CapturedPerson
 from dyngs.human.prediction.texel_maps import HULL_LIMIT, TexelMaps, from_atlas, to_atlas
-from dyngs.models.convolution import GROUPS, ResidualBlock, begin_weights, upsampled
+from dyngs.models.convolution import ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import unit_quats
 
+WIDTHS = (24, 32, 48, 64)
+"""Channels of the U-Net at 1/2, 1/4, ... of the resolution of the atlas."""
+SILHOUETTE_FRACTION = 0.9
+"""Gaussians above the lowest scaffold lie inside at least this fraction of the silhouettes."""
 HEADS = {
     "rotation": 4,
     "scale": 3,
@@ -43,40 +45,31 @@ class AtlasNetwork(nn.Module):
     full resolution the input itself.
     """
 
-    def __init__(
-        self, channels: int, scaffolds: int, widths: Sequence[int], generator: torch.Generator
-    ) -> None:
-        """D ``channels`` come in, K ``scaffolds`` go out; ``widths`` are channels at 1/2, 1/4, ...
-        of the resolution.
+    def __init__(self, channels: int, scaffolds: int, generator: torch.Generator) -> None:
+        """D ``channels`` come in, K ``scaffolds`` go out.
 
-        The network is made on the CPU, with weights of ``generator``. Raises DyngsError: a width is
-        no multiple of 8.
+        The network is made on the CPU, with weights of ``generator``.
         """
         super().__init__()
-        if any(width % GROUPS for width in widths):
-            raise DyngsError(f"model.widths must be multiples of {GROUPS}, not {list(widths)}")
-        self.scaffolds, self.halvings = scaffolds, len(widths)
+        self.scaffolds = scaffolds
         with torch.device("cpu"):
-            self._make_layers(channels, scaffolds, widths)
+            self.down = nn.ModuleList(
+                nn.Sequential(
+                    nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1),
+                    ResidualBlock(width),
+                )
+                for i, (before, width) in enumerate(zip((channels, *WIDTHS), WIDTHS, strict=False))
+            )
+            self.up = nn.ModuleList(
+                nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), ResidualBlock(width))
+                for below, width in zip(WIDTHS[:0:-1], WIDTHS[-2::-1], strict=True)
+            )
+            self.last = nn.Sequential(
+                nn.Conv2d(WIDTHS[0] + channels, WIDTHS[0], 3, padding=1), nn.SiLU()
+            )
+            self.heads = nn.Conv2d(WIDTHS[0], scaffolds * sum(HEADS.values()), 1)
         begin_weights(self, generator)
         nn.init.zeros_(self.heads.weight)
-
-    def _make_layers(self, channels: int, scaffolds: int, widths: Sequence[int]) -> None:
-        self.down = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1),
-                ResidualBlock(width),
-            )
-            for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
-        )
-        self.up = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), ResidualBlock(width))
-            for below, width in zip(widths[:0:-1], widths[-2::-1], strict=True)
-        )
-        self.last = nn.Sequential(
-            nn.Conv2d(widths[0] + channels, widths[0], 3, padding=1), nn.SiLU()
-        )
-        self.heads = nn.Conv2d(widths[0], scaffolds * sum(HEADS.values()), 1)
 
     def forward(self, maps: Tensor) -> Tensor:
         """Return the raw predictions (K, 16, S, S); S must be a multiple of 2 to the number of
@@ -149,23 +142,17 @@ def guessed_colours(
 
 
 def predict_gaussians(
-    person: CapturedPerson,
-    maps: TexelMaps,
-    mean: Tensor,
-    network: AtlasNetwork | None,
-    min_silhouette_fraction: float,
+    person: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork
 ) -> PredictedAvatar:
-    """Return the avatar that ``network`` predicts, differentiable in its weights; None: discs in
-    observed colours.
+    """Return the avatar that ``network`` predicts, differentiable in its weights.
 
     All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they
-    lie inside at least the fraction ``min_silhouette_fraction`` of the silhouettes. Rotations are
-    relative to the tangent frame, scales to the initial Gaussian, means move along the normal.
-    Colours are a weighted mean of those of the images and of the network, which mixes and corrects
-    the ``guessed_colours``; without a network those of the images. ``mean`` is as in
-    ``network_inputs``.
+    lie inside the fraction ``SILHOUETTE_FRACTION`` of the silhouettes. Rotations are relative to
+    the tangent frame, scales to the initial Gaussian, means move along the normal. Colours are a
+    weighted mean of those of the images and of the network, which mixes and corrects the
+    ``guessed_colours``. ``mean`` is as in ``network_inputs``.
     """
-    kept = (maps.inside >= min_silhouette_fraction) & (maps.seen > 0)
+    kept = (maps.inside >= SILHOUETTE_FRACTION) & (maps.seen > 0)
     kept[0] = True
     rows = kept.flatten().nonzero()[:, 0]
     first = person.gaussians.select(rows)
@@ -173,9 +160,6 @@ def predict_gaussians(
     seen = maps.seen.flatten()[rows]
     observed = maps.rgb.flatten(0, 1)[rows]
     guesses = torch.stack(guessed_colours(person, maps, mean))[:, rows % len(person.texels)]
-    if network is None:
-        rgb = torch.where(seen[:, None] > 0, observed, maps.nearby[rows % len(person.texels)])
-        return PredictedAvatar(first.replace(sh=((rgb - 0.5) / SH_C0)[:, None]), subject)
     raw = network(network_inputs(person, maps, mean))
     raw = torch.cat([from_atlas(level, person.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))

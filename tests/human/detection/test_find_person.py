@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from dyngs.api.train import with_capture
 from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.config import DataConfig
-from dyngs.config.io import load_config
 from dyngs.conventions import report_nothing
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.images.images import read_image
@@ -24,7 +22,6 @@ from dyngs.files.write import write_image
 from dyngs.human.detection import find_person as module
 from dyngs.human.detection.detector import Detection
 from dyngs.human.detection.find_person import find_person, with_found_person, write_found_person
-from dyngs.human.detection.mediapipe import VARIABLE
 from dyngs.human.fit.keypoints import JOINTS, read_keypoints
 from tests.detections import person
 
@@ -200,12 +197,3 @@ def test_a_clip_is_looked_at_once(
         assert (data.root, data.frames) == (made[-1], None)
     assert len(made) == 2
     assert [line for line in said if "found before" in line] == [said[2]]
-
-
-def test_without_a_detector_training_says_what_to_install(
-    clip: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
-    config = load_config("human", [f"data.root={clip}"])
-    with pytest.raises(DyngsError, match="install MediaPipe"):
-        with_capture(config, say=[].append)

@@ -51,19 +51,6 @@ def test_who_is_hidden_for_a_while_is_the_same_one() -> None:
     assert len(followed(gone)) == 2
 
 
-def test_who_jumps_or_grows_is_another_one() -> None:
-    assert len(followed([[person(100)], [person(100 + 200)]])) == 2
-    assert len(followed([[person(100)], [person(100, 340)]])) == 2
-
-
-def test_nobody() -> None:
-    assert followed([[], []]) == []
-    unsure = person(100).keypoints * np.array([1, 1, 0], np.float32)
-    assert followed([[Detection(unsure, NOBODY)]]) == [], (
-        "where no key point is sure there is no box"
-    )
-
-
 @pytest.mark.parametrize("sides", [(LEFT, RIGHT), ARMS], ids=["all", "arms"])
 @given(st.sets(st.integers(2, 27), max_size=6))
 @settings(max_examples=20, deadline=None)

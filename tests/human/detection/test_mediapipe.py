@@ -90,18 +90,6 @@ def _has_mediapipe() -> bool:
     return find_spec("mediapipe") is not None and find_spec("cv2") is not None
 
 
-def test_without_an_interpreter_it_says_how_to_get_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
-    with pytest.raises(DyngsError, match="no detector finds the person: install MediaPipe with"):
-        MediaPipe()
-    with pytest.raises(DyngsError, match="no such Python interpreter"):
-        MediaPipe(tmp_path / "python")
-    monkeypatch.setenv(VARIABLE, sys.executable)
-    assert MediaPipe().name == "MediaPipe"
-
-
 @pytest.mark.skipif(
     VARIABLE not in os.environ, reason=f"{VARIABLE} names no environment with MediaPipe"
 )

@@ -46,15 +46,3 @@ def test_what_is_bad_is_said(
     found = warnings_of(clip(people), people, others)
     assert len(found) == 1
     assert said in found[0]
-
-
-def test_blur_is_said() -> None:
-    people = turning(12)
-    assert warnings_of(clip(people, 4), people, []) == [
-        "4 images blurred; more light, or slower motion, helps"
-    ]
-
-
-def test_who_stands_among_several_cameras_need_not_turn() -> None:
-    people = [person(200)] * 12
-    assert warnings_of(clip(people), people, [], alone=False) == []
