@@ -7,8 +7,9 @@ from scenes import look_around
 from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
-from dyngs.camera import Cameras
 from dyngs.config import DynamicModel, HumanModel
+from dyngs.core.camera import Cameras
+from dyngs.core.state import State, part_of, tensors_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.windows import OPEN, WindowedField
 from dyngs.gaussians import Gaussians
@@ -19,12 +20,11 @@ from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body_reader import default_template
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body_reader import default_template
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
-from dyngs.state import State, part_of, tensors_of
 from dyngs.static.scene import StaticScene
 
 KINDS = ("static", *FIELDS, "windowed", "masked", "human")

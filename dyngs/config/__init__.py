@@ -13,6 +13,7 @@ from dyngs.config.keys.strategy import (
     Strategy,
 )
 from dyngs.config.keys.train import TrainConfig
+from dyngs.core.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
 from dyngs.deform.keys import (
     ControlNodesField,
     DeformField,
@@ -22,9 +23,8 @@ from dyngs.deform.keys import (
     HexplaneField,
     MlpField,
 )
-from dyngs.gps.keys import GpsModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
-from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
+from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.static.keys import StaticModel
 
 __all__ = [

@@ -20,7 +20,7 @@ import yaml
 from yaml.composer import ComposerError
 from yaml.reader import ReaderError
 
-from dyngs.errors import DyngsError, printable, reason, require_name
+from dyngs.core.errors import DyngsError, printable, reason, require_name
 
 MAX_BYTES = 2**18
 """Largest size of a preset or an override: read in 3 s; the longest that we know has 5 KB."""

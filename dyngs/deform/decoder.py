@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from dyngs.config import FieldSection
+from dyngs.core.initialisation import glorot
 from dyngs.deform.field import Offsets
 from dyngs.gaussians.parameters import Parameters
-from dyngs.initialisation import glorot
 from dyngs.ops.perceptron import Layer, perceptron
 
 

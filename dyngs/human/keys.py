@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.section import Positive, SceneModel
+from dyngs.core.section import Positive, SceneModel
 
 
 class _OnTemplate(SceneModel):

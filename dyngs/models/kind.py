@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from dyngs.baselines.fields.keys import NerfModel, NgpModel
+from dyngs.baselines.triangles.keys import BgTriangleModel
+from dyngs.core.errors import DyngsError
+from dyngs.core.section import ModelSection
 from dyngs.deform.keys import DynamicModel
-from dyngs.errors import DyngsError
-from dyngs.fields.keys import NerfModel, NgpModel
-from dyngs.gps.keys import GpsModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
-from dyngs.human_fields.keys import EgHumanNerfModel, KeypointNerfModel, PredictedFieldModel
-from dyngs.section import ModelSection
+from dyngs.human.predict.fields.keys import EgHumanNerfModel, KeypointNerfModel, PredictedFieldModel
+from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.static.keys import StaticModel
-from dyngs.triangles.keys import BgTriangleModel
 
 if TYPE_CHECKING:
     import torch
@@ -90,14 +90,14 @@ KINDS: tuple[Kind, ...] = (
     Kind(StaticModel, "dyngs.static.training"),
     Kind(DynamicModel, "dyngs.deform.kind"),
     Kind(HumanModel, "dyngs.human.avatar.kind"),
-    Kind(HumanPredictorModel, "dyngs.human.prediction.learner"),
-    Kind(GpsModel, "dyngs.gps.learner"),
-    Kind(KeypointNerfModel, "dyngs.human_fields.learner"),
-    Kind(EgHumanNerfModel, "dyngs.human_fields.learner"),
-    Kind(PredictedFieldModel, "dyngs.human_fields.scene"),
-    Kind(NgpModel, "dyngs.fields.kind"),
-    Kind(NerfModel, "dyngs.fields.kind"),
-    Kind(BgTriangleModel, "dyngs.triangles.kind"),
+    Kind(HumanPredictorModel, "dyngs.human.predict.ghg.learner"),
+    Kind(GpsModel, "dyngs.human.predict.gps.learner"),
+    Kind(KeypointNerfModel, "dyngs.human.predict.fields.learner"),
+    Kind(EgHumanNerfModel, "dyngs.human.predict.fields.learner"),
+    Kind(PredictedFieldModel, "dyngs.human.predict.fields.scene"),
+    Kind(NgpModel, "dyngs.baselines.fields.kind"),
+    Kind(NerfModel, "dyngs.baselines.fields.kind"),
+    Kind(BgTriangleModel, "dyngs.baselines.triangles.kind"),
 )
 
 

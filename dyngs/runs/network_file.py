@@ -13,8 +13,8 @@ import torch
 
 from dyngs.config import Config
 from dyngs.config.io import without_removed_keys
-from dyngs.errors import DyngsError, reading
-from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
+from dyngs.core.errors import DyngsError, reading
+from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import info_of
 from dyngs.runs.inputs import inputs_of

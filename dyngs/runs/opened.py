@@ -13,16 +13,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import up_direction
 from dyngs.config import Config, DataConfig, HumanModel, StaticModel
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture, Split, View
-from dyngs.errors import DyngsError, counted
-from dyngs.files.wrong_place import command_for
+from dyngs.export.camera_paths.aim import up_direction
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.body.body_reader import load_template
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
-from dyngs.human.template.body_reader import load_template
+from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
+from dyngs.io.formats.rotation import AXES, inverse
+from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.splat_file import Nonfinite, drawing_options
+from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, training_cameras
@@ -30,10 +34,6 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.splats.formats import all_suffixes, format_to_read, read_splats
-from dyngs.splats.rotation import AXES, inverse
-from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.splat_file import Nonfinite, drawing_options
 from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
@@ -337,7 +337,7 @@ def open_scene(
     file of Gaussians.
 
     Args:
-        nonfinite: of a file of Gaussians, as ``dyngs.splats.formats.read_splats``.
+        nonfinite: of a file of Gaussians, as ``dyngs.io.formats.formats.read_splats``.
         data_root: where the capture of a run lies by now, if it was moved.
 
     Raises:

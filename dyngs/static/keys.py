@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.section import SceneModel
+from dyngs.core.section import SceneModel
 
 
 class StaticModel(SceneModel):

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.config import Config, DynamicModel, TrainConfig
+from dyngs.core.errors import DyngsError, counted
 from dyngs.deform.schedule import deform_schedule, motion_begins_after
 from dyngs.deform.training import DeformSchedule
-from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 from dyngs.training.corrections.exposure import WARM_UP
-from dyngs.triangles.keys import BgTriangleModel
 
 
 @dataclass(frozen=True)

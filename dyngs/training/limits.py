@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import torch
 
+from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.config import Config, DeformField, DynamicModel
-from dyngs.conventions import num_sh_terms
+from dyngs.core.conventions import num_sh_terms
+from dyngs.core.errors import DyngsError
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
-from dyngs.errors import DyngsError
 from dyngs.training.processes import Processes
-from dyngs.triangles.keys import BgTriangleModel
 
 # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 RANDOM_FRACTION = 0.1

@@ -25,8 +25,8 @@ from dyngs.config import (
     MlpField,
     RandomInit,
 )
-from dyngs.conventions import num_sh_terms
-from dyngs.errors import DyngsError
+from dyngs.core.conventions import num_sh_terms
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians.schedule import densify_schedule, growth_per_change
 from dyngs.ops.device import gpu_memory, num_gpus
 from dyngs.training.limits import num_field_values

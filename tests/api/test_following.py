@@ -21,7 +21,7 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, load_checkpoint
 from dyngs.training.processes import Processes

@@ -27,8 +27,8 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import find_preset, load_config, load_resolved, packaged_preset, save_config
-from dyngs.conventions import RasterizeMode
-from dyngs.errors import DyngsError
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError
 
 PRESETS = ("static", "blender", "colmap", "static_mcmc", "mip")
 ROOT = "data.root=capture"

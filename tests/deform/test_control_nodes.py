@@ -17,10 +17,10 @@ from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
 from torch import Tensor
 
 from dyngs.config import ControlNodesField
+from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import SMOOTHNESS, ControlNodes
 from dyngs.deform.field import Offsets
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)
 

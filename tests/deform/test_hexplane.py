@@ -13,9 +13,9 @@ from tiny_fields import cloud, stirred_field, tiny_field, tiny_options, tiny_set
 from torch import Tensor
 
 from dyngs.config import HexplaneField
+from dyngs.core.state import tensors_of
 from dyngs.deform.hexplane import Hexplane, time_rows
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 
 def field_with_rows(rows: int) -> Hexplane:

@@ -9,10 +9,10 @@ import torch
 from tiny_fields import TIMES, cloud, stirred_field, tiny_field, tiny_setup
 
 from dyngs.config import MlpField
+from dyngs.core.state import tensors_of
 from dyngs.deform.field import Offsets
 from dyngs.deform.mlp import SKIP_LAYER, Mlp, encoded
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 
 def outputs(offsets: Offsets) -> list[torch.Tensor]:

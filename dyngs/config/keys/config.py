@@ -13,8 +13,8 @@ from dyngs.config.keys.data import DataConfig
 from dyngs.config.keys.start import PointsInit, RandomInit, SceneInit
 from dyngs.config.keys.strategy import DefaultStrategy, OptimConfig, Strategy
 from dyngs.config.keys.train import TrainConfig
+from dyngs.core.section import SceneModel, Section
 from dyngs.models.kind import KINDS
-from dyngs.section import SceneModel, Section
 from dyngs.static.keys import StaticModel
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from dyngs.section import Fraction, Section
+from dyngs.core.section import Fraction, Section
 
 
 class TrainConfig(Section):

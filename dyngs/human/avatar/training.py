@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import HumanModel
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role, State, with_role
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
@@ -37,7 +38,6 @@ from dyngs.human.avatar.pose_refit import PoseRefit
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.ops.adam import Count
-from dyngs.state import Role, State, with_role
 
 
 @dataclass(frozen=True)

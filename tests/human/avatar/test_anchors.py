@@ -20,10 +20,10 @@ from dyngs.human.avatar.anchors import (
     surface_texels,
     texel_gaussians,
 )
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.ops.quaternions import rotation_matrices
 
 RESOLUTION = 48

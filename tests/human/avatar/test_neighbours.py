@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dyngs.camera import Cameras
 from dyngs.config import HumanModel
+from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.anchors import Anchors
@@ -22,9 +22,9 @@ from dyngs.human.avatar.neighbours import (
     smoothed,
     strains,
 )
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body_reader import load_template
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body_reader import load_template
+from dyngs.human.body.joints import JOINT_NAMES
 
 
 @settings(max_examples=40, deadline=None)

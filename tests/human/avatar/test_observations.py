@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.human.avatar.observations import observed_colours
 from dyngs.human.avatar.posing import BodyPose, Skeleton

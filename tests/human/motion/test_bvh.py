@@ -19,7 +19,7 @@ from motion_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.human.motion.bvh import read_bvh
 from dyngs.human.motion.retarget import retarget
 

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from motion_files import random_motion
 from scipy.spatial.transform import Rotation
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import body_frames
 from dyngs.data.capture import BodyFrames, View
-from dyngs.errors import DyngsError
+from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.motion.motion import (
     MAX_JOINT_POSES,
     Motion,
@@ -23,7 +24,6 @@ from dyngs.human.motion.motion import (
     captured_motion,
     require_frame_count,
 )
-from dyngs.human.template.joints import SMPLX_ROWS
 
 
 def matrices(motion: Motion) -> np.ndarray:

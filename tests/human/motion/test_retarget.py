@@ -27,14 +27,14 @@ from motion_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import (
     Motion,
     SkeletonMotion,
 )
 from dyngs.human.motion.placement import place_on_floor
 from dyngs.human.motion.retarget import RIGS, match_joints, read_motion, retarget
-from dyngs.human.template.joints import JOINT_NAMES
 
 FILE = Path("walk.bvh")
 

@@ -20,9 +20,9 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.data.loader import Image
-from dyngs.kinds import assemble
 from dyngs.models.renderable import Rendering
 from dyngs.training.corrections.exposure import WARM_UP, ViewExposures
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 BLACK = torch.zeros(3)

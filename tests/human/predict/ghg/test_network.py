@@ -1,0 +1,142 @@
+"""The UNet: shapes, zeros before training, weights from the generator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_people import NET, people, person
+from torch import Tensor
+
+from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.human.predict.ghg.network import (
+    HEADS,
+    AtlasNetwork,
+    PredictedAvatar,
+    guessed_colours,
+    network_inputs,
+    num_input_channels,
+    predict_gaussians,
+)
+from dyngs.human.predict.ghg.person import CapturedPerson
+from dyngs.human.predict.ghg.texel_maps import TexelMaps
+
+
+def test_predictions_are_zero_before_training() -> None:
+    found = AtlasNetwork(6, 3, torch.Generator().manual_seed(0))(torch.rand(6, 32, 32))
+    assert found.shape == (3, sum(HEADS.values()), 32, 32)
+    assert (found == 0).all()
+
+
+Shown = tuple[CapturedPerson, TexelMaps]
+MEAN = torch.full((3, NET.resolution, NET.resolution), 0.25)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    filmed = person(people(tmp_path_factory.mktemp("people"), (1,)) / "p1")
+    return filmed.person, filmed.observe([0, 3, 6])
+
+
+def constant_network(bias: dict[str, float] | None = None) -> AtlasNetwork:
+    """One that says the same everywhere: 0, or ``bias`` in every number of some heads."""
+    made = AtlasNetwork(num_input_channels(2), 2, torch.Generator().manual_seed(0))
+    names = [name for _ in range(2) for name, count in HEADS.items() for _ in range(count)]
+    with torch.no_grad():
+        made.heads.bias.copy_(torch.tensor([(bias or {}).get(name, 0.0) for name in names]))  # type: ignore[union-attr]
+    return made
+
+
+def predicted(shown: Shown, bias: dict[str, float] | None = None) -> PredictedAvatar:
+    with torch.no_grad():
+        return predict_gaussians(*shown, MEAN, constant_network(bias))
+
+
+def matrices(quats: Tensor) -> Tensor:
+    """(N, 3, 3) of unit quaternions."""
+    w = quats[:, :1].clamp(-1, 1)
+    xyz = quats[:, 1:]
+    return axis_angle_to_matrix(
+        torch.nn.functional.normalize(xyz, dim=1)
+        * 2
+        * torch.atan2(xyz.norm(dim=1, keepdim=True), w)
+    )
+
+
+def test_the_skin_is_whole_and_scaffolds_are_carved(shown: Shown) -> None:
+    """Above the skin: seen, and inside the silhouettes of all three views."""
+    sitter, maps = shown
+    found = predicted(shown).subject.anchors
+    kept = (maps.inside[1] == 1) & (maps.seen[1] > 0)
+    assert (found.points[: len(sitter.texels)] == sitter.texels.points).all()
+    torch.testing.assert_close(
+        found.points[len(sitter.texels) :],
+        (sitter.texels.points + 0.02 * sitter.texels.normals)[kept],
+    )
+
+
+def test_every_quaternion_is_normalised_by_itself(shown: Shown) -> None:
+    """(1, 0, 0, 0) + 1 in all four is a turn by 2 acos(2 / sqrt 7) about the diagonal of each
+    tangent frame."""
+    bare = predicted(shown).gaussians
+    turned = predicted(shown, {"rotation": 1.0}).gaussians
+    torch.testing.assert_close(turned.quats.norm(dim=1), torch.ones(len(turned)))
+    angle = 2 * torch.tensor(2 / 7**0.5).acos()
+    expected = matrices(bare.quats) @ axis_angle_to_matrix(torch.ones(3) / 3**0.5 * angle)
+    torch.testing.assert_close(matrices(turned.quats), expected, atol=1e-5, rtol=0)  # float32
+
+
+def test_places_lengths_and_opacities_stay_within_bounds(shown: Shown) -> None:
+    """However loud the network: half way to the next scaffold along the normal, e^1.5 times as
+    long."""
+    sitter, _ = shown
+    bare = predicted(shown).gaussians
+    loud = predicted(shown, {"height": 50.0, "scale": 50.0, "opacity": 2.0}).gaussians
+    count = len(sitter.texels)
+    torch.testing.assert_close(
+        loud.means[:count], bare.means[:count] + 0.01 * sitter.texels.normals
+    )
+    torch.testing.assert_close(loud.log_scales, bare.log_scales + 1.5)
+    torch.testing.assert_close(loud.logit_opacities, bare.logit_opacities + 2)
+
+
+def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None:
+    sitter, maps = shown
+    seen = maps.seen[0] > 0
+    trusting = predicted(shown, {"colour": 0.5, "image_weight": 50.0}).gaussians.base_rgb[
+        : len(sitter.texels)
+    ]
+    torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
+    mean, nearby, other_side = guessed_colours(sitter, maps, MEAN)
+    guess = torch.stack([mean, nearby, other_side], dim=-1) @ torch.tensor([0.0, 2.0, 0.0]).softmax(
+        0
+    )
+    torch.testing.assert_close(trusting[~seen], guess[~seen] + 0.5)
+    wary = predicted(shown, {"colour": 0.5, "image_weight": -50.0}).gaussians.base_rgb
+    torch.testing.assert_close(wary[: len(sitter.texels)], guess + 0.5)
+
+
+def test_all_heads_learn(shown: Shown) -> None:
+    made = constant_network()
+    avatar = predict_gaussians(*shown, MEAN, made)
+    sum(x.square().sum() for x in avatar.gaussians.tensors().values()).backward()  # type: ignore[union-attr]
+    grad = made.heads.bias.grad
+    assert grad is not None
+    moved = dict(zip(HEADS, grad.view(2, -1)[0].split(tuple(HEADS.values())), strict=True))
+    assert {name for name, x in moved.items() if bool((x == 0).all())} <= {"rotation"}, (
+        "a turn changes no length"
+    )
+
+
+def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
+    sitter, maps = shown
+    found = network_inputs(sitter, maps, MEAN)
+    assert found.shape == (num_input_channels(2), NET.resolution, NET.resolution)
+    assert found[-2].sum() == len(sitter.texels)
+    torch.testing.assert_close(found[-1], found[-2] / 3)
+    other = network_inputs(sitter, replace(maps, rgb=1 - maps.rgb), MEAN)
+    changed = (found != other).flatten(1).any(1)
+    level = [True] * 3 + [False] * 3
+    other_side = [True] * 3
+    assert changed.tolist() == level + level + [False] * 12 + other_side + [False] * 3
