@@ -89,11 +89,16 @@ def rasterization(
 
         import dyngs
 
-        means, quats = torch.tensor([[0.0, 0, 4]]), torch.tensor([[1.0, 0, 0, 0]])
-        scales, opacities, colors = torch.full((1, 3), 0.3), torch.tensor([0.9]),
-        torch.tensor([[1.0, 0.5, 0]]) pose, intrinsics = torch.eye(4)[None], torch.tensor([[[50.0,
-        0, 32], [0, 50, 24], [0, 0, 1]]]) images, alphas, meta = dyngs.rasterization(means, quats,
-        scales, opacities, colors, pose, intrinsics, 64, 48)
+        means = torch.tensor([[0.0, 0, 4]])
+        quats = torch.tensor([[1.0, 0, 0, 0]])
+        scales = torch.full((1, 3), 0.3)
+        opacities = torch.tensor([0.9])
+        colors = torch.tensor([[1.0, 0.5, 0]])
+        pose = torch.eye(4)[None]
+        intrinsics = torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+        images, alphas, meta = dyngs.rasterization(
+            means, quats, scales, opacities, colors, pose, intrinsics, 64, 48
+        )
 
     Args:
         means: (N, 3) world.

@@ -34,8 +34,9 @@ def load(path: Path | str) -> GaussianScene:
 
         scene = dyngs.load("runs/lego")
         pose = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]])
-        camera = dyngs.Cameras(pose, torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64,
-        48) image = scene.render(camera, time=0.5).rgb[0]
+        intrinsics = torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+        camera = dyngs.Cameras(pose, intrinsics, 64, 48)
+        image = scene.render(camera, time=0.5).rgb[0]
 
     Args:
         path: a run folder (its newest checkpoint, or its ``scene.dyngs``), a ``scene.dyngs`` with

@@ -84,6 +84,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         refit: PoseRefit | None = None,
     ) -> None:
         self.options, self.rates, self.views, self.colour_loss = options, rates, views, outlines
+        self._finding = None if outlines is None else outlines.finding
         self.refines_from = round(PARAMS.refine_from * rates.steps)
         self.frames_from = round(PARAMS.frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
@@ -136,8 +137,8 @@ class HumanTraining(SceneTraining[HumanScene]):
         After the first step with a line about outlines, if there is one. In between poses may be
         fitted again.
         """
-        if step == 1 and self.colour_loss is not None:
-            return scene, EditResult(None, finding=self.colour_loss.finding)
+        if step == 1 and self._finding is not None:
+            return scene, EditResult(None, finding=self._finding)
         if step == self.rates.steps:
             return (
                 self._filled(scene, step)
