@@ -16,9 +16,8 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
-from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
+from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template

@@ -13,7 +13,7 @@ from dyngs.cli.progress_bar import ProgressBar
 from dyngs.core.errors import DyngsError, as_word, counted, show
 
 if TYPE_CHECKING:
-    from dyngs.human.fit.known_person import KnownAvatar
+    from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "polyhedra", "spin", "wave", "room", "roll", "human", "people")
@@ -353,8 +353,8 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
+    from dyngs.human.detect.detector import MediaPipe
     from dyngs.human.detect.find_person import write_found_person
-    from dyngs.human.detect.mediapipe import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
@@ -373,7 +373,7 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
     if person is None or not (person / RESOLVED_NAME).is_file():
         return None
     from dyngs.human.avatar.scene import avatar_of
-    from dyngs.human.fit.known_person import KnownAvatar
+    from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.runs.checkpoint import load_run
 
     run = load_run(person)

@@ -12,7 +12,7 @@ from tiny_stereo import stereo_config
 
 from dyngs.config import Config, HumanPredictorModel
 from dyngs.core.errors import DyngsError
-from dyngs.human.predict.gps.surface import GpsNetwork
+from dyngs.human.predict.gps.stereo import GpsNetwork
 from dyngs.io.tensor_file import FileKind, write_tensors
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import load_weights

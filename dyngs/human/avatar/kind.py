@@ -12,13 +12,18 @@ from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of
-from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
 from dyngs.human.avatar.observations import Subject, in_colours_of
-from dyngs.human.avatar.outlines import outline_loss
-from dyngs.human.avatar.pose_refit import PoseRefit
-from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
+from dyngs.human.avatar.pose_fit import PoseRefit
+from dyngs.human.avatar.posing import (
+    Skeleton,
+    pixel_size,
+    pose_blend_shapes,
+    rest_normals,
+    surface_gaussians,
+    surface_texels,
+)
 from dyngs.human.avatar.scene import HumanScene, first_scene
-from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.avatar.training import HumanTraining, outline_loss
 from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.motion.motion import captured_motion
 from dyngs.models.checkpoint import Checkpoint

@@ -20,26 +20,25 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
-from dyngs.human.avatar.anchors import Anchors, skinning_weights
-from dyngs.human.avatar.corrections import (
-    SharedCorrection,
-    corrected_clip,
-    corrected_pose,
-    corrected_skeleton,
-    learned_light,
-    new_corrections,
-)
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (
     LEFT_OUT,
     TERMS,
+    Anchors,
     BodyPose,
     Light,
     PoseBlendShapes,
+    SharedCorrection,
     Skeleton,
+    corrected_clip,
+    corrected_pose,
+    corrected_skeleton,
     frame_pose,
+    learned_light,
+    new_corrections,
     pose_gaussians,
     rest_offsets,
+    skinning_weights,
 )
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
@@ -152,7 +151,7 @@ class HumanScene(GaussianScene):
     @property
     def up(self) -> Tensor:
         """The up direction (3,) of the world, as training saw it."""
-        from dyngs.human.motion.placement import up_direction  # late: scipy
+        from dyngs.human.motion.placement import up_direction
 
         if "up" not in self._derived:
             self._derived["up"] = up_direction(self.clip)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import (
+from dyngs.human.avatar.posing import (
     FINER,
     Anchors,
     skinning_weights,

@@ -12,8 +12,7 @@ from dyngs.config import HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.avatar.neighbours import (
+from dyngs.human.avatar.observations import (
     filled,
     linked_neighbours,
     mirror_images,
@@ -22,6 +21,7 @@ from dyngs.human.avatar.neighbours import (
     smoothed,
     strains,
 )
+from dyngs.human.avatar.posing import Anchors
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.body.joints import JOINT_NAMES

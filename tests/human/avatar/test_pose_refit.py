@@ -13,7 +13,7 @@ from posed_person import WHITE, Shown, disturbed, images_of, joints_of, person_a
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import ImageLoader
-from dyngs.human.avatar.pose_refit import LEAST_GAIN, LEAST_MOVE, PoseRefit
+from dyngs.human.avatar.pose_fit import LEAST_GAIN, LEAST_MOVE, PoseRefit
 from dyngs.human.avatar.scene import HumanScene
 
 

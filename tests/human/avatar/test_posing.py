@@ -18,9 +18,9 @@ from torch import Tensor
 
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import Anchors, skinning_weights, texel_gaussians
 from dyngs.human.avatar.posing import (
     TERMS,
+    Anchors,
     BodyPose,
     Light,
     Skeleton,
@@ -29,6 +29,8 @@ from dyngs.human.avatar.posing import (
     pose_gaussians,
     rest_offsets,
     rotate_sh,
+    skinning_weights,
+    texel_gaussians,
 )
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate, posed_vertices

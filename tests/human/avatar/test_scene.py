@@ -14,14 +14,14 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import part_of, tensors_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
-from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.corrections import (
+from dyngs.human.avatar.observations import Subject
+from dyngs.human.avatar.posing import (
     SharedCorrection,
+    Skeleton,
     corrected_clip,
     corrected_pose,
+    texel_gaussians,
 )
-from dyngs.human.avatar.observations import Subject
-from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template

@@ -26,7 +26,7 @@ from dyngs.config import (
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.human.avatar import pose_refit
+from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -227,7 +227,7 @@ def turned(capture: Path, out: Path) -> Path:
 def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240,))
+    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240,))
     config = tiny(turned(capture, tmp_path / "turned"), steps=240)
     trainer = assemble(config)
     lines = [trainer.step().finding or "" for _ in range(16)]
@@ -246,7 +246,7 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
 def test_poses_that_views_gain_nothing_from_stay_for_good(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240, 14 / 240))
+    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240, 14 / 240))
     trainer = assemble(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
     lines = [trainer.step().finding or "" for _ in range(12)]

@@ -162,7 +162,7 @@ def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Pat
 def test_a_capture_of_the_person_comes_out(
     clip: Path, tmp_path: Path, short_fits: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 2)
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 2)
     out = tmp_path / "ann"
     result = write_found_person(DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append)
     assert result.root == out

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.human.detect.mediapipe import LANDMARKS, VARIABLE, MediaPipe
+from dyngs.human.detect.detector import LANDMARKS, VARIABLE, MediaPipe
 from dyngs.io.write import write_image
 
 SCRIPT = """#!{python}

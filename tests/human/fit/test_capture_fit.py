@@ -21,21 +21,22 @@ from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.human.body.body_reader import default_template, read_body, rest_shape
 from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
-from dyngs.human.fit import start
+from dyngs.human.fit import capture_fit
 from dyngs.human.fit.capture_fit import (
     GAIN,
     RESOLUTION,
     CaptureFit,
     FitEffort,
     TriedFit,
+    body_fit,
     fit_capture,
     fitted_clips,
+    new_fit,
     placed_clip,
     split_views,
+    surface_of,
 )
-from dyngs.human.fit.known_person import with_shape
-from dyngs.human.fit.silhouettes import surface_of
-from dyngs.human.fit.solve import body_fit, new_fit
+from dyngs.human.fit.fitted_capture import with_shape
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.write import write_image
@@ -153,8 +154,8 @@ def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> N
 def test_without_given_poses_every_frame_has_its_own(
     wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(start, "STEPS", 1)
-    monkeypatch.setattr(start, "ARMS", ())
+    monkeypatch.setattr(capture_fit, "STEPS", 1)
+    monkeypatch.setattr(capture_fit, "ARMS", ())
     capture = wrong[1].replace(body=None)
     effort = FitEffort(side=32, steps=1, visits=0)
     fit = fit_capture(

@@ -19,7 +19,7 @@ from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body_reader import default_template, read_body
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.fit.known_person import (
+from dyngs.human.fit.fitted_capture import (
     AvatarPoses,
     KnownAvatar,
     known_shape,

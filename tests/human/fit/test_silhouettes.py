@@ -15,7 +15,7 @@ from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import posed_vertices
 from dyngs.human.body.body_reader import read_body
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.human.fit.silhouettes import (
+from dyngs.human.fit.capture_fit import (
     Surface,
     longest_box_side,
     observed_frame,

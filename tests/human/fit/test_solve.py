@@ -13,14 +13,15 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.fit import solve
-from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
-from dyngs.human.fit.solve import (
+from dyngs.human.fit import capture_fit
+from dyngs.human.fit.capture_fit import (
     KEYPOINT,
     LIMIT_WEIGHT,
     MISTAKEN,
     Fitting,
+    ObservedFrame,
     PosePrior,
+    Surface,
     drawn_frame,
     fit_lens,
     frame_pose_of,
@@ -29,6 +30,7 @@ from dyngs.human.fit.solve import (
     new_fit,
     prior,
     refined,
+    surface_of,
     usual,
     with_lens,
 )
@@ -93,7 +95,7 @@ def test_a_wrong_mask_among_right_ones_moves_the_person_less(
     fitting = Fitting(given, surface, near_given(given))
     moved = []
     for scale in (MISTAKEN, 1e9 * MISTAKEN):
-        monkeypatch.setattr(solve, "MISTAKEN", scale)
+        monkeypatch.setattr(capture_fit, "MISTAKEN", scale)
         found = fitting.run(new_fit(given, surface), ("trans",), 80, lambda _: seen)
         moved.append(abs(float(found["trans"][0, 0].detach())))
     assert moved[0] < 0.5 * moved[1]

@@ -17,17 +17,22 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.camera import Cameras
 from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.body.body_reader import default_template
-from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
-from dyngs.human.fit.solve import drawn_frame, frame_pose_of, new_fit, usual_pose
-from dyngs.human.fit.start import (
+from dyngs.human.fit.capture_fit import (
     NUM_HEADINGS,
     STATURE,
+    ObservedFrame,
+    Surface,
+    drawn_frame,
     first_poses,
+    frame_pose_of,
     likely_path,
+    new_fit,
     num_ticks,
     place_and_height,
     standing_clip,
+    surface_of,
     up_of,
+    usual_pose,
 )
 from dyngs.human.motion.motion import MotionClip
 
@@ -117,8 +122,8 @@ def test_place_and_size_of_who_stands_somewhere(surface: Surface) -> None:
 
 
 def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 15)
-    monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 15)
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.ARMS", ())
     place = torch.tensor([0.0, 1.0, 0.0])
     heading = 2.0
     seen = seen_by(surface, standing(place, heading), ring(3, place))
@@ -137,8 +142,8 @@ def test_who_turns_before_one_camera_is_followed(
 ) -> None:
     """From frame to frame a body would rather twist than turn: outlines of front and back are
     alike."""
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 10)
-    monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 10)
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.ARMS", ())
     place = torch.tensor([0.0, 1.0, 0.0])
     camera = ring(1, torch.tensor([0.0, 1.0, 0.0]))
     # towards the camera, then sideways, then away from it

@@ -24,9 +24,13 @@ from torch.nn.functional import interpolate, pad
 from dyngs.baselines.fields.space import rays_of
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human.predict.fields.boundaries import OUTWARDS, Boundaries
-from dyngs.human.predict.fields.features import (
+from dyngs.human.predict.fields.network import (
+    CHUNK,
     FINE,
+    NEAR,
+    EncodedPerson,
+    FieldNetwork,
+    FieldPicture,
     Perceptron,
     PointFeatures,
     SourceFeatures,
@@ -36,14 +40,7 @@ from dyngs.human.predict.fields.features import (
     blended,
     mean_and_variance,
 )
-from dyngs.human.predict.fields.network import (
-    CHUNK,
-    NEAR,
-    EncodedPerson,
-    FieldNetwork,
-    FieldPicture,
-)
-from dyngs.human.predict.fields.people import PosedBody
+from dyngs.human.predict.fields.people import OUTWARDS, Boundaries, PosedBody
 from dyngs.ops.rays import Rays
 
 

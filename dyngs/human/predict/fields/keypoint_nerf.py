@@ -22,21 +22,19 @@ from dyngs.baselines.fields.space import rays_of
 from dyngs.baselines.fields.thinning import kept_samples, reached_samples, thinned_samples
 from dyngs.core.camera import Cameras
 from dyngs.human.body.joints import JOINT_PARENTS
-from dyngs.human.predict.fields.features import (
+from dyngs.human.predict.fields.network import (
+    CHUNK,
     FINE,
+    NEAR,
+    EncodedPerson,
+    FieldNetwork,
+    FieldPicture,
     Perceptron,
     SourceFeatures,
     begin,
     between,
     blended,
     mean_and_variance,
-)
-from dyngs.human.predict.fields.network import (
-    CHUNK,
-    NEAR,
-    EncodedPerson,
-    FieldNetwork,
-    FieldPicture,
 )
 from dyngs.human.predict.fields.people import KEY_POINTS, PosedBody, Sources
 from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march

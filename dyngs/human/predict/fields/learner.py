@@ -30,7 +30,7 @@ from dyngs.human.predict.fields.people import (
     window,
 )
 from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
-from dyngs.human.predict.gps.pairs import MIN_ANGLE, angle
+from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     Example,

@@ -30,11 +30,15 @@ from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.human.predict.ghg.network import (
     WIDTHS,
     AtlasNetwork,
+    CapturedPerson,
+    TexelMaps,
+    captured_person,
     num_input_channels,
+    observe_texels,
     predict_gaussians,
+    spread_views,
+    to_atlas,
 )
-from dyngs.human.predict.ghg.person import CapturedPerson, captured_person, spread_views
-from dyngs.human.predict.ghg.texel_maps import TexelMaps, observe_texels, to_atlas
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.prediction import (
     Example,

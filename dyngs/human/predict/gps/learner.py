@@ -21,9 +21,18 @@ from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
-from dyngs.human.predict.gps.pairs import MAX_ANGLE, Pair, lessons, neighbours, well_spread
-from dyngs.human.predict.gps.rectification import RectifiedPair, cropped, is_inside, rectified
-from dyngs.human.predict.gps.surface import GpsNetwork, gaussians_of, offset_loss
+from dyngs.human.predict.gps.rectification import (
+    MAX_ANGLE,
+    Pair,
+    RectifiedPair,
+    cropped,
+    is_inside,
+    lessons,
+    neighbours,
+    rectified,
+    well_spread,
+)
+from dyngs.human.predict.gps.stereo import GpsNetwork, gaussians_of, offset_loss
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     Example,

@@ -7,8 +7,15 @@ import pytest
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.human.predict.fields.boundaries import INWARDS, OUTWARDS, Boundaries, depths
-from dyngs.human.predict.fields.people import Person, PosedBody, metric
+from dyngs.human.predict.fields.people import (
+    INWARDS,
+    OUTWARDS,
+    Boundaries,
+    Person,
+    PosedBody,
+    depths,
+    metric,
+)
 
 DISTANCE, RADIUS = 3.0, 0.3
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dyngs.human.predict.fields.boundaries import Boundaries
 from dyngs.human.predict.fields.eg_human_nerf import (
     PARAMS,
     EgHumanNerf,
@@ -15,7 +14,7 @@ from dyngs.human.predict.fields.eg_human_nerf import (
     opacities,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.fields.people import Person, metric, sources_of, window
+from dyngs.human.predict.fields.people import Boundaries, Person, metric, sources_of, window
 
 
 def network_with() -> EgHumanNerf:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.human.predict.fields.features import (
+from dyngs.human.predict.fields.network import (
     SourceFeatures,
     blended,
 )

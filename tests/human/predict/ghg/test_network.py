@@ -13,14 +13,14 @@ from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.predict.ghg.network import (
     HEADS,
     AtlasNetwork,
+    CapturedPerson,
     PredictedAvatar,
+    TexelMaps,
     guessed_colours,
     network_inputs,
     num_input_channels,
     predict_gaussians,
 )
-from dyngs.human.predict.ghg.person import CapturedPerson
-from dyngs.human.predict.ghg.texel_maps import TexelMaps
 
 
 def test_predictions_are_zero_before_training() -> None:

@@ -11,7 +11,7 @@ from tiny_people import NET, body, people, person
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
-from dyngs.human.predict.ghg.person import CapturedPerson, captured_person, spread_views
+from dyngs.human.predict.ghg.network import CapturedPerson, captured_person, spread_views
 
 
 @pytest.fixture(scope="module")

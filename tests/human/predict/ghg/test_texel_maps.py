@@ -22,13 +22,11 @@ from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.mesh import interpolate, rasterize
-from dyngs.human.predict.ghg.person import (
+from dyngs.human.predict.ghg.network import (
+    HULL_LIMIT,
     CapturedPerson,
     captured_person,
     colours_nearby,
-)
-from dyngs.human.predict.ghg.texel_maps import (
-    HULL_LIMIT,
     observe_texels,
 )
 from dyngs.human.synthetic.capture import PosedMesh, render_mesh

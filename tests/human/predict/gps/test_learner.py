@@ -26,7 +26,7 @@ from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.camera_paths.aim import look_at
 from dyngs.human.predict.gps.learner import learner, predictor
-from dyngs.human.predict.gps.pairs import neighbours
+from dyngs.human.predict.gps.rectification import neighbours
 from dyngs.human.synthetic.people import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run

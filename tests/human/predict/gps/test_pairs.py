@@ -10,7 +10,7 @@ import pytest
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
-from dyngs.human.predict.gps.pairs import around, fault, lessons, neighbours, well_spread
+from dyngs.human.predict.gps.rectification import around, fault, lessons, neighbours, well_spread
 
 
 def view_at(

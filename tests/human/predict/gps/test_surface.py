@@ -8,7 +8,7 @@ import torch
 from ray_traced_ball import CENTER, RADIUS, ball, exact_depth, pose_at
 
 from dyngs.human.predict.gps.rectification import RectifiedPair, rectified
-from dyngs.human.predict.gps.surface import GpsNetwork, PredictedSurface, gaussians_of, offset_loss
+from dyngs.human.predict.gps.stereo import GpsNetwork, PredictedSurface, gaussians_of, offset_loss
 
 
 @pytest.fixture(scope="module")
