@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.api.prune import prune_run
+from dyngs.api.scene_file import num_bytes_exact, write_scene_file
 from dyngs.api.train import num_cores
 from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.compress.prune.stage import prune_
+from dyngs.compress.prune.stage import pruning
 from dyngs.compress.storage.file import write_scene
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
@@ -17,7 +18,6 @@ from dyngs.config.schema import section_class
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
-from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -129,7 +129,7 @@ class VariantRuns:
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, read_capture_of(config.data, checkpoint.info), restored=True)
             trainer.restore(checkpoint)
-            prune_(trainer)
+            trainer.apply(pruning(trainer))
             return trainer.checkpoint(), config
 
 

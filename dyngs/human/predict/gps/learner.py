@@ -21,6 +21,8 @@ from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.static_scene import Sides, StaticScene
+from dyngs.gaussians.static_training import StaticTraining
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     Pair,
@@ -45,9 +47,6 @@ from dyngs.models.prediction import (
 )
 from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU, device_for
-from dyngs.static.scene import StaticScene
-from dyngs.static.sides import Sides
-from dyngs.static.training import StaticTraining
 
 DEPTH_FRACTION = 0.4  # of the steps in which depth alone is learned, from depth maps
 DECAY = 0.9
