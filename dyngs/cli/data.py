@@ -145,13 +145,6 @@ def _add_people(verbs: args.Commands) -> None:
     about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    parser.add_argument(
-        "--person",
-        type=int,
-        default=1,
-        metavar="N",
-        help="which of several people (1: the largest)",
-    )
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
@@ -356,9 +349,7 @@ def run_people(arguments: argparse.Namespace) -> int:
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
-        result = write_found_person(
-            options, arguments.out, detector, report, number=arguments.person
-        )
+        result = write_found_person(options, arguments.out, detector, report)
     print_lines(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 

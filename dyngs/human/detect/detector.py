@@ -53,6 +53,11 @@ class Detection:
         )
 
     @property
+    def middle(self) -> np.ndarray:
+        """(2,) column and row of the middle of the box, pixels."""
+        return (self.box[:2] + self.box[2:]) / 2
+
+    @property
     def height(self) -> float:
         """Of the box, pixels."""
         return float(self.box[3] - self.box[1])

@@ -10,12 +10,11 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from scipy.optimize import linear_sum_assignment
 
 from dyngs.capture.background import at_size, outlined
 from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
@@ -33,14 +32,11 @@ from dyngs.io.outputs import note_sources, require_new_folder
 from dyngs.io.temporary import cache_folder, temporary_folder_beside
 from dyngs.io.write import write_image, write_text
 
-# how far a person moves between images at most, in heights, beside what the last motion explains
-REACH = 0.6
-GROWTH = 1.6  # largest ratio of a person's heights in following detections
-PATIENCE = 10  # images that a person may be missing
+REACH = 0.6  # distance between following detections of one person, at most, in heights an image
+PATIENCE = 10  # images after which anybody may be the person again
 SWAP = 0.04
 """What a swapped image costs, in heights of the person by which each key point moves: a limb taken
 for the other one in a few images moves them more, and who has turned around stays so for long."""
-_IMPOSSIBLE = 1e3
 _PAIRS = {
     "all": ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)),
     "arms": ((7, 8), (9, 10)),
@@ -49,74 +45,24 @@ _PAIRS = {
 """Key points of COCO on the left and on the right."""
 
 
-@dataclass
-class _Track:
-    """A person: the detection of each image, None where they are not seen."""
-
-    seen: list[Detection | None] = field(default_factory=list)
-    last: list[tuple[int, np.ndarray]] = field(default_factory=list)  # the last two: image, box
-
-    def expected(self, number: int) -> tuple[np.ndarray, float]:
-        """Return the middle (2,) of the person in image ``number`` at constant velocity, and the
-        height, pixels."""
-        (image, box) = self.last[-1]
-        middle = _middle(box)
-        if len(self.last) > 1:
-            before, earlier = self.last[-2]
-            middle = middle + (middle - _middle(earlier)) * (number - image) / (image - before)
-        return middle, float(box[3] - box[1])
-
-    def add(self, number: int, person: Detection) -> None:
-        self.seen += [None] * (number - len(self.seen)) + [person]
-        self.last = [*self.last[-1:], (number, person.box)]
-
-    @property
-    def weight(self) -> float:
-        """Area of the boxes over all images."""
-        boxes = np.array([person.box for person in self.seen if person is not None])
-        return float(((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).sum())
-
-
-def followed(images: Sequence[Sequence[Detection]]) -> list[list[Detection | None]]:
-    """Return the people in the images (F) of one camera, each with their detection per image, the
-    largest first.
-
-    Detections are joined where middle and height of the boxes go on as before, all of an image at
-    once (assignment of least total distance). A person who is away for more than ``PATIENCE``
-    images comes back as another one.
-    """
-    tracks: list[_Track] = []
-    for number, people in enumerate(images):
-        people = [person for person in people if person.height > 0]
-        open_ones = [track for track in tracks if number - track.last[-1][0] <= PATIENCE]
-        costs = np.array(
-            [[_cost(track, number, person) for person in people] for track in open_ones]
-        )
-        joined: dict[int, _Track] = {}
-        if costs.size:
-            pairs = zip(*linear_sum_assignment(np.minimum(costs, _IMPOSSIBLE)), strict=True)
-            joined = {int(c): open_ones[int(r)] for r, c in pairs if costs[r, c] < _IMPOSSIBLE}
-        for index, person in enumerate(people):
-            track = joined.get(index)
-            if track is None:
-                track = _Track()
-                tracks.append(track)
-            track.add(number, person)
-    tracks.sort(key=lambda track: -track.weight)
-    return [track.seen + [None] * (len(images) - len(track.seen)) for track in tracks]
-
-
-def _middle(box: np.ndarray) -> np.ndarray:
-    return (box[:2] + box[2:]) / 2
-
-
-def _cost(track: _Track, number: int, person: Detection) -> float:
-    """Return the distance from where the person is expected in heights, or ``_IMPOSSIBLE``."""
-    middle, height = track.expected(number)
-    ratio = person.height / max(height, 1e-6)
-    distance = float(np.linalg.norm(_middle(person.box) - middle)) / max(height, 1e-6)
-    waited = number - track.last[-1][0]
-    return distance if distance < REACH * waited and 1 / GROWTH < ratio < GROWTH else _IMPOSSIBLE
+def followed(images: Sequence[Sequence[Detection]]) -> list[Detection | None]:
+    """Return one person in the images (F) of a camera: the largest that is found first, then who is
+    nearest."""
+    person: list[Detection | None] = []
+    last: Detection | None = None
+    missing = 0
+    for people in images:
+        if last is None or missing > PATIENCE:
+            found = max(people, key=lambda x: x.height, default=None)
+        else:
+            reach = REACH * (missing + 1) * last.height
+            away = [float(np.linalg.norm(x.middle - last.middle)) for x in people]
+            row = int(np.argmin([*away, reach]))
+            found = people[row] if row < len(people) else None
+        person.append(found)
+        missing = missing + 1 if found is None else 0
+        last = last if found is None else found
+    return person
 
 
 def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
@@ -185,44 +131,39 @@ _ANKLES = (15, 16)
 
 
 def warnings_of(
-    images: np.ndarray,
-    person: Sequence[Detection | None],
-    others: Sequence[Sequence[Detection | None]],
-    *,
-    alone: bool = True,
+    images: np.ndarray, person: Sequence[Detection | None], *, alone: bool = True
 ) -> list[str]:
     """Return lines on what will be bad.
 
     Args:
         images: (F, H, W, 3) uint8.
         person: their detection in each image.
-        others: the same of the other people.
         alone: there is no other camera.
     """
-    seen = [(image, x) for image, x in zip(images, person, strict=True) if x is not None]
-    detections = [x for _, x in seen]
-    count = len(images)
-    beside = sum(any(other[row] is not None for other in others) for row in range(count))
+    shown = [(image, x) for image, x in zip(images, person, strict=True) if x is not None]
+    detections = [x for _, x in shown]
+    count = len(shown)
     height = float(np.median([x.height for x in detections]))
     cut = sum(_is_cut_off(x, images.shape[1]) for x in detections)
-    sharp = np.array([_sharpness(image, x) for image, x in seen])
+    sharp = np.array([_sharpness(image, x) for image, x in shown])
     blurred = int((sharp < BLURRED * np.median(sharp)).sum())
-    found = {
-        f"other people in {beside} of {counted(count, 'image')}; --person 2 takes the next one": beside
-        > OFTEN * count,
-        f"nobody is found in {count - len(seen)} of {counted(count, 'image')}; these are left out": len(
-            seen
+    lines = []
+    if count < len(images):
+        gone = len(images) - count
+        lines.append(
+            f"nobody is found in {gone} of {counted(len(images), 'image')}; these are left out"
         )
-        < count,
-        f"the feet are cut off or hidden in {cut} of {counted(len(seen), 'image')}; legs will be a guess there": cut
-        > OFTEN * len(seen),
-        f"the person is {height:.0f} px high; come nearer or record larger images": height < SMALL,
-        f"{counted(blurred, 'image')} blurred; more light, or slower motion, helps": blurred
-        > OFTEN * len(seen),
-        "the person never turns around: what the camera never sees will be a guess": alone
-        and not _turns(detections),
-    }
-    return [line for line, holds in found.items() if holds]
+    if cut > OFTEN * count:
+        lines.append(
+            f"the feet are cut off or hidden in {cut} of {counted(count, 'image')}; legs will be a guess there"
+        )
+    if height < SMALL:
+        lines.append(f"the person is {height:.0f} px high; come nearer or record larger images")
+    if blurred > OFTEN * count:
+        lines.append(f"{counted(blurred, 'image')} blurred; more light, or slower motion, helps")
+    if alone and not _turns(detections):
+        lines.append("the person never turns around: what the camera never sees will be a guess")
+    return lines
 
 
 def _is_cut_off(person: Detection, height: int) -> bool:
@@ -272,7 +213,6 @@ def find_person(
     folder: Path,
     report: ReportProgress,
     say: Callable[[str], None] = show,
-    number: int = 1,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
     are.
@@ -280,31 +220,26 @@ def find_person(
     Left and right are made the same over time. Where a camera stands, outlines of masks are those
     of what stands before its background. Views without the person, or a camera that never shows
     them, get empty masks. Says what was found, and what will be bad about it.
-    Raises DyngsError: nobody is found, or not so many.
-
-    Args:
-        number: which person of several: 1 is who fills most of the clip.
+    Raises DyngsError: nobody is found.
     """
     points: dict[str, np.ndarray] = {}
     cameras = _cameras_of(capture)
     for index, camera in enumerate(cameras):
-        people = followed(_detected(camera, detector, folder / "frames"))
+        person, swapped = with_sides(followed(_detected(camera, detector, folder / "frames")))
         report("cameras in which the person is found", index + 1, len(cameras))
         where = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
-        if not people:
+        heights = [x.height for x in person if x is not None]
+        if not heights:
             say(f"warning: {where}{detector.name} finds nobody, its images are left out")
-            _write_empty_masks(camera, folder / "masks")
+            for view in camera.views:
+                nobody = np.zeros((view.height, view.width), np.uint8)
+                write_image(folder / "masks" / f"{view.name}.png", nobody)
             continue
-        if not 1 <= number <= len(people):
-            raise DyngsError(
-                f"{capture.root}: {where}--person {number}, but people found: {len(people)}"
-            )
-        person, swapped = with_sides(people[number - 1])
         say(
-            f"{where}{_summary(person, detector)}; left and right swapped in {counted(swapped, 'image')}"
+            f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
+            f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
         )
-        others = [x for x in people if x is not people[number - 1]]
-        for warning in warnings_of(camera.images, person, others, alone=len(cameras) == 1):
+        for warning in warnings_of(camera.images, person, alone=len(cameras) == 1):
             say(f"warning: {where}{warning}")
         _write_masks(camera, person, folder / "masks", say)
         for view, own in zip(camera.views, person, strict=True):
@@ -344,12 +279,6 @@ def _detected(camera: _Camera, detector: Detector, folder: Path) -> list[list[De
             file.unlink(missing_ok=True)
 
 
-def _summary(person: Sequence[Detection | None], detector: Detector) -> str:
-    seen = [x for x in person if x is not None]
-    height = float(np.median([x.height for x in seen]))
-    return f"{detector.name} finds the person, {height:.0f} px high, in {len(seen)} of {counted(len(person), 'image')}"
-
-
 def _write_masks(
     camera: _Camera, person: Sequence[Detection | None], folder: Path, say: Callable[[str], None]
 ) -> None:
@@ -364,11 +293,6 @@ def _write_masks(
         )
     for view, mask in zip(camera.views, masks if better is None else better, strict=True):
         write_image(folder / f"{view.name}.png", at_size(mask, view))
-
-
-def _write_empty_masks(camera: _Camera, folder: Path) -> None:
-    for view in camera.views:
-        write_image(folder / f"{view.name}.png", np.zeros((view.height, view.width), np.uint8))
 
 
 def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
@@ -387,7 +311,6 @@ def write_found_person(
     detector: Detector,
     report: ReportProgress = report_nothing,
     say: Callable[[str], None] = show,
-    number: int = 1,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
     new folder ``out``.
@@ -400,7 +323,7 @@ def write_found_person(
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = find_person(capture, detector, folder, report, say, number)
+        found = find_person(capture, detector, folder, report, say)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -108,34 +108,12 @@ def test_masks_and_key_points_of_all_views(
     ankle = points["f2"][JOINTS["left_ankle"]].numpy()
     np.testing.assert_allclose(ankle, person(50, 90.0).keypoints[15], atol=1e-3)
     assert any("finds the person" in line and "in 9 of 10 images" in line for line in said)
-    assert any(line.startswith("warning: other people in 9 of 10 images") for line in said) == (
-        side == 960
-    )
     assert not list((tmp_path / "found" / "frames").iterdir()), (
         "images for the detector only live while it runs"
     )
 
 
-def test_another_person_and_nobody(clip: Path, tmp_path: Path) -> None:
-    found = find_person(
-        capture_of(clip),
-        Rough(beside=True),
-        tmp_path / "found",
-        report_nothing,
-        [].append,
-        number=2,
-    )
-    assert found.masks is not None
-    assert overlap(found.masks, 2) < 0.1
-    with pytest.raises(DyngsError, match="--person 3, but people found: 2"):
-        find_person(
-            capture_of(clip),
-            Rough(beside=True),
-            tmp_path / "found",
-            report_nothing,
-            [].append,
-            number=3,
-        )
+def test_nobody_is_an_error(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="Rough finds nobody in 10 images"):
         find_person(
             capture_of(clip), Rough(nobody=True), tmp_path / "found", report_nothing, [].append
