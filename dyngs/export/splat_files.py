@@ -81,7 +81,9 @@ def writing_of(
     if up == "keep" or (edited is not None and edited.fixed and up is None):
         own = None if edited is None else edited.up
         known = "" if own is None else f", {own} up"
-        return Writing(up=own, sh_degree=sh_degree), f"axes are those of the {frame.removesuffix('ed run')}{known}"
+        return Writing(
+            up=own, sh_degree=sh_degree
+        ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
     found = up_of(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"

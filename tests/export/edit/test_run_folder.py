@@ -27,7 +27,7 @@ from dyngs.io.formats.similarity import Similarity
 from dyngs.io.formats.splat_file import splat_options
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, open_run
-from dyngs.view.recording import Keyframe, Recording
+from dyngs.view.session import Keyframe, Recording
 
 EDITS = Edits(frame=Frame(up=(0.0, 0.6, 0.8), origin=(0.5, 0.25, 0.0), scale=3.0))
 
@@ -93,11 +93,7 @@ def test_paths_are_in_the_frame_that_people_see(tmp_path: Path) -> None:
     it was recorded."""
     opened = open_run(edited(write_moving_run(tmp_path)))
     (camera,) = training_cameras(opened.capture.splits["train"][:1], opened.config.data)
-    text = (
-        Recording((Keyframe(camera, 0.0),))
-        .moved(opened.frame)
-        .document((16, 16), 30.0, opened.world_offset)
-    )
+    text = Recording((Keyframe(camera, 0.0),)).document((16, 16), 30.0, opened)
     (tmp_path / "path.json").write_text(text)
     pose = np.array(json.loads(text)["keyframes"][0]["cam_from_world"])
     centre = -pose[:3, :3].T @ pose[:3, 3]
