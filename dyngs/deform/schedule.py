@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dyngs.config import Config, DynamicModel
+from dyngs.config import DynamicModel
 from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians.schedule import Rates
 
-MIN_COARSE_STEPS = 1000
-"""Steps that a static model needs to show where it fails; short runs spend at most a third on
-it."""
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all
 times."""
@@ -22,7 +19,7 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     nothing.
     """
     steps = rates.steps
-    fine = min(max(1, round(model.motion_from * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
+    fine = model.moves_after(steps)
     opens = max(fine, round(model.time_window_grows_from * steps))
     full = max(opens, round(model.time_window_full_at * steps))
     decays = full if model.time_window < 1 else fine
@@ -33,12 +30,3 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     )
     splits = tuple(step for step in splits if step > full)
     return DeformSchedule(fine, opens, full, decays, splits, rates)
-
-
-def motion_begins_after(config: Config, steps: int) -> int | None:
-    """Return the last step without motion in a run of ``steps``; None where nothing will move."""
-    return (
-        deform_schedule(config.model, Rates(steps)).fine
-        if isinstance(config.model, DynamicModel)
-        else None
-    )

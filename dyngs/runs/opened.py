@@ -19,12 +19,12 @@ from dyngs.core.errors import DyngsError, counted
 from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
-from dyngs.io.formats.rotation import AXES, inverse
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
 from dyngs.io.formats.splat_file import Nonfinite, drawing_options
 from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
@@ -34,7 +34,6 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""
@@ -169,7 +168,7 @@ class Opened(LoadedRun):
         less their offset."""
         if self.edited is not None:
             return self.edited.similarity
-        return Similarity(inverse(self.turned), self.info.world_scale)
+        return Similarity(Similarity(self.turned).inverse().turn, self.info.world_scale)
 
     @property
     def world(self) -> Similarity:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.config import Config, DynamicModel, HumanModel, TrainConfig
 from dyngs.core.errors import DyngsError, counted
-from dyngs.deform.schedule import deform_schedule, motion_begins_after
+from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
@@ -67,7 +67,7 @@ def with_length(config: Config, done: int, steps: int) -> Config:
     changed: dict[str, object] = {"train": _train(config.train, length)}
     match config.model:
         case DynamicModel():
-            changed["model"] = _dynamic(config, config.model, length)
+            changed["model"] = _dynamic(config.model, length)
         case HumanModel():
             fraction = length.share(config.model.refine_from)
             changed["model"] = config.model.model_copy(update={"refine_from": fraction})
@@ -117,7 +117,7 @@ def _train(options: TrainConfig, length: Length) -> TrainConfig:
     return options.model_copy(update=changed)
 
 
-def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicModel:
+def _dynamic(model: DynamicModel, length: Length) -> DynamicModel:
     old = deform_schedule(model, Rates(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
     if length.done >= old.opens:
@@ -126,8 +126,8 @@ def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicMode
             "time_window_full_at": length.kept(old.full),
         }
     changed = model.model_copy(update=fractions)
-    begins = motion_begins_after(config.model_copy(update={"model": changed}), length.steps)
-    if begins is not None and old.fine <= length.done < begins:
+    begins = changed.moves_after(length.steps)
+    if old.fine <= length.done < begins:
         raise DyngsError(
             f"train.steps={length.steps}: motion began after {old.fine:,} steps, and a run of {length.steps:,} trains "
             f"{begins:,} before anything moves; train anew with so many steps"

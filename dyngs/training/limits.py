@@ -14,14 +14,12 @@ from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
-from dyngs.training.processes import Processes
 
 # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 RANDOM_FRACTION = 0.1
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
 """Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in
 docs/storage.md."""
-CLOSE = 0.8  # Fraction of the limit from which the limit counts as having held growth back
 FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 
@@ -56,24 +54,6 @@ def require_possible(config: Config) -> None:
             "train.minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
             "`dyngs prune` afterwards"
         )
-
-
-def shared(config: Config, processes: Processes) -> Config:
-    """Return ``config`` for so many processes: with one view for each of them where one per step
-    was asked for."""
-    if processes.size == 1:
-        return config
-    minutes = config.train.minutes
-    if minutes is not None:
-        raise DyngsError(
-            f"train.minutes={minutes:g}: is measured with one process; leave it out, or start without torchrun"
-        )
-    if config.train.batch_size == 1:
-        config = config.model_copy(
-            update={"train": config.train.model_copy(update={"batch_size": processes.size})}
-        )
-    processes.share(config.train.batch_size)
-    return config
 
 
 def _require_whole_images(config: Config) -> None:
@@ -115,10 +95,8 @@ def _require_batch(config: Config) -> None:
             )
 
 
-def within_cap(config: Config, num_times: int) -> Config:
-    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where
-    it has none."""
-    cap = most_gaussians(config, num_times)
+def within_cap(config: Config, cap: int | None) -> Config:
+    """Return ``config`` with all numbers of Gaussians lowered to ``cap``; None: as it is."""
     changes = {}
     if cap is None:
         return config

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from dyngs.api.from_scene import first_of, settled
 from moving_scene import write_moving_run
 
-from dyngs.api.from_scene import first_of, settled
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, FixedStrategy

@@ -29,11 +29,11 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.aim import look_at
 from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
+from dyngs.gaussians.levels import LevelScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.opened import Opened, open_run, open_scene
-from dyngs.static.levels import LevelScene
-from dyngs.static.scene import StaticScene
 from dyngs.view.controls import Frusta, distinct, frustum_size
 from dyngs.view.layers import (
     LAYERS,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.compress.prune.stage import remove_
+from dyngs.compress.prune.stage import removal
 from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import innermost, with_innermost
@@ -20,6 +20,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
 from dyngs.training.new_trainer import GaussianTrainer
+from dyngs.training.trainer import Edit
 
 
 @dataclass(frozen=True)
@@ -101,12 +102,11 @@ def cut_config(config: Config, cut: Cut) -> Config:
 
 def apply_cut(trainer: GaussianTrainer, cut: Cut, scores: Tensor) -> None:
     """Take away what ``cut`` says from the scene of ``trainer``, which is at the end of its run."""
-    trainer.config = cut_config(trainer.config, replace(cut, field=None))
-    trainer.model.draw_as(trainer.config.model)
-    remove_(trainer, scores if cut.fraction else None)
+    trainer.apply(Edit(config=cut_config(trainer.config, replace(cut, field=None))))
+    trainer.apply(removal(trainer, scores if cut.fraction else None))
     if cut.field is not None and _nodes_of(trainer.model.scene) is not None:
         # else nothing that moves is left
-        trainer.config = cut_config(trainer.config, cut)
+        trainer.apply(Edit(config=cut_config(trainer.config, cut)))
         trainer.model.exchange(with_field(trainer.model.scene, cut.field))
     if cut.harmonics:
         _drop_harmonics(trainer, cut.harmonics)

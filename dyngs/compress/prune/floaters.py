@@ -9,17 +9,15 @@ usually is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from dyngs.config import StaticModel
 from dyngs.core.errors import counted
 from dyngs.gaussians.rendering import depths_and_contributions
-from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
+from dyngs.training.trainer import Edit, Trainer
 
 MAIN_FRACTION = 0.5  # Fraction of the weight of a Gaussian that must lie in one view
 # Depth of a Gaussian in that view, over the median depth of the view, below which it is near
@@ -33,38 +31,24 @@ FEWEST_VIEWS, MOST = 20, 0.01
 view only."""
 
 
-class FloaterRemoval:
-    """Listener that removes floaters when training ends, if that is asked for; static scenes
-    only."""
-
-    def __init__(self, loop: Loop, trainer: Callable[[], GaussianTrainer]) -> None:
-        self._loop, self._trainer = loop, trainer
-
-    def __call__(self, event: Event) -> None:
-        match event:
-            case StepDone() if event.step == self._trainer().config.train.steps:
-                self._remove(event.step)
-
-    def _remove(self, step: int) -> None:
-        trainer = self._trainer()
-        match trainer.config.model:
-            case StaticModel() if (
-                trainer.config.train.remove_floaters and len(trainer.images) >= FEWEST_VIEWS
-            ):
-                found = floaters(trainer)
-            case _:
-                return
-        before = len(trainer.model.scene)
-        count = int(found.sum())
-        if not count:
-            return
-        fraction = f"{count:,} of {counted(before, 'Gaussian')} hang close before single cameras"
-        if count > MOST * before:
-            self._loop.tell(Message(f"{fraction}: too many to be floaters, none is removed"))
-            return
-        trainer.model.keep(~found, trainer.done)
-        self._loop.tell(Message(f"{fraction}: removed (train.remove_floaters)"))
-        self._loop.tell(TopologyChanged(step, before, len(trainer.model.scene)))
+def remove_floaters(loop: Loop) -> Edit | None:
+    """Editor that removes floaters when training ends, if that is requested; static scenes only."""
+    trainer = loop.trainer
+    assert isinstance(trainer, Trainer)
+    options = trainer.config.train
+    if trainer.done != options.steps or not options.remove_floaters:
+        return None
+    if not isinstance(trainer.config.model, StaticModel) or len(trainer.images) < FEWEST_VIEWS:
+        return None
+    found = floaters(trainer)
+    count = int(found.sum())
+    if not count:
+        return None
+    before = counted(len(found), "Gaussian")
+    message = f"{count:,} of {before} hang close before single cameras"
+    if count > MOST * len(found):
+        return Edit(f"{message}: too many to be floaters, none is removed")
+    return Edit(f"{message}: removed (train.remove_floaters)", ~found)
 
 
 @torch.no_grad()

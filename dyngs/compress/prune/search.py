@@ -138,8 +138,8 @@ class Search:
         self.trainer, self.start, self.tell = trainer, start, tell
         self.held_out = () if unseen else evenly_held_out(len(trainer.images))
         self.trials = 0
-        self._begin = trainer.config, trainer.model.colours
-        trainer.held_out = frozenset(self.held_out)
+        self._config = trainer.config
+        trainer.hold_out(self.held_out)
         self._scores = scores_of(trainer, trainer.config.prune)
         self._truths = (
             list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
@@ -162,7 +162,7 @@ class Search:
         The first is the run as it is.
         """
         self._restart()
-        config = self._begin[0]
+        config = self._config
         exact = quality_of(self.trainer, self.trainer.model.scene, self._truths)
         self._exact_trained = quality_of(self.trainer, self.trainer.model.scene, self._others())
         accepted = [Candidate(Cut(), config, self.start, self.trainer.num_gaussians, exact, 0.0)]
@@ -296,9 +296,7 @@ class Search:
 
     def _restart(self) -> None:
         trainer = self.trainer
-        trainer.config, trainer.model.colours = self._begin
-        trainer.model.draw_as(trainer.config.model)
-        trainer.restore(self.start)
+        trainer.begin_again(self._config, self.start)
         trainer.model.exchange(trainer.model.scene.unmasked())
 
     def _fewer_gaussians(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
@@ -310,7 +308,7 @@ class Search:
         ]
 
     def _higher_cut_offs(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
-        own = self._begin[0].model
+        own = self._config.model
         values = [x for x in CUT_OFFS if x > own.alpha_min]
         return [(f"alphas below {x:g}", replace(so_far, alpha_min=x)) for x in values]
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import fmean
@@ -34,10 +34,9 @@ from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
-from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import Trainer
+from dyngs.training.trainer import Edit, Trainer
 
 # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 STEEPNESS = 4.0
@@ -150,76 +149,53 @@ MASKED_BELOW = 0.5
 (docs/prune.md)."""
 
 
-@dataclass(frozen=True)
-class Pruned:
-    """Result of the pruning stage of a run."""
-
-    before: int
-    after: int
-    loss: float
-    active: float  # mean fraction of the kept that masks let through; 1 without masks
-
-    def __str__(self) -> str:
-        masks = "" if self.active == 1 else f"; masks let {self.active:.0%} of them through"
-        return (
-            f"pruned: {self.before:,} -> {counted(self.after, 'Gaussian')}, "
-            f"{1 - self.after / max(self.before, 1):.1%} removed, "
-            f"{-self.loss:+.2f} dB before it is trained again{masks}"
-        )
-
-
-class PruneStage:
-    """Listener that prunes when training ends and fine-tuning begins."""
-
-    def __init__(self, loop: Loop, trainer: Callable[[], GaussianTrainer]) -> None:
-        self._loop, self._trainer = loop, trainer
-
-    def __call__(self, event: Event) -> None:
-        match event:
-            case Started() | StepDone() if (
-                event.step == self._trainer().config.train.steps < event.total
-            ):
-                done = prune_(self._trainer())
-                self._loop.tell(Message(str(done)))
-                self._loop.tell(TopologyChanged(event.step, done.before, done.after))
+def prune_stage(loop: Loop) -> Edit | None:
+    """Editor that prunes and masks when training ends and fine-tuning begins."""
+    trainer = loop.trainer
+    assert isinstance(trainer, Trainer)
+    config = trainer.config
+    if trainer.done != config.train.steps or trainer.done >= loop.total:
+        return None
+    return pruning(trainer)
 
 
 @torch.no_grad()
-def prune_(trainer: GaussianTrainer) -> Pruned:
-    """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their
-    number stays."""
-    trainer.model.exchange(trainer.model.scene.unmasked())
-    before = len(trainer.model.scene)
-    whole = quality_of(trainer, trainer.model.scene)
-    remove_(
-        trainer,
-        scores_of(trainer, trainer.config.prune) if trainer.config.prune.fraction > 0 else None,
-    )
-    scene = trainer.model.scene
-    active = 1.0
-    loss = whole - quality_of(trainer, scene.unmasked())
-    if scene.masks is not None:
-        masks = scene.masks
-        active = fmean(
-            len(masks.active(k)) / max(masks.count, 1) for k in range(len(masks.times) - 1)
+def pruning(trainer: GaussianTrainer) -> Edit:
+    """Return the edit that prunes and masks the Gaussians of ``trainer`` as its config says."""
+    scene = trainer.model.scene.unmasked()
+    options = trainer.config.prune
+    edit = removal(trainer, scores_of(trainer, options) if options.fraction > 0 else None)
+    message = f"pruned: {len(scene):,} -> "
+    if edit.kept is None:
+        return replace(
+            edit, message=f"{message}{counted(len(scene), 'Gaussian')}{_let_through(edit)}"
         )
-    return Pruned(before, len(scene), loss, active)
+    gain = quality_of(trainer, scene.select(edit.kept)) - quality_of(trainer, scene)
+    left = counted(int(edit.kept.sum()), "Gaussian")
+    cost = f"{gain:+.2f} dB before it is trained again"
+    return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
+
+
+def _let_through(edit: Edit) -> str:
+    masks = edit.masks
+    if masks is None:
+        return ""
+    times = range(len(masks.times) - 1)
+    active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in times)
+    return f"; masks let {active:.0%} of them through"
 
 
 @torch.no_grad()
-def remove_(trainer: GaussianTrainer, scores: Tensor | None) -> None:
-    """Leave all but the fraction ``prune.fraction`` with the lowest ``scores`` (N,), and mask them
-    if requested."""
+def removal(trainer: GaussianTrainer, scores: Tensor | None) -> Edit:
+    """Return the edit that leaves all but the fraction ``prune.fraction`` with the lowest ``scores``
+    (N,), and masks them if requested; from then on their number stays."""
     options = trainer.config.prune
     whole = trainer.model.scene.unmasked()
-    trainer.model.exchange(whole)
-    kept = torch.ones(len(whole), dtype=torch.bool, device=whole.gaussians.means.device)
-    if scores is not None:
-        kept = highest(scores, options.fraction)
-        trainer.model.keep(kept, trainer.done)
-    trainer.model.stop_growing()
+    kept = None if scores is None else highest(scores, options.fraction)
+    masks = None
     if options.mask_times > 1 and trainer.config.model.may_move and not whole.is_static:
-        trainer.model.exchange(replace(trainer.model.scene, masks=_masks(trainer, whole, kept)))
+        masks = _masks(trainer, whole, kept)
+    return Edit(kept=kept, masks=masks, stops_growing=True)
 
 
 @torch.no_grad()
@@ -291,7 +267,7 @@ def quality_of(
     return fmean(values)
 
 
-def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> VisibilityMasks:
+def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor | None) -> VisibilityMasks:
     """Return at which of evenly spaced key times each Gaussian kept is seen from any of the
     survey's cameras."""
     options = trainer.config.prune
@@ -303,7 +279,7 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> Visi
     moved = field_scene_of(scene)
     if moved is not None and moved.field is not None and moved.field.fades:
         seen |= there_after(scene, times, trainer.model.options.alpha_min).to(seen.device)
-    return VisibilityMasks.pack(tuple(times), seen[:, kept])
+    return VisibilityMasks.pack(tuple(times), seen if kept is None else seen[:, kept])
 
 
 def there_after(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:

@@ -67,7 +67,7 @@ class QualityCurve:
             scores = self._scores(trainer)
             took = time.perf_counter() - start
             event.loop.watch.pause(took)
-            event.loop.tell(Evaluated(event.step, self._split, *scores, took))
+            event.loop.emit(Evaluated(event.step, self._split, *scores, took))
 
     def _scores(self, trainer: Trainer[Any]) -> tuple[float, float]:
         data = trainer.config.data

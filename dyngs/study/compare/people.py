@@ -33,8 +33,8 @@ from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.runs.folder import require_empty
 from dyngs.study.tables import csv_text, markdown_table
-from dyngs.training.clock import with_steps
 from dyngs.training.new_trainer import assemble
+from dyngs.training.plan import with_steps
 
 STEM = "comparison"
 APART = 30.0

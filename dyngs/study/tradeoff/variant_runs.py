@@ -10,7 +10,7 @@ from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import num_bytes_exact, write_scene_file
 from dyngs.api.train import num_cores
 from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.compress.prune.stage import prune_
+from dyngs.compress.prune.stage import pruning
 from dyngs.compress.storage.file import write_scene
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
@@ -129,7 +129,7 @@ class VariantRuns:
         with kernel_threads(self.threads or num_cores()):
             trainer = assemble(config, read_capture_of(config.data, checkpoint.info), restored=True)
             trainer.restore(checkpoint)
-            prune_(trainer)
+            trainer.apply(pruning(trainer))
             return trainer.checkpoint(), config
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from dyngs.api.budget.run import STAGES, stage
 from hypothesis import given
 from hypothesis import strategies as st
 from limited import limited, said
 
-from dyngs.api.budget.run import STAGES, stage
 from dyngs.compress.prune.stage import quality_of
 from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, StaticModel, TrainConfig
 from dyngs.training.events import Event, Message, TopologyChanged

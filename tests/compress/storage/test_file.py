@@ -30,8 +30,8 @@ from dyngs.compress.storage.tensors import COARSENESS
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import part_of
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import CheckpointInfo
-from dyngs.static.scene import StaticScene
 
 INFO = CheckpointInfo(7, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic")
 STEPS = {

@@ -28,7 +28,7 @@ from dyngs.compress.storage.tensors import (
 from dyngs.core.state import part_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
-from dyngs.static.scene import StaticScene
+from dyngs.gaussians.static_scene import StaticScene
 
 
 def tensors() -> dict[str, Tensor]:

@@ -53,13 +53,13 @@ from dyngs.core.state import Role, part_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.motion import MotionClip
-from dyngs.static.scene import StaticScene
 
 
 def test_names_decide() -> None:

@@ -6,10 +6,10 @@ import errno
 import io
 
 import pytest
+from dyngs.runs.progress import Progress
 from steps import step_done
 
 from dyngs.runs.log import LogRecord
-from dyngs.runs.progress import Progress
 from dyngs.training.events import Evaluated, Message, TotalChanged
 
 
