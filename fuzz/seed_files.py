@@ -16,10 +16,11 @@ from tiny_fields import stirred_field
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.path import CameraPath, write_path
-from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
+from dyngs.config import Config, DataConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
+from dyngs.deform.keys import DynamicModel
 from dyngs.files.tensor_file import write_tensors
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.motion.amass import write_amass
@@ -30,6 +31,7 @@ from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.splats import formats
 from dyngs.splats.splat_file import SplatFile, with_degree
 from dyngs.state import tensors_of
+from dyngs.static.keys import StaticModel
 from dyngs.storage.file import encoded
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")

@@ -11,24 +11,19 @@ from scaled_captures import scaled_capture
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import (
-    Config,
-    ControlNodesField,
-    DataConfig,
-    DynamicModel,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.fields import field_state
+from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.state import Role, tensors_of
+from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 
 MOVING_ROWS = (1, 3)

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.loader import Image
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, joint_transforms
 from dyngs.human.template.joints import JOINT_NAMES

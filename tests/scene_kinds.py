@@ -8,7 +8,7 @@ from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel, HumanModel
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.windows import OPEN, WindowedField
 from dyngs.gaussians import Gaussians
@@ -21,6 +21,7 @@ from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body_reader import default_template

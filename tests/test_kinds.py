@@ -15,13 +15,11 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
     FixedStrategy,
     McmcStrategy,
     OptimConfig,
     PointsInit,
     RandomInit,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_config, packaged_presets
@@ -35,6 +33,7 @@ from dyngs.data.synthetic.captures import (
     write_dynamic_capture,
     write_still_capture,
 )
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
@@ -45,6 +44,7 @@ from dyngs.gaussians.mcmc import McmcDensifier
 from dyngs.kinds import assemble, with_points
 from dyngs.models.views import resolved_background, training_cameras, training_times
 from dyngs.state import tensors_of
+from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 from dyngs.training.losses import SilhouetteLoss
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from dyngs.config import Config, DataConfig, HumanPredictorModel
+from dyngs.config import Config, DataConfig
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.prediction.learner import Filmed, filmed
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body import BodyTemplate

@@ -22,33 +22,23 @@ from statistics import fmean, stdev
 from dyngs.api.from_scene import first_of
 from dyngs.api.pair_scores import PairScore, after_colour_fit, after_pose_fit, explained, plain
 from dyngs.budget.time import refitted
-from dyngs.config import (
-    BudgetConfig,
-    Config,
-    DeformField,
-    DynamicModel,
-    FieldSection,
-    FreeField,
-    NetworkColour,
-    PruneConfig,
-    ShColour,
-    StaticModel,
-)
+from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.schedule import motion_begins_after
+from dyngs.deform.keys import DeformField, DynamicModel, FieldSection, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.errors import DyngsError, counted
 from dyngs.files.write import write_text
 from dyngs.kinds import GaussianTrainer, assemble, with_points
-from dyngs.models.kind import kind_of
+from dyngs.models.kind import kind_of, motion_begins_after
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
 from dyngs.section import Section
+from dyngs.static.keys import StaticModel
 from dyngs.training.loop import Interrupts
 
 # Of small runs: longest side of the images, px, and most Gaussians
@@ -210,7 +200,7 @@ def _with_and_without_motion(
     """Return trainers without and with motion after the trial ``config``; None where it takes too
     long."""
     moving = assemble(config, capture, held_out=held_out)
-    begins = motion_begins_after(config, config.train.steps) or 1
+    begins = motion_begins_after(config.model, config.train.steps) or 1
     if not _trained(moving, begins - 1, deadline):
         return None
     still = refitted(moving, _with(config, "model", motion_from=1.0))
@@ -408,7 +398,10 @@ def _longest_side(config: Config, view: View) -> int:
 def _trial_config(config: Config) -> Config:
     small = _small(config, TRIAL_STEPS, math.inf, TRIAL_SIDE, TRIAL_GAUSSIANS)
     small = _with(small, "init", num_random=min(config.init.num_random, TRIAL_GAUSSIANS))
-    return _with(small, "model", num_random_moving=min(config.model.added_for_motion, TRIAL_RANDOM))
+    made_of = capability(config.model, HasGaussians)
+    if made_of is None:
+        return small
+    return small.model_copy(update={"model": made_of.adding(config.model, TRIAL_RANDOM)})
 
 
 def _small(

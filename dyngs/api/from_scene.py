@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.config import AutoColour, Config, FixedStrategy, SceneInit, ShColour, StaticModel
+from dyngs.config import AutoColour, Config, FixedStrategy, SceneInit, ShColour
 from dyngs.data.capture import Capture
 from dyngs.errors import DyngsError, counted, show
 from dyngs.gaussians.start import FirstGaussians
+from dyngs.models.kind import kind_of
 from dyngs.runs.opened import open_scene
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import with_degree
@@ -25,7 +26,7 @@ def settled(config: Config) -> Config:
     init = config.init
     if not isinstance(init, SceneInit):
         return config
-    if not isinstance(config.model, StaticModel):
+    if "init.scene" not in kind_of(config.model).uses:
         raise DyngsError(
             f"init.kind=scene goes with model.kind=static, not with {config.model.kind}"
         )

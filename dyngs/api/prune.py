@@ -20,6 +20,8 @@ from dyngs.export.scene_file import write_scene_file
 from dyngs.files.outputs import new_folder
 from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
+from dyngs.models.kind import HasGaussians, capability
+from dyngs.models.renderable import Posable
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Promise, Search
@@ -132,7 +134,7 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
     done = [f"train.steps={start.info.step}", "train.minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
-    if not config.model.made_of_gaussians:
+    if capability(config.model, HasGaussians) is None:
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to prune")
     return config
 
@@ -144,7 +146,7 @@ def unseen_images(trainer: GaussianTrainer) -> list[Image]:
     They play other motions there, in which poses are not refined.
     """
     views = trainer.capture.splits.get("val", ())
-    if not views or trainer.config.model.is_posed:
+    if not views or isinstance(trainer.model.scene, Posable):
         return []
     loader = ImageLoader(views, trainer.config.data)
     loader.device = trainer.device

@@ -21,8 +21,8 @@ from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.time import Deadline, fit_to_time
-from dyngs.capture.unposed import is_unposed, with_poses
-from dyngs.config import Config, HumanModel
+from dyngs.capture.unposed import with_poses
+from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
@@ -31,9 +31,9 @@ from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
 from dyngs.files.lock import Held, writing
 from dyngs.gaussians.start import FirstGaussians
-from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.kinds import build
 from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.kind import HasBody, HasGaussians, Moves, Predicts, capability, kind_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
@@ -200,7 +200,7 @@ def _chosen(
 ) -> tuple[Config, list[Choice], Capture | None]:
     """Return the configuration with all decided, what was said, and the capture, which nothing
     reads again."""
-    if config.model.is_network:
+    if capability(config.model, Predicts) is not None:
         return config, [], None  # it has several captures
     if resumed is not None:
         return config, [], read_capture_of(config.data, resumed.info)
@@ -260,7 +260,8 @@ class _Run:
         self._config = config
         self._saved = self.loop.trainer.done
         self._save_timer = SaveTimer(config.train.save_minutes, watch.seconds)
-        self._gaussians = self.limited if config.model.made_of_gaussians else None
+        has_gaussians = capability(config.model, HasGaussians) is not None
+        self._gaussians = self.limited if has_gaussians else None
         if self._gaussians is not None:
             _tell_memory(self._gaussians.trainer, processes.local_size)
         self._meter: CostMeter | None = None
@@ -520,26 +521,17 @@ def with_capture(
     """Return the configuration with a capture that can be trained on; what is found for it is kept
     for other runs."""
     data = config.data
-    model = config.model
-    if model.is_network:
-        return config  # its folder holds a capture per person
     root = data.root
     folder = capture_folder(root)
     if folder != root:
         say(f"{root} is unpacked in {folder}")
         data = data.model_copy(update={"root": folder})
-    if not model.is_posed:
-        data = with_poses(data, needs_times=model.may_move, say=say, report=report)
-    else:
-        if is_unposed(data):
-            # late: other kinds need no detector
-            from dyngs.human.detection.find_person import with_found_person
-
-            data = with_found_person(data, say=say, report=report)
-        if isinstance(model, HumanModel):
-            data = with_fitted_body(
-                data, model, only_if_needed=not model.fit, say=say, report=report
-            )
+    kind = kind_of(config.model)
+    if isinstance(kind, HasBody):
+        data = kind.find_body(data, config.model, say, report)
+    elif not isinstance(kind, Predicts):  # whose folder holds a capture per person
+        moves = isinstance(kind, Moves)
+        data = with_poses(data, needs_times=moves, say=say, report=report)
     if data.root == folder:  # the archive outlives the cache
         data = data.model_copy(update={"root": root})
     return config.model_copy(update={"data": data})

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
 from dyngs.config import Config
-from dyngs.deform.schedule import motion_begins_after
 from dyngs.errors import counted
 from dyngs.gaussians.start import FirstGaussians
 from dyngs.kinds import assemble
+from dyngs.models.kind import motion_begins_after
 from dyngs.runs.config_file import write_config
 from dyngs.training.clock import Forecast, with_steps
 from dyngs.training.events import Event, StepDone
@@ -258,7 +258,7 @@ def same_phase(old: Config, new: Config, done: int) -> bool:
 def happened(config: Config, done: int) -> list[bool]:
     """Return which of the one-time events of a run are over after ``done`` steps."""
     once = (
-        motion_begins_after(config, config.train.steps),
+        motion_begins_after(config.model, config.train.steps),
         config.colour.measured_after(config.train.steps),
     )
     return [done >= step for step in once if step is not None]

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.api.predict import trained_network
+from dyngs.api.predict import require_network, trained_network
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.conventions import report_nothing
@@ -29,7 +29,6 @@ from dyngs.files.write import write_image, write_text
 from dyngs.gps.pairs import angle, around
 from dyngs.kinds import assemble
 from dyngs.metrics import psnr, ssim
-from dyngs.models.kind import kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.runs.folder import require_empty
@@ -134,12 +133,12 @@ def compare_people(
                     update={"root": person.root, "test_every": 0} | changed
                 )
                 make = partial(
-                    kind_of(config.model).predictor,
+                    require_network(config, bench.people).networks()[1],
                     config,
                     checkpoint,
                     data,
-                    say=say,
-                    report=report_nothing,
+                    say,
+                    report_nothing,
                 )
                 views = make().views
                 methods = [*_methods(make, name, config)]

@@ -18,7 +18,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture, require_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, as_word, printable
-from dyngs.models.kind import kind_of
+from dyngs.models.kind import Predicts, capability, kind_of
 from dyngs.models.views import evaluation_background
 from dyngs.runs.opened import split_views
 from dyngs.training.limits import require_possible
@@ -121,9 +121,10 @@ def planned(bench: Bench, models: Sequence[str]) -> Plan:
             config = load_config(file, _words(bench, name))
             require_possible(config)
             problem = (
-                "is a network, which is trained on many people" if config.model.is_network else None
+                "is a network, which is trained on many people"
+                if capability(config.model, Predicts) is not None
+                else kind_of(config.model).refusal(capture)
             )
-            problem = problem or kind_of(config.model).refusal(capture)
         except DyngsError as error:
             problem = str(error)
         if problem is not None:

@@ -13,19 +13,7 @@ from dyngs.config.keys.strategy import (
     Strategy,
 )
 from dyngs.config.keys.train import TrainConfig
-from dyngs.deform.keys import (
-    ControlNodesField,
-    DeformField,
-    DynamicModel,
-    FieldSection,
-    FreeField,
-    HexplaneField,
-    MlpField,
-)
-from dyngs.gps.keys import GpsModel
-from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
-from dyngs.static.keys import StaticModel
 
 __all__ = [
     "AutoColour",
@@ -33,22 +21,12 @@ __all__ = [
     "CameraConfig",
     "ColourSection",
     "Config",
-    "ControlNodesField",
     "CutOff",
     "DataConfig",
     "DefaultStrategy",
-    "DeformField",
-    "DynamicModel",
-    "FieldSection",
     "FixedStrategy",
     "Fraction",
-    "FreeField",
-    "GpsModel",
-    "HexplaneField",
-    "HumanModel",
-    "HumanPredictorModel",
     "McmcStrategy",
-    "MlpField",
     "ModelSection",
     "NetworkColour",
     "OptimConfig",
@@ -61,7 +39,6 @@ __all__ = [
     "SceneModel",
     "Section",
     "ShColour",
-    "StaticModel",
     "Strategy",
     "TrainConfig",
 ]

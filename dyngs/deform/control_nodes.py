@@ -21,9 +21,9 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
-from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes, offsets_of
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets
+from dyngs.deform.keys import ControlNodesField
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
 from dyngs.deform.spline_fit import refitted
 from dyngs.gaussians import TopologyEdit

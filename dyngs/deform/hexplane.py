@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets, chosen
+from dyngs.deform.keys import HexplaneField
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyngs.config import MlpField
 from dyngs.deform.decoder import Decoder, split_heads
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
+from dyngs.deform.keys import MlpField
 from dyngs.gaussians.parameters import Parameters
 
 SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # Octaves of the positional encodings

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
+from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state

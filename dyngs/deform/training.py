@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel, FreeField
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
@@ -25,6 +24,7 @@ from dyngs.deform.fields import new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.free import FreePrimitives, FreeStart, free_start
+from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene

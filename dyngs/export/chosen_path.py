@@ -24,6 +24,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.export.images import file_stems
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
@@ -136,9 +137,10 @@ def points_at(scene: Renderable, time: float | None = None) -> Tensor:
 
 def front_of(opened: Opened, ring: Cameras) -> int:
     """Return which camera of an orbit sees a person's front; 0 for other scenes."""
-    if opened.person is None:
+    person = avatar_of(opened.renderable)
+    if person is None:
         return 0
-    facing = axis_angle_to_matrix(opened.person.clip.poses[0, 0])[:, 2]
+    facing = axis_angle_to_matrix(person.clip.poses[0, 0])[:, 2]
     return int((ring.centers @ facing).argmax())
 
 

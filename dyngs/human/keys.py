@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -12,8 +12,6 @@ from dyngs.section import Fraction, Positive, SceneModel
 
 class _OnTemplate(SceneModel):
     """Keys that models of people share: a body template."""
-
-    is_posed: ClassVar[bool] = True
 
     body: Path | None = Field(
         default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template"
@@ -83,9 +81,6 @@ class HumanModel(_OnTemplate):
 class HumanPredictorModel(_OnTemplate):
     """A network that predicts people from a few images, trained on others
     (docs/people_network.md)."""
-
-    made_of_gaussians: ClassVar[bool] = False
-    is_network: ClassVar[bool] = True
 
     kind: Literal["human_predictor"] = Field(
         default="human_predictor",

@@ -14,10 +14,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dyngs.config import StaticModel
 from dyngs.errors import counted
 from dyngs.gaussians.rendering import depths_and_contributions
 from dyngs.kinds import GaussianTrainer
+from dyngs.static.keys import StaticModel
 from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 

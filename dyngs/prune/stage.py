@@ -218,7 +218,8 @@ def remove_(trainer: GaussianTrainer, scores: Tensor | None) -> None:
         kept = highest(scores, options.fraction)
         trainer.model.keep(kept, trainer.done)
     trainer.model.stop_growing()
-    if options.mask_times > 1 and trainer.config.model.may_move and not whole.is_static:
+    moves = field_scene_of(whole) is not None and not whole.is_static
+    if options.mask_times > 1 and moves:
         trainer.model.exchange(replace(trainer.model.scene, masks=_masks(trainer, whole, kept)))
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DefaultStrategy, SceneInit, StaticModel
+from dyngs.config import DefaultStrategy, SceneInit
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
@@ -24,6 +24,7 @@ from dyngs.models.kind import RunStart
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
 from dyngs.state import Role, State, StateTensor
+from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 from dyngs.tensor_checks import require_tensor
 

@@ -8,14 +8,16 @@ from pathlib import Path
 
 from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores
-from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
+from dyngs.config import BudgetConfig, Config, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
+from dyngs.deform.keys import DynamicModel, FieldSection
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.kinds import assemble, restored_model
 from dyngs.models.checkpoint import read_capture_of, settings_of
+from dyngs.models.kind import Moves, capability
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.stage import prune_
 from dyngs.runs.checkpoint import (
@@ -95,7 +97,7 @@ class VariantRuns:
         out = self.out / "training" / wanted.slug
         run = load_resolved(self.run_dir)
         changes = [*field_changes(run, wanted)]
-        if run.model.may_move:
+        if capability(run.model, Moves) is not None:
             # a variant is what it says: nothing is chosen, and it stays a moving scene
             changes += ["model.choose=false"]
         if wanted.colour is not None:

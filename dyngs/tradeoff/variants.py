@@ -8,9 +8,10 @@ from dataclasses import dataclass, fields, replace
 
 from pydantic import ConfigDict
 
-from dyngs.config import Config, DynamicModel
+from dyngs.config import Config
 from dyngs.config.schema import kinds_of
 from dyngs.conventions import RasterizeMode
+from dyngs.deform.keys import DynamicModel
 from dyngs.errors import DyngsError, printable
 
 Value = float | int | str

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from dyngs.config import Config
-from dyngs.deform.schedule import motion_begins_after
+from dyngs.models.kind import motion_begins_after
 from dyngs.models.schedule import image_divisor, scaled
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 6.0, 300.0, 7e-4
@@ -89,7 +89,7 @@ def step_cost(config: Config | None, step: int, pixels: float, num_gaussians: fl
     factor = 1.0
     if config is not None:
         pixels = pixels / image_divisor(config.train, max(step, 1)) ** 2
-        begins = motion_begins_after(config, config.train.steps)
+        begins = motion_begins_after(config.model, config.train.steps)
         factor = MOTION if begins is not None and step > begins else 1.0
     return factor * (FIXED + PER_MEGAPIXEL * 1e-6 * pixels + PER_GAUSSIAN * num_gaussians)
 

@@ -11,25 +11,12 @@ from pathlib import Path
 
 from typing_extensions import assert_never
 
-from dyngs.config import (
-    Config,
-    ControlNodesField,
-    DefaultStrategy,
-    DeformField,
-    DynamicModel,
-    FixedStrategy,
-    FreeField,
-    HexplaneField,
-    HumanModel,
-    McmcStrategy,
-    MlpField,
-    RandomInit,
-)
+from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy, RandomInit
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians.schedule import densify_schedule, growth_per_change
+from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import gpu_memory, num_gpus
-from dyngs.training.limits import num_field_values
 from dyngs.training.trainer import Trainer
 
 COPIES = 7
@@ -37,16 +24,6 @@ COPIES = 7
 when their set changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values
 take 0.24 kB."""
 NEEDED_COPIES = 4  # Of these, what is there in every step: value, gradient, two moments
-POSING_BYTES = 2600
-"""Bytes of a Gaussian of a person next to that, where the body fit is refined: its anchor, weights
-of joints, their gradients, and the Gaussian in a pose."""
-# Bytes next to that of a Gaussian that control nodes move: the Gaussian at a time
-MOVING_BYTES = 200
-# Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice
-LOOKUP_COPIES = 12
-ACTIVATION_COPIES = 3
-"""Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a
-gradient."""
 FIELD_COPIES = 5
 """Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for
 the penalties."""
@@ -250,8 +227,10 @@ def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
 
 
 def _limit_of_gaussians(config: Config) -> tuple[str, int]:
-    if isinstance(config.model, HumanModel):
-        return "model.resolution", config.model.resolution
+    made_of = capability(config.model, HasGaussians)
+    own = None if made_of is None else made_of.count_limit(config.model)
+    if own is not None:
+        return own
     match config.strategy:
         case DefaultStrategy() | McmcStrategy():
             return "strategy.max_gaussians", config.strategy.max_gaussians
@@ -263,7 +242,7 @@ def _limit_of_gaussians(config: Config) -> tuple[str, int]:
 
 def require_room(config: Config) -> None:
     """Raise where the random Gaussians that a run is to begin with cannot fit on this machine."""
-    if not config.model.made_of_gaussians:
+    if capability(config.model, HasGaussians) is None:
         return
     whole = whole_memory()
     each = 4 * NEEDED_COPIES * stored_values(config)
@@ -285,34 +264,16 @@ def stored_values(config: Config) -> int:
 def gaussian_bytes(config: Config) -> int:
     """Return the bytes of memory that a Gaussian takes in training, where it moves if anything
     may."""
-    each = 4 * COPIES * stored_values(config)
-    field = _field(config)
-    if config.model.is_posed:
-        return each + POSING_BYTES
-    match field:
-        case None:
-            return each
-        case HexplaneField():
-            return each + 4 * LOOKUP_COPIES * field.channels * len(field.levels)
-        case MlpField():
-            return each + 4 * ACTIVATION_COPIES * field.depth * field.width
-        case ControlNodesField() | FreeField():
-            return each + MOVING_BYTES
-        case _:
-            assert_never(field)
-
-
-def _field(config: Config) -> DeformField | None:
-    return config.model.deform if isinstance(config.model, DynamicModel) else None
+    made_of = capability(config.model, HasGaussians)
+    moving = 0 if made_of is None else made_of.moving_bytes(config.model)
+    return 4 * COPIES * stored_values(config) + moving
 
 
 def field_bytes(config: Config, num_times: int) -> int:
-    """Return the bytes of memory of what a deformation field learns next to its Gaussians; 0 where
-    there is none."""
-    field = _field(config)
-    if field is None or num_times < 2:
-        return 0
-    return 4 * FIELD_COPIES * num_field_values(field, num_times)
+    """Return the bytes of memory of what a model learns next to its Gaussians."""
+    made_of = capability(config.model, HasGaussians)
+    shared = 0 if made_of is None else made_of.num_shared(config.model, num_times)
+    return 4 * FIELD_COPIES * shared
 
 
 def num_changes(config: Config, steps: int | None = None) -> int:
@@ -338,9 +299,12 @@ def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE)
             usual = round(
                 USUAL_GAUSSIANS * detail * (changes if changes < 1 else min(changes, 4.0) ** 0.5)
             )
-            return (
-                max(now, min(usual, config.strategy.growth_limit)) + config.model.added_for_motion
-            )
+            return max(now, min(usual, config.strategy.growth_limit)) + _num_added(config)
+
+
+def _num_added(config: Config) -> int:
+    made_of = capability(config.model, HasGaussians)
+    return 0 if made_of is None else made_of.num_added(config.model)
 
 
 def _mcmc_gaussians(config: Config, strategy: McmcStrategy, now: int) -> int:

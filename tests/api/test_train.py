@@ -32,7 +32,6 @@ from dyngs.config import (
     OptimConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import (
@@ -51,6 +50,7 @@ from dyngs.errors import DyngsError
 from dyngs.kinds import assemble
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
+from dyngs.static.keys import StaticModel
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
 from dyngs.training.events import Event, StepDone

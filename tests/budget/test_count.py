@@ -16,17 +16,17 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    HumanModel,
     McmcStrategy,
     PruneConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
+from dyngs.human.keys import HumanModel
 from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.static.keys import StaticModel
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from limited import limited, said
 
 from dyngs.budget.run import STAGES, stage
-from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, StaticModel, TrainConfig
+from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, TrainConfig
 from dyngs.kinds import assemble
 from dyngs.prune.stage import quality_of
+from dyngs.static.keys import StaticModel
 from dyngs.training.events import Event, Message, TopologyChanged
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))

@@ -17,7 +17,6 @@ from dyngs.config import (
     OptimConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
@@ -33,6 +32,7 @@ from dyngs.runs.checkpoint import (
     load_run,
 )
 from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.static.keys import StaticModel
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")

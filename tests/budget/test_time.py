@@ -31,10 +31,8 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
@@ -42,11 +40,13 @@ from dyngs.data.capture import View
 from dyngs.data.decoding import Decoded
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.deform.schedule import motion_begins_after
+from dyngs.deform.keys import DynamicModel
 from dyngs.files.lock import Held
 from dyngs.kinds import assemble, prepared
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import motion_begins_after
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.static.keys import StaticModel
 from dyngs.training.clock import Forecast, Stopwatch, with_steps
 from dyngs.training.events import StepReport
 from dyngs.training.loop import Loop
@@ -128,7 +128,7 @@ def test_a_step_unlike_the_others_is_not_taken_for_the_pace() -> None:
     now = 0.0
     planned = list[int]()
     for done in itertools.count(1):
-        now += 30.0 if done == motion_begins_after(config, config.train.steps) else 0.02
+        now += 30.0 if done == motion_begins_after(config.model, config.train.steps) else 0.02
         deadline._forecast.observe(config, done, now, 1000, 10_000)
         found = deadline.steps(config, done, now)
         config = with_steps(config, found)

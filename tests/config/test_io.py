@@ -13,22 +13,19 @@ from hypothesis import strategies as st
 
 from dyngs.config import (
     Config,
-    ControlNodesField,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
-    HexplaneField,
     McmcStrategy,
-    MlpField,
     OptimConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import find_preset, load_config, load_resolved, packaged_preset, save_config
 from dyngs.conventions import RasterizeMode
+from dyngs.deform.keys import ControlNodesField, DynamicModel, HexplaneField, MlpField
 from dyngs.errors import DyngsError
+from dyngs.static.keys import StaticModel
 
 PRESETS = ("static", "blender", "colmap", "static_mcmc", "mip")
 ROOT = "data.root=capture"

@@ -9,16 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field
 from pydantic.fields import FieldInfo
 
-from dyngs.config import (
-    Config,
-    DefaultStrategy,
-    DynamicModel,
-    HexplaneField,
-    McmcStrategy,
-    MlpField,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DefaultStrategy, McmcStrategy, TrainConfig
 from dyngs.config.schema import (
     allowed_values,
     config_keys,
@@ -28,6 +19,8 @@ from dyngs.config.schema import (
     section_at,
     section_class,
 )
+from dyngs.deform.keys import DynamicModel, HexplaneField, MlpField
+from dyngs.static.keys import StaticModel
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "cli.md"
 

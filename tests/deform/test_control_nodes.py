@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.config import ControlNodesField
 from dyngs.deform.control_nodes import SMOOTHNESS, ControlNodes
 from dyngs.deform.field import Offsets
+from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
 from dyngs.state import tensors_of
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from tiny_fields import TIMES, cloud, stirred_field, tiny_field, tiny_setup
 
-from dyngs.config import MlpField
 from dyngs.deform.field import Offsets
+from dyngs.deform.keys import MlpField
 from dyngs.deform.mlp import SKIP_LAYER, Mlp, encoded
 from dyngs.gaussians import TopologyEdit
 from dyngs.state import tensors_of

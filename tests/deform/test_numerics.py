@@ -25,11 +25,12 @@ from tiny_fields import (
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
+from dyngs.config import TrainConfig
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.hexplane import Hexplane, time_rows
+from dyngs.deform.keys import ControlNodesField, DynamicModel, HexplaneField
 from dyngs.deform.motion import MAX_SAMPLES, measure_motion
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
@@ -40,6 +41,7 @@ from dyngs.gaussians.rendering import render
 from dyngs.kinds import assemble, restored_scene
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.state import tensors_of
+from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 from dyngs.training.trainer import Trainer
 

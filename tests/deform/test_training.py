@@ -31,7 +31,8 @@ from static_balls import Ball, filmed
 from tiny_fields import KINDS, stir, tiny_options
 from torch import Tensor
 
-from dyngs.config import ControlNodesField, DynamicModel, FreeField, OptimConfig
+from dyngs.config import OptimConfig
+from dyngs.deform.keys import ControlNodesField, DynamicModel, FreeField
 from dyngs.deform.still_error import StillErrors
 from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit

@@ -15,13 +15,14 @@ from scaled_files import FACTORS, write_scaled
 
 from dyngs.api.train import train
 from dyngs.camera_paths.path import CameraPath, write_path
-from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError
 from dyngs.export.chosen_path import PathOptions, choose_path, orbit_around, view_to_show
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.kinds import assemble
 from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene

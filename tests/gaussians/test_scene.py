@@ -14,7 +14,7 @@ from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
-from dyngs.config import FixedStrategy, StaticModel
+from dyngs.config import FixedStrategy
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -25,6 +25,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.kinds import assemble, restored_scene
 from dyngs.state import Role, part_of, tensors_of
+from dyngs.static.keys import StaticModel
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 

@@ -10,8 +10,9 @@ import pytest
 import torch
 from tiny_fields import busy_config
 
-from dyngs.config import Config, DynamicModel
+from dyngs.config import Config
 from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.kinds import assemble, restored_scene
 from dyngs.models.checkpoint import Checkpoint

@@ -19,18 +19,17 @@ from dyngs.camera import Cameras
 from dyngs.config import (
     Config,
     DataConfig,
-    FreeField,
     McmcStrategy,
     PruneConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.field import Offsets
 from dyngs.deform.free import FreePrimitives, FreeStart
+from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
@@ -49,6 +48,7 @@ from dyngs.prune.stage import (
     there_after,
 )
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged

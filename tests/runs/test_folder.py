@@ -16,7 +16,7 @@ import pytest
 from dyngs.api.prune import prune_run
 from dyngs.api.train import train
 from dyngs.cli import main
-from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.demo import is_unused
 from dyngs.errors import DyngsError
@@ -34,6 +34,7 @@ from dyngs.runs.checkpoint import (
 from dyngs.runs.folder import default_folder, require_empty, tidy
 from dyngs.runs.log import RunLog
 from dyngs.runs.opened import open_run
+from dyngs.static.keys import StaticModel
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -10,10 +10,11 @@ import pytest
 import torch
 from tiny_stereo import STEREO, stereo_config
 
-from dyngs.config import Config, HumanPredictorModel
+from dyngs.config import Config
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import FileKind, write_tensors
 from dyngs.gps.surface import GpsNetwork
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import load_weights
 from dyngs.runs import network_file

@@ -15,7 +15,7 @@ from moving_scene import camera
 from scipy.spatial.transform import Rotation
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians

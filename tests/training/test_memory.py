@@ -15,16 +15,16 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
     FixedStrategy,
-    HumanModel,
     McmcStrategy,
     PointsInit,
     RandomInit,
     TrainConfig,
 )
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.deform.keys import DynamicModel
 from dyngs.errors import DyngsError
+from dyngs.human.keys import HumanModel
 from dyngs.kinds import assemble
 from dyngs.training import memory
 from dyngs.training.memory import (

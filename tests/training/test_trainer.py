@@ -18,14 +18,7 @@ from hypothesis import strategies as st
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
-from dyngs.config import (
-    Config,
-    DataConfig,
-    RandomInit,
-    RunConfig,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
@@ -39,6 +32,7 @@ from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
 from dyngs.state import Role, State, with_role
+from dyngs.static.keys import StaticModel
 from dyngs.training.trainer import ViewSampler
 
 

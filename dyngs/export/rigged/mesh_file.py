@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
 from dyngs.export.rigged.skeleton import (
     BodyMesh,
@@ -31,6 +30,7 @@ from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
 from dyngs.files.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.files.write import atomic_file
 from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.keys import HumanModel
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import load_template

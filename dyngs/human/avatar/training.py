@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import HumanModel
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
@@ -38,6 +37,7 @@ from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.pose_refit import PoseRefit
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, with_role
 

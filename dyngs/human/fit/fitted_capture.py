@@ -23,7 +23,7 @@ from dyngs.capture.fixed_camera import (
     zoomed,
 )
 from dyngs.capture.photos import digest_of
-from dyngs.config import DataConfig, HumanModel
+from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.body_frames import numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
@@ -58,6 +58,7 @@ from dyngs.human.fit.known_person import (
 )
 from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
 from dyngs.human.fit.solve import LensFit
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import has_same_shapes, load_template, read_body

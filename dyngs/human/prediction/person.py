@@ -13,13 +13,13 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.config import HumanPredictorModel
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate

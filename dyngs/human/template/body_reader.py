@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.data.capture import BodyFrames
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.limits import read_limited, require_at_most
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.pickles import read_pickle
+from dyngs.human.keys import HumanModel
 from dyngs.human.template.body import BodyTemplate, apply_shape, bone_shapes
 
 _Coordinates = tuple[np.ndarray, np.ndarray]

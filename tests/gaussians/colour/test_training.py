@@ -21,7 +21,6 @@ from dyngs.config import (
     RandomInit,
     RunConfig,
     ShColour,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
@@ -38,6 +37,7 @@ from dyngs.gaussians.colour.training import (
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.kinds import GaussianTrainer, assemble, restored_scene
 from dyngs.state import tensors_of
+from dyngs.static.keys import StaticModel
 
 
 def gaussians() -> Gaussians:

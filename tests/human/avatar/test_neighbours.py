@@ -13,7 +13,6 @@ from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
@@ -28,6 +27,7 @@ from dyngs.human.avatar.neighbours import (
     strains,
     trust_in,
 )
+from dyngs.human.keys import HumanModel
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body_reader import default_template, load_template
 from dyngs.human.template.joints import JOINT_NAMES

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.schedule import Rates
@@ -26,6 +25,7 @@ from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels

@@ -18,7 +18,6 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    HumanModel,
     NetworkColour,
     OptimConfig,
     RunConfig,
@@ -30,6 +29,7 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
 from dyngs.human.avatar import pose_refit
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.joints import mirrored_joints
 from dyngs.kinds import assemble, restored_scene

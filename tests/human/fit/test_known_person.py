@@ -12,7 +12,7 @@ import torch
 from synthetic_bodies import model, write_npz
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.capture import View
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
@@ -27,6 +27,7 @@ from dyngs.human.fit.known_person import (
     template_of_run,
     with_shape,
 )
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import HumanPredictorModel
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.loader import Image
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.prediction.person import (
     CapturedPerson,
     captured_person,

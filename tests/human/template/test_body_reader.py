@@ -34,9 +34,9 @@ from synthetic_bodies import (
     write_python2_pickle,
 )
 
-from dyngs.config import HumanModel
 from dyngs.data.capture import BodyFrames, ShapeSpace
 from dyngs.errors import DyngsError
+from dyngs.human.keys import HumanModel
 from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.template.body_reader import (
     default_template,
