@@ -23,11 +23,11 @@ from statistics import fmean
 import torch
 
 from dyngs.api.train import train
+from dyngs.cli.demo_run import DemoOptions, demo_config
 from dyngs.config.io import load_config, packaged_preset, save_config
+from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.demo import DemoOptions, demo_config
-from dyngs.metrics import psnr
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
 

@@ -22,7 +22,7 @@ from disturbed import Study, print_table
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.files.write import write_text
+from dyngs.io.write import write_text
 from dyngs.runs.checkpoint import load_run
 
 DEGREES, FRACTION = 0.5, 0.01

@@ -51,21 +51,21 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from skinned_avatar import Avatar, posed_mesh, read_avatar
 
-from dyngs.files.write import write_image, write_text
-from dyngs.human.motion.amass import read_amass, write_amass
-from dyngs.human.motion.motion import Motion
-from dyngs.human.motion.retarget import least_rotation
-from dyngs.human.pose.skinning import (
+from dyngs.human.body.body import BodyTemplate, posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS
+from dyngs.human.body.mesh import interpolate, normalized, rasterize
+from dyngs.human.body.skinning import (
     apply_transforms,
     axis_angle_to_matrix,
     blend_transforms,
     joint_transforms,
 )
+from dyngs.human.motion.amass import read_amass, write_amass
+from dyngs.human.motion.motion import Motion
+from dyngs.human.motion.retarget import least_rotation
 from dyngs.human.synthetic.capture import Lamp, random_light
-from dyngs.human.template.body import BodyTemplate, posed_vertices
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES, JOINT_PARENTS
-from dyngs.human.template.mesh import interpolate, normalized, rasterize
+from dyngs.io.write import write_image, write_text
 
 SAMPLES = 3
 """Samples per side of a pixel."""

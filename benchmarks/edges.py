@@ -22,13 +22,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from dyngs.baselines.triangles.scene import TriangleScene
+from dyngs.core.metrics import ssim
+from dyngs.core.state import Role
 from dyngs.data.capture import Split, View
 from dyngs.data.loader import ImageLoader
-from dyngs.metrics import ssim
 from dyngs.models.renderable import Renderable
 from dyngs.runs.opened import Opened, open_run
-from dyngs.state import Role
-from dyngs.triangles.scene import TriangleScene
 
 NEAR = 2  # px from an edge
 SPLITS: tuple[Split, ...] = ("test", "val")

@@ -23,14 +23,14 @@ import torch
 from disturbed import Study, print_table
 
 from dyngs.config import Config, DataConfig
+from dyngs.core.metrics import psnr
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import split_views
 from dyngs.evaluate.view_scores import right_half_scores
-from dyngs.files.write import write_image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.metrics import psnr
+from dyngs.io.write import write_image
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import load_run
 

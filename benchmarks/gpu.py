@@ -28,13 +28,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.bench import Workload, garden_workload, random_workload
-from dyngs.camera import Cameras
-from dyngs.camera_paths.orbit import frame_orbit_for_points
-from dyngs.compat import rasterization
+from dyngs.api.compat import rasterization
+from dyngs.cli.kernel_bench import Workload, garden_workload, random_workload
+from dyngs.core.camera import Cameras
+from dyngs.export.camera_paths.orbit import frame_orbit_for_points
+from dyngs.io.formats.formats import read_splats
+from dyngs.io.formats.rotation import axis_of
 from dyngs.ops.device import why_no_gpu
-from dyngs.splats.formats import read_splats
-from dyngs.splats.rotation import axis_of
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 Arguments = dict[str, Any]

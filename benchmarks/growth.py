@@ -25,7 +25,7 @@ SIZES = (
 
 def measure(count: int, side: int, threads: int, repeats: int) -> str:
     """Return a line of the table."""
-    from dyngs.bench import bench_rasterize, random_workload
+    from dyngs.cli.kernel_bench import bench_rasterize, random_workload
 
     load = random_workload(count)
     focal = 480 * side / 648

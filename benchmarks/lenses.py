@@ -29,7 +29,7 @@ from dyngs.data.images.lens import undistorted_points
 from dyngs.data.synthetic import raytrace
 from dyngs.data.synthetic.scenes import scene_at
 from dyngs.evaluate.report import evaluate_run
-from dyngs.files.write import write_image, write_text
+from dyngs.io.write import write_image, write_text
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
 

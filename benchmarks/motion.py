@@ -32,6 +32,8 @@ from dyngs.api.load import read_capture
 from dyngs.api.train import train
 from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.config.io import load_config
+from dyngs.core.metrics import Lpips
+from dyngs.core.state import Role
 from dyngs.data.capture import View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import (
@@ -58,15 +60,13 @@ from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
-from dyngs.kinds import GaussianTrainer, assemble
-from dyngs.metrics import Lpips
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.state import Role
 from dyngs.static.keys import StaticModel
 from dyngs.static.training import StaticTraining
+from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
 REST = 1.0

@@ -17,7 +17,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from dyngs.human.pose.skinning import apply_transforms, blend_transforms
+from dyngs.human.body.skinning import apply_transforms, blend_transforms
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_of, rotation_matrices

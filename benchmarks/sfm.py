@@ -33,7 +33,7 @@ from dyngs.data.images.images import area_downscale, read_image, target_size
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.video import VideoWriter
-from dyngs.files.write import to_uint8, write_image
+from dyngs.io.write import to_uint8, write_image
 from dyngs.runs.checkpoint import checkpoint_paths
 
 CONFIGS = Path(__file__).parents[1] / "configs"

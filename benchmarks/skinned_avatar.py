@@ -14,10 +14,10 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
-from dyngs.files.gltf import GltfFile
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.mesh import normalized
 from dyngs.human.motion.retarget import match_joints
-from dyngs.human.template.mesh import normalized
+from dyngs.io.gltf import GltfFile
 
 
 @dataclass(frozen=True)

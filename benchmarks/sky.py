@@ -27,6 +27,7 @@ from dyngs.api.train import train
 from dyngs.capture.silhouettes import points_in_silhouettes
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
+from dyngs.core.metrics import psnr
 from dyngs.data.capture import PointCloud, Split, Splits, View
 from dyngs.data.geometry import camera_center, inverse_rigid
 from dyngs.data.images.images import read_image
@@ -34,9 +35,8 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import cube_half_side
 from dyngs.evaluate.report import split_views
-from dyngs.files.write import write_image
 from dyngs.gaussians.scene import require_gaussians
-from dyngs.metrics import psnr
+from dyngs.io.write import write_image
 from dyngs.runs.checkpoint import load_run
 
 FARS = {"infinite": (1e6,), "ridges": (30.0, 40.0, 55.0, 75.0, 100.0)}

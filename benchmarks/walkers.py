@@ -27,7 +27,7 @@ from dyngs.config.io import load_config
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
 

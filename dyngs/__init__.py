@@ -9,12 +9,12 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from dyngs.api.compat import rasterization
     from dyngs.api.load import load, read_capture
     from dyngs.api.train import train
-    from dyngs.camera import Cameras
-    from dyngs.compat import rasterization
     from dyngs.config.io import load_config
-    from dyngs.errors import DyngsError
+    from dyngs.core.camera import Cameras
+    from dyngs.core.errors import DyngsError
     from dyngs.gaussians import Gaussians
     from dyngs.gaussians.rendering import RenderOptions, contributions, render
     from dyngs.gaussians.scene import GaussianScene
@@ -38,8 +38,8 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Cameras": "dyngs.camera",
-    "DyngsError": "dyngs.errors",
+    "Cameras": "dyngs.core.camera",
+    "DyngsError": "dyngs.core.errors",
     "GaussianScene": "dyngs.gaussians.scene",
     "Gaussians": "dyngs.gaussians",
     "RenderOptions": "dyngs.gaussians.rendering",
@@ -47,7 +47,7 @@ _HOMES = {
     "contributions": "dyngs.gaussians.rendering",
     "load": "dyngs.api.load",
     "load_config": "dyngs.config.io",
-    "rasterization": "dyngs.compat",
+    "rasterization": "dyngs.api.compat",
     "read_capture": "dyngs.api.load",
     "render": "dyngs.gaussians.rendering",
     "train": "dyngs.api.train",

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.gaussians.rendering import Rendering
     from dyngs.gaussians.scene import GaussianScene
-    from dyngs.human.template.body import BodyTemplate
+    from dyngs.human.body.body import BodyTemplate
 
 Read = Callable[[Path], object]
 """Reads the input in a folder and uses it; returns values that must be finite."""
@@ -72,10 +72,10 @@ def read_whole_capture(root: Path) -> object:
     images."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
     from dyngs.config import DataConfig
+    from dyngs.core.errors import DyngsError
     from dyngs.data.loader import ImageLoader
     from dyngs.data.read import read_capture
     from dyngs.data.tracks import read_tracks
-    from dyngs.errors import DyngsError
     from dyngs.human.motion.motion import captured_motion
 
     options = DataConfig.model_validate({"root": root})
@@ -175,7 +175,7 @@ def read_a_video(root: Path) -> object:
 
 def read_a_pickle(root: Path) -> object:
     """Read a pickle; NaN in it is no failure, because its users check the numbers."""
-    from dyngs.files.pickles import read_pickle
+    from dyngs.io.pickles import read_pickle
 
     read_pickle(only(root))
     return None
@@ -185,8 +185,8 @@ def read_a_body(root: Path) -> object:
     """Read a body template and pose it."""
     import torch
 
-    from dyngs.human.template.body import posed_vertices
-    from dyngs.human.template.body_reader import read_body
+    from dyngs.human.body.body import posed_vertices
+    from dyngs.human.body.body_reader import read_body
 
     uv = root / "uv.obj"
     body = read_body(
@@ -235,8 +235,8 @@ def two_images(root: Path) -> Capture:
 
 def read_splats(root: Path) -> object:
     """Read a file of Gaussians, render it, and write it as another one."""
-    from dyngs.splats.formats import known_format, read_splats, write_splats
-    from dyngs.splats.splat_file import splat_options
+    from dyngs.io.formats.formats import known_format, read_splats, write_splats
+    from dyngs.io.formats.splat_file import splat_options
 
     path = next((p for p in sorted(root.iterdir()) if known_format(p) is not None), root / "a.ply")
     splat = read_splats(path)
@@ -282,7 +282,7 @@ def read_override_lines(root: Path) -> object:
 
 def read_a_path(root: Path) -> object:
     """Read a camera path."""
-    from dyngs.camera_paths.path import read_path
+    from dyngs.export.camera_paths.path import read_path
 
     path = read_path(only(root))
     return path.cameras, path.fps, path.times
@@ -290,8 +290,8 @@ def read_a_path(root: Path) -> object:
 
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
-    from dyngs.tradeoff.measure import read_measurement
-    from dyngs.tradeoff.table import table_rows
+    from dyngs.study.tradeoff.measure import read_measurement
+    from dyngs.study.tradeoff.table import table_rows
 
     measurement = read_measurement(only(root))
     return table_rows([measurement]), measurement
@@ -299,10 +299,10 @@ def read_a_point(root: Path) -> object:
 
 def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
-    from dyngs.camera_paths.path import parse_times
     from dyngs.data.times import parse_frames
-    from dyngs.tradeoff.table import parse_requirements
-    from dyngs.tradeoff.variants import parse_variations
+    from dyngs.export.camera_paths.path import parse_times
+    from dyngs.study.tradeoff.table import parse_requirements
+    from dyngs.study.tradeoff.variants import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (
@@ -326,7 +326,7 @@ def read_a_log(root: Path) -> object:
 
 def read_a_load(root: Path) -> object:
     """Read the workload of a benchmark."""
-    from dyngs.bench import garden_workload
+    from dyngs.cli.kernel_bench import garden_workload
 
     return garden_workload(only(root))
 

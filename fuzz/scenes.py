@@ -117,7 +117,7 @@ def safetensors_changed(data: bytes, rng: Random) -> bytes:
 
 def dyngs_changed(data: bytes, rng: Random) -> bytes:
     """Return a ``scene.dyngs`` after one mutation, mostly with the right checksum."""
-    from dyngs.storage.file import MAGIC, MAX_HEADER, compressed, decompressed
+    from dyngs.compress.storage.file import MAGIC, MAX_HEADER, compressed, decompressed
 
     if rng.random() < 0.1:
         return bytes_changed(data, rng)
@@ -217,7 +217,7 @@ def _tensors_changed(data: bytes, rng: Random) -> bytes:
     """Change tensors or header and write them as dyngs does."""
     from safetensors.torch import save
 
-    from dyngs.files.tensor_file import _digest
+    from dyngs.io.tensor_file import _digest
 
     size = int.from_bytes(data[:8], "little")
     metadata = json.loads(data[8 : 8 + size])["__metadata__"]

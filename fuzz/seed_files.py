@@ -14,25 +14,25 @@ from synthetic_bodies import model, write_npz, write_obj, write_pickle
 from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.path import CameraPath, write_path
+from dyngs.compress.storage.file import encoded
 from dyngs.config import Config, DataConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.core.camera import Cameras
+from dyngs.core.state import tensors_of
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
-from dyngs.files.tensor_file import write_tensors
+from dyngs.export.camera_paths.path import CameraPath, write_path
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass
-from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.kinds import restored_scene
+from dyngs.io.formats import formats
+from dyngs.io.formats.splat_file import SplatFile, with_degree
+from dyngs.io.tensor_file import write_tensors
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.splats import formats
-from dyngs.splats.splat_file import SplatFile, with_degree
-from dyngs.state import tensors_of
 from dyngs.static.keys import StaticModel
-from dyngs.storage.file import encoded
+from dyngs.training.new_trainer import restored_scene
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
@@ -415,9 +415,9 @@ def write_keyframes(root: Path) -> None:
 def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
     from dyngs.study.speed import Quartiles, Speed
-    from dyngs.tradeoff.measure import Measurement
-    from dyngs.tradeoff.measure import write_measurement as write
-    from dyngs.tradeoff.variants import Variant
+    from dyngs.study.tradeoff.measure import Measurement
+    from dyngs.study.tradeoff.measure import write_measurement as write
+    from dyngs.study.tradeoff.variants import Variant
 
     speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))
     write(

@@ -24,7 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from fuzz.case import Case, clear
 from fuzz.readers import Reader
 from fuzz.verdict import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import look_at
+from dyngs.core.camera import Cameras
+from dyngs.export.camera_paths.aim import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
 

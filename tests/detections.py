@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dyngs.human.detection.detector import Detection
+from dyngs.human.detect.detector import Detection
 
 
 def person(

@@ -14,7 +14,18 @@ from moving_scene import camera
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
+from dyngs.compress.storage.file import (
+    _DTYPES,
+    MAGIC,
+    MAX_HEADER,
+    _Header,
+    _Info,
+    _stored,
+    compressed,
+)
+from dyngs.compress.storage.tensors import Coding, TensorKind
 from dyngs.config import NetworkColour, SceneModel
+from dyngs.core.state import prefixed, tensors_of
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.windows import WindowedField
@@ -22,10 +33,7 @@ from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.state import prefixed, tensors_of
 from dyngs.static.keys import StaticModel
-from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, _Header, _Info, _stored, compressed
-from dyngs.storage.tensors import Coding, TensorKind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

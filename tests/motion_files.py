@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.motion.motion import Motion
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
 ABOVE = {
     "pelvis": "",

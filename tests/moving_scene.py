@@ -10,9 +10,10 @@ import torch
 from scaled_captures import scaled_capture
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
+from dyngs.core.camera import Cameras
+from dyngs.core.state import Role, tensors_of
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
@@ -22,7 +23,6 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.state import Role, tensors_of
 from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 

@@ -11,7 +11,8 @@ from scenes import look_around
 from tiny_fields import cloud
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import part_of, tensors_of
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
@@ -24,7 +25,6 @@ from dyngs.gaussians import EditResult, Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
-from dyngs.state import part_of, tensors_of
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 FOCAL, DISTANCE = 100.0, 3.0

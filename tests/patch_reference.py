@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.ops.patches import Places, lattice
 
 ORDER = (2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2)

@@ -9,17 +9,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, OptimConfig, RunConfig, TrainConfig
+from dyngs.core.camera import Cameras
+from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.skinning import apply_transforms, joint_transforms
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import apply_transforms, joint_transforms
-from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.kinds import assemble
-from dyngs.metrics import psnr
+from dyngs.training.new_trainer import assemble
 
 WHITE = torch.ones(3)
 SIZE = 64

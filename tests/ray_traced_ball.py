@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gps.rectification import RectifiedPair
+from dyngs.human.predict.gps.rectification import RectifiedPair
 
 SIZE = 96
 CENTER = torch.tensor([0.1, 0.9, -0.05])

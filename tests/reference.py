@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.quaternions import rotation_matrices

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.gaussians import Gaussians
-from dyngs.splats.formats import read_splats, write_splats
-from dyngs.splats.ply import write_ply
-from dyngs.splats.ply_header import header_bytes, read_header
-from dyngs.splats.splat_file import SplatFile
+from dyngs.io.formats.formats import read_splats, write_splats
+from dyngs.io.formats.ply import write_ply
+from dyngs.io.formats.ply_header import header_bytes, read_header
+from dyngs.io.formats.splat_file import SplatFile
 
 FACTORS = (1e-4, 1e-3, 0.05, 1e3)
 FAR = (500_123.25, 4_600_321.5, 117.0)

@@ -7,7 +7,8 @@ from scenes import look_around
 from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import State, part_of, tensors_of
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.windows import OPEN, WindowedField
@@ -21,13 +22,12 @@ from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body_reader import default_template
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
-from dyngs.state import State, part_of, tensors_of
 from dyngs.static.scene import StaticScene
 
 KINDS = ("static", *FIELDS, "windowed", "masked", "human")

@@ -21,7 +21,7 @@ from moving_scene import camera, moving_scene, sliding_nodes
 from PIL import Image
 from splat_scenes import cloud
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.export.html.page import ELEMENT, PAGE, WrittenPage, write_folder, write_page
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene

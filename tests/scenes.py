@@ -11,7 +11,7 @@ import reference
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.ops import harmonics, projection, rasterization
 from dyngs.ops.projection import Projection, ProjectionOptions

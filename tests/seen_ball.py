@@ -7,7 +7,7 @@ from functools import cache
 import torch
 from small_triangles import camera
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians.fusion import Seen
 
 RADIUS, SIZE = 0.8, 48

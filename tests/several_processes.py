@@ -22,9 +22,9 @@ from dyngs.api.following import together
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config
-from dyngs.errors import DyngsError
-from dyngs.kinds import build
+from dyngs.core.errors import DyngsError
 from dyngs.training import processes as module
+from dyngs.training.new_trainer import build
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import StepReport, Trainer
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.baselines.triangles.patches import Patches, flat_triangles
 from dyngs.config import Config
 from dyngs.config.io import load_config
-from dyngs.triangles.patches import Patches, flat_triangles
+from dyngs.core.camera import Cameras
 
 KEYS = [
     "model.kind=bg_triangle",

@@ -15,11 +15,11 @@ import pytest
 import torch
 from synthetic_bodies import parents_of, write_npz, write_obj
 
+from dyngs.human.body.body import apply_shape
+from dyngs.human.body.body_reader import default_template, read_body
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.synthetic import capture as synthetic
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.body import apply_shape
-from dyngs.human.template.body_reader import default_template, read_body
-from dyngs.human.template.joints import JOINT_NAMES
 
 NEAR = 60  # vertices that a joint is regressed from
 # spread of the pose blend shapes per unit of a rotation, and how far they reach, m

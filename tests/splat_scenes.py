@@ -8,12 +8,12 @@ from importlib.util import find_spec
 import torch
 from two_balls import cameras_around
 
-from dyngs.camera import Cameras
-from dyngs.conventions import num_sh_terms
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
+from dyngs.io.formats.formats import FORMATS, Format
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.splats.formats import FORMATS, Format
 
 AROUND = cameras_around(3, 48, 36)
 

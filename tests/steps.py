@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import torch
 from moving_scene import camera
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import StepDone, StepReport

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.adam import AdamState
+from dyngs.core.state import Role, tensors_of
+from dyngs.gaussians.adam import AdamState
 from dyngs.ops.adam import Count
-from dyngs.state import Role, tensors_of
 
 SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}
 EPS = 1e-15

@@ -11,7 +11,8 @@ import torch
 from pretend_gpu import GPU, pretend_gpu
 from reference import project, rasterize
 
-from dyngs.bench import (
+from dyngs.cli import main
+from dyngs.cli.kernel_bench import (
     STAGES,
     bench_rasterize,
     format_report,
@@ -19,15 +20,14 @@ from dyngs.bench import (
     random_workload,
     write_report,
 )
-from dyngs.cli import main
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.projection import ProjectionOptions
 
 
 @pytest.fixture(autouse=True)
 def small_product(monkeypatch: pytest.MonkeyPatch) -> None:
     """The matrix product beside the stages is a small one: no test asks how fast it is."""
-    monkeypatch.setattr("dyngs.bench.SGEMM_SIZE", 64)
+    monkeypatch.setattr("dyngs.cli.kernel_bench.SGEMM_SIZE", 64)
 
 
 def test_counts_agree_with_the_reference() -> None:

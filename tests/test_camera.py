@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import look_around
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 
 
 def three_cameras() -> Cameras:

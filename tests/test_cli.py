@@ -23,7 +23,7 @@ import dyngs
 from dyngs.cli import doctor, main
 from dyngs.cli.train import parse_config
 from dyngs.config.io import load_config, save_config
-from dyngs.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, reading
 
 VERBS = (
     "demo",

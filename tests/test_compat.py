@@ -19,8 +19,8 @@ from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
 import dyngs
-from dyngs.compat import rasterization
-from dyngs.errors import DyngsError
+from dyngs.api.compat import rasterization
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project

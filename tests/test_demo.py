@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from dyngs.cli import main
-from dyngs.demo import DemoOptions, DemoResult, claimed_folder, demo_config, run_demo
-from dyngs.files.lock import LOCK_NAME
+from dyngs.cli.demo_run import DemoOptions, DemoResult, claimed_folder, demo_config, run_demo
+from dyngs.io.lock import LOCK_NAME
 
 TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 
@@ -24,8 +24,8 @@ def test_everything_that_is_promised_lies_there_and_the_command_prints_it(
         done.append(run_demo(*arguments))
         return done[0]
 
-    monkeypatch.setattr("dyngs.demo.DemoOptions", lambda steps, threads: TINY)
-    monkeypatch.setattr("dyngs.demo.run_demo", run_tiny)
+    monkeypatch.setattr("dyngs.cli.demo_run.DemoOptions", lambda steps, threads: TINY)
+    monkeypatch.setattr("dyngs.cli.demo_run.run_demo", run_tiny)
     assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "30", "--threads", "1"]) == 0
     (result,) = done
     for path in (

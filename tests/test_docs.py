@@ -26,8 +26,8 @@ from dyngs.cli import main, make_parser
 from dyngs.cli.train import parse_config
 from dyngs.config.io import load_config
 from dyngs.config.schema import config_keys
+from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.errors import DyngsError
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -183,9 +183,9 @@ def require_overrides(*overrides: str) -> None:
 def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times,
     presets."""
-    from dyngs.camera_paths.path import parse_times, path_file
-    from dyngs.tradeoff.table import parse_goal, parse_requirements
-    from dyngs.tradeoff.variants import parse_variations
+    from dyngs.export.camera_paths.path import parse_times, path_file
+    from dyngs.study.tradeoff.table import parse_goal, parse_requirements
+    from dyngs.study.tradeoff.variants import parse_variations
 
     for word in command.words:
         if word.startswith(("configs/", "benchmarks/", "examples/")):

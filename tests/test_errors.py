@@ -16,7 +16,8 @@ import pytest
 
 import dyngs
 from dyngs.cli.arguments import print_notes
-from dyngs.errors import (
+from dyngs.compress.storage.file import read_scene
+from dyngs.core.errors import (
     DyngsError,
     as_word,
     counted,
@@ -27,10 +28,9 @@ from dyngs.errors import (
     show,
     warn,
 )
-from dyngs.files.fields import read_json_object
-from dyngs.files.tensor_file import FileKind, read_tensors
+from dyngs.io.fields import read_json_object
+from dyngs.io.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
-from dyngs.storage.file import read_scene
 
 
 @pytest.mark.parametrize(
@@ -97,10 +97,10 @@ def test_no_message_can_steer_a_terminal() -> None:
 
 @pytest.mark.parametrize("text", ["x" * 5000, "9" * 5000, "\x07" * 300, "prune=" + "1" * 5000])
 def test_what_the_command_line_quotes_is_short(text: str) -> None:
-    from dyngs.camera_paths.path import parse_times
     from dyngs.data.times import parse_frames
-    from dyngs.tradeoff.table import parse_requirements
-    from dyngs.tradeoff.variants import parse_variations
+    from dyngs.export.camera_paths.path import parse_times
+    from dyngs.study.tradeoff.table import parse_requirements
+    from dyngs.study.tradeoff.variants import parse_variations
 
     for parse in (
         parse_frames,
@@ -186,7 +186,7 @@ def test_names_in_commands_can_be_copied(
 @pytest.mark.skipif(os.name != "posix", reason="locales of POSIX")
 def test_names_can_be_copied_in_the_locale_c(tmp_path: Path) -> None:
     (tmp_path / "läufer").mkdir()
-    code = "import sys; from dyngs.errors import as_word; print('next: cd ' + as_word(sys.argv[1]))"
+    code = "import sys; from dyngs.core.errors import as_word; print('next: cd ' + as_word(sys.argv[1]))"
     locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(
         [sys.executable, "-c", code, "läufer"],

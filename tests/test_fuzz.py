@@ -121,7 +121,7 @@ def test_what_harms_is_noticed(fuzzed: Fuzzed) -> None:
 HARM = """
 import ctypes, json, math, os, shutil, subprocess, tempfile, time
 from pathlib import Path
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from fuzz.campaign import run_cases, verdict_of
 from fuzz.case import Case
 from fuzz.readers import Reader

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import random_scene
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians, TopologyEdit
 
 

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.initialisation import glorot
+from dyngs.core.initialisation import glorot
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))

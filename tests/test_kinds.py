@@ -23,7 +23,8 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_config, packaged_presets
-from dyngs.conventions import RasterizeMode
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.state import tensors_of
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -37,16 +38,15 @@ from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
-from dyngs.files.write import write_image
 from dyngs.gaussians.densify import DefaultDensifier, Densifier
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.mcmc import McmcDensifier
-from dyngs.kinds import assemble, with_points
+from dyngs.io.write import write_image
 from dyngs.models.views import resolved_background, training_cameras, training_times
-from dyngs.state import tensors_of
 from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 from dyngs.training.losses import SilhouetteLoss
+from dyngs.training.new_trainer import assemble, with_points
 
 
 @pytest.fixture(scope="module")
@@ -291,7 +291,7 @@ def test_no_points_are_triangulated_for_what_is_restored(
     def refuse(*_: object) -> None:
         raise AssertionError("triangulated again")
 
-    monkeypatch.setattr("dyngs.kinds.with_first_points", refuse)
+    monkeypatch.setattr("dyngs.training.new_trainer.with_first_points", refuse)
     again = assemble(config, restored=True)
     again.restore(trainer.checkpoint())
     assert again.step().loss == trainer.step().loss

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs import metrics
-from dyngs.metrics import MAX_PSNR, Lpips, flip, load_lpips, psnr, ssim, ssim_map
+from dyngs.core import metrics
+from dyngs.core.metrics import MAX_PSNR, Lpips, flip, load_lpips, psnr, ssim, ssim_map
 
 
 def image(height: int = 24, width: int = 32, seed: int = 0) -> torch.Tensor:

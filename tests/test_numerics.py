@@ -16,11 +16,11 @@ import torch
 from scenes import random_scene, relative_error, weights
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0, RasterizeMode
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0, RasterizeMode
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.scene_space import change_coordinates, normalise_capture
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.models.renderable import Rendering

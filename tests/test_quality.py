@@ -20,9 +20,9 @@ from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.data.images.images import read_image
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.files.write import write_image
 from dyngs.human.fit import fitted_capture
 from dyngs.human.fit.capture_fit import FitEffort
+from dyngs.io.write import write_image
 
 SMALL = ("init.num_random=2000", "strategy.max_gaussians=6000")
 

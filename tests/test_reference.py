@@ -10,7 +10,7 @@ import torch
 from scenes import EXACT, REFERENCE, Limits, Scene, draw, loss, random_scene
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.state import (
+from dyngs.core.state import (
     Role,
     StateTensor,
     fields_moved_to,

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from dyngs.config import Config, DataConfig
 from dyngs.data.people_set import captures_in
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.predict.fields.people import Person, person_of
 from dyngs.human.synthetic.people import PeopleOptions, write_people
-from dyngs.human.template.body_reader import default_template
-from dyngs.human_fields.people import Person, person_of
 
 NETWORKS: dict[str, dict[str, object]] = {
     "keypoint_nerf": {"step": 0.04},

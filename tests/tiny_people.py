@@ -7,11 +7,11 @@ from functools import cache
 from pathlib import Path
 
 from dyngs.config import Config, DataConfig
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.prediction.learner import Filmed, filmed
+from dyngs.human.predict.ghg.learner import Filmed, filmed
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import default_template
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
 NET = HumanPredictorModel(

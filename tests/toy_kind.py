@@ -12,18 +12,18 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from dyngs.adam import AdamState
-from dyngs.camera import Cameras
 from dyngs.config import Config, ModelSection
+from dyngs.core.camera import Cameras
+from dyngs.core.state import Role, State, StateTensor, prefixed
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
+from dyngs.gaussians.adam import AdamState
 from dyngs.models import kind as kinds
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Kind, RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
 from dyngs.models.views import background_colour
-from dyngs.state import Role, State, StateTensor, prefixed
-from dyngs.tensor_checks import require_tensor
 
 CELLS, SAMPLES, HALF = 12, 24, 1.5
 

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 
 

@@ -15,7 +15,7 @@ static void refuse_for_memory(const std::exception_ptr& exception, void*) {
     std::rethrow_exception(exception);
   } catch (const std::bad_alloc&) {
     const std::string left = dyngs::gigabytes(dyngs::available_memory());
-    nb::object type = nb::module_::import_("dyngs.errors").attr("DyngsError");
+    nb::object type = nb::module_::import_("dyngs.core.errors").attr("DyngsError");
     PyErr_SetString(type.ptr(), ("out of memory: " + left + " are available; ask for less at once").c_str());
   }
 }

@@ -19,27 +19,27 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 
+from dyngs.api.budget.time import refitted
 from dyngs.api.from_scene import first_of
 from dyngs.api.pair_scores import PairScore, after_colour_fit, after_pose_fit, explained, plain
-from dyngs.budget.time import refitted
 from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
 from dyngs.config.io import load_config, packaged_preset
+from dyngs.core.errors import DyngsError, counted
+from dyngs.core.section import Section
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import DeformField, DynamicModel, FieldSection, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
-from dyngs.errors import DyngsError, counted
-from dyngs.files.write import write_text
-from dyngs.kinds import GaussianTrainer, assemble, with_points
+from dyngs.io.write import write_text
 from dyngs.models.kind import kind_of, motion_begins_after
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.section import Section
 from dyngs.static.keys import StaticModel
 from dyngs.training.loop import Interrupts
+from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
 
 # Of small runs: longest side of the images, px, and most Gaussians
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000

@@ -19,13 +19,13 @@ import torch
 from safetensors.torch import load, save
 
 from dyngs.config import Config
-from dyngs.errors import DyngsError
-from dyngs.kinds import build
+from dyngs.core.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.loop import Interrupts, Trainable
+from dyngs.training.new_trainer import build
 from dyngs.training.processes import EXIT_INTERRUPTED, Processes
 from dyngs.training.trainer import Trainer
 

@@ -6,13 +6,13 @@ from __future__ import annotations
 import torch
 
 from dyngs.config import AutoColour, Config, FixedStrategy, SceneInit, ShColour
+from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.capture import Capture
-from dyngs.errors import DyngsError, counted, show
 from dyngs.gaussians.start import FirstGaussians
+from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.splat_file import with_degree
 from dyngs.models.kind import kind_of
 from dyngs.runs.opened import open_scene
-from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.splat_file import with_degree
 from dyngs.static.scene import StaticScene
 
 

@@ -7,18 +7,18 @@ from pathlib import Path
 
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import DataConfig
+from dyngs.core.camera import Cameras
+from dyngs.core.state import State
 from dyngs.data import read
 from dyngs.data.capture import Capture
 from dyngs.data.scene_space import change_coordinates
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
+from dyngs.io.formats.similarity import Similarity
 from dyngs.models.renderable import TimeStep
 from dyngs.runs.opened import open_scene
-from dyngs.splats.similarity import Similarity
-from dyngs.state import State
 
 
 def load(path: Path | str) -> GaussianScene:

@@ -8,13 +8,13 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.kinds import GaussianTrainer
-from dyngs.metrics import psnr
 from dyngs.models.renderable import Rendering
 from dyngs.models.views import background_colour
 from dyngs.training.corrections.camera_refinement import fitted_to_image
+from dyngs.training.new_trainer import GaussianTrainer
 
 EXPLAINED = 0.8
 """Fraction of the pixels of a view that count: those where the smaller of two models' errors is

@@ -10,11 +10,10 @@ from pathlib import Path
 
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.errors import DyngsError, show
-from dyngs.files.outputs import new_folder
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, show
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.kinds import assemble
+from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.prediction import Predictor, named_views
@@ -23,6 +22,7 @@ from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import require_empty
 from dyngs.runs.network_file import published_network, read_network
+from dyngs.training.new_trainer import assemble
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,21 @@ from dataclasses import replace
 from pathlib import Path
 
 from dyngs.api.train import num_cores, train
+from dyngs.compress.prune.search import MOST_HELD_OUT, Promise, Search
+from dyngs.compress.storage.file import write_scene
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
+from dyngs.core.errors import DyngsError, show
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import require_folder
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, show
 from dyngs.export.scene_file import write_scene_file
-from dyngs.files.outputs import new_folder
-from dyngs.kinds import GaussianTrainer, assemble
+from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.models.renderable import Posable
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.search import MOST_HELD_OUT, Promise, Search
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -37,7 +37,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, require_empty
 from dyngs.runs.frame import FRAME_NAME
 from dyngs.runs.log import LOG_NAME
-from dyngs.storage.file import write_scene
+from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise
 

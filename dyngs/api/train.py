@@ -13,31 +13,30 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from dyngs.api.budget.cost import CostMeter
+from dyngs.api.budget.count import count_limit
+from dyngs.api.budget.run import LimitedRun
+from dyngs.api.budget.size import has_file, write_within
+from dyngs.api.budget.time import Deadline, fit_to_time
 from dyngs.api.choose import Choice, choose, write_choices
 from dyngs.api.following import Leader
 from dyngs.api.from_scene import first_of, settled
-from dyngs.budget.cost import CostMeter
-from dyngs.budget.count import count_limit
-from dyngs.budget.run import LimitedRun
-from dyngs.budget.size import has_file, write_within
-from dyngs.budget.time import Deadline, fit_to_time
 from dyngs.capture.unposed import with_poses
+from dyngs.compress.prune.floaters import FloaterRemoval
+from dyngs.compress.prune.stage import PruneStage
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, as_word, counted, show, warn
 from dyngs.data.capture import Capture
 from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
-from dyngs.errors import DyngsError, as_word, counted, show, warn
 from dyngs.evaluate.report import evaluate_run
-from dyngs.files.lock import Held, writing
 from dyngs.gaussians.start import FirstGaussians
-from dyngs.kinds import build
+from dyngs.io.lock import Held, writing
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.kind import HasBody, HasGaussians, Moves, Predicts, capability, kind_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.floaters import FloaterRemoval
-from dyngs.prune.stage import PruneStage
 from dyngs.runs.capture_record import changed_files, named, write_record
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -73,6 +72,7 @@ from dyngs.training.extend import told, with_length
 from dyngs.training.limits import require_possible, shared
 from dyngs.training.loop import Interrupts, Loop
 from dyngs.training.memory import memory_forecasts, require_room
+from dyngs.training.new_trainer import build
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 

@@ -15,12 +15,12 @@ import torch
 from scipy import ndimage
 
 from dyngs.capture.multi_video.films import STANDS, displaced_by
+from dyngs.core.errors import DyngsError, show
 from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, show
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 NOISE = 1.5  # least standard deviation of the background that is expected, grey levels
 LOW, HIGH = 5.0, 12.0

@@ -36,7 +36,7 @@ from dyngs.data.geometry import camera_center, projected, times_seen
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.scene_space import cube_half_side, outside_of_cube, points_in_frusta
 from dyngs.data.times import evenly_spaced
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 if TYPE_CHECKING:
     import pycolmap

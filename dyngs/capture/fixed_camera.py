@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
@@ -15,9 +16,8 @@ from dyngs.data.images.images import SUFFIXES, files_in, read_header
 from dyngs.data.images.video import colour_notes
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import check_size, images_up_to, inside, staying_within
-from dyngs.files.wrong_place import VIDEO_SUFFIXES
+from dyngs.io.containment import check_size, images_up_to, inside, staying_within
+from dyngs.io.wrong_place import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
 """``Capture.format`` of what is read here."""

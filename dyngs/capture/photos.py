@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.images.colour_space import UNSPECIFIED, ColourTags, to_srgb
 from dyngs.data.images.images import (
     END_MARKERS,
@@ -27,10 +28,9 @@ from dyngs.data.images.images import (
     read_mask,
 )
 from dyngs.data.images.video import DECODER_VERSION, VIDEO_SUFFIXES
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import check_size, inside
-from dyngs.files.write import atomic_file, write_image
-from dyngs.files.wrong_place import PHOTO_SUFFIXES
+from dyngs.io.containment import check_size, inside
+from dyngs.io.write import atomic_file, write_image
+from dyngs.io.wrong_place import PHOTO_SUFFIXES
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 """What phones write; read by pillow-heif."""

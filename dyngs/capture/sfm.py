@@ -28,7 +28,8 @@ from dyngs.capture.sfm_matches import (
     without_movers,
 )
 from dyngs.capture.sfm_work import SfmOptions, SfmTask, quiet_colmap, working
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, counted
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import (
     colour_notes,
@@ -39,11 +40,10 @@ from dyngs.data.images.video import (
 )
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import write_seconds
-from dyngs.errors import DyngsError, counted
-from dyngs.files.containment import images_up_to, inside, staying_within
-from dyngs.files.fields import first_few, read_json_object
-from dyngs.files.outputs import require_new_folder
-from dyngs.files.write import write_image, write_text
+from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.fields import first_few, read_json_object
+from dyngs.io.outputs import require_new_folder
+from dyngs.io.write import write_image, write_text
 
 _NUM_FRAMES = 100
 _SMALL_ANGLE_DEG = 1.0

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dyngs.capture.photos import Photo
-from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.errors import DyngsError
-from dyngs.files.containment import MAX_MEGAPIXELS
-from dyngs.files.lock import LOCK_NAME, writing
-from dyngs.files.write import write_text
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError
+from dyngs.io.containment import MAX_MEGAPIXELS
+from dyngs.io.lock import LOCK_NAME, writing
+from dyngs.io.write import write_text
 
 if TYPE_CHECKING:
     import pycolmap

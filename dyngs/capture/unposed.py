@@ -13,14 +13,14 @@ from dyngs.capture.photos import digest_of, photos_below
 from dyngs.capture.sfm import estimate_poses
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.config import DataConfig
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, as_word, counted, reading, show
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
-from dyngs.errors import DyngsError, as_word, counted, reading, show
-from dyngs.files.lock import make_once
-from dyngs.files.outputs import note_sources
-from dyngs.files.temporary import cache_folder
-from dyngs.files.wrong_place import command_for
+from dyngs.io.lock import make_once
+from dyngs.io.outputs import note_sources
+from dyngs.io.temporary import cache_folder
+from dyngs.io.wrong_place import command_for
 
 FEWEST_PHOTOS = 3
 

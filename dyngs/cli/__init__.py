@@ -44,8 +44,8 @@ from dyngs.cli import (
     view,
 )
 from dyngs.cli.arguments import follows_links, require_outputs_apart
-from dyngs.errors import DyngsError, NoCaptureError, printable, quoted, require_name
-from dyngs.files.containment import following_links_of_runs
+from dyngs.core.errors import DyngsError, NoCaptureError, printable, quoted, require_name
+from dyngs.io.containment import following_links_of_runs
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130

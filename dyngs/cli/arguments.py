@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from dyngs.errors import DyngsError, show, warn
+from dyngs.core.errors import DyngsError, show, warn
 
 if TYPE_CHECKING:
     import torch
@@ -234,7 +234,7 @@ def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.N
     """Check that no output of a command would replace what it reads, as far as its arguments and
     overrides say.
 
-    Raises DyngsError: see ``dyngs.files.outputs.Inputs.require_output``.
+    Raises DyngsError: see ``dyngs.io.outputs.Inputs.require_output``.
     """
     words = [word.partition("=") for word in getattr(arguments, "overrides", ())]
     outputs = [
@@ -302,7 +302,7 @@ def run_of_scene_file(path: Path) -> Path:
         DyngsError: the file has another name.
     """
     if path.is_dir():
-        from dyngs.splats.formats import format_to_read, sog_meta
+        from dyngs.io.formats.formats import format_to_read, sog_meta
 
         return path if format_to_read(path) is None else sog_meta(path) or path
     if path.suffix.lower() != ".dyngs" or not path.is_file():

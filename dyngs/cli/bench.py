@@ -39,7 +39,7 @@ def run_rasterize(arguments: argparse.Namespace) -> int:
     """Measure the rasterizer and print the table."""
     import torch
 
-    from dyngs.bench import (
+    from dyngs.cli.kernel_bench import (
         bench_rasterize,
         format_report,
         garden_workload,

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.tables import numbers_table, print_tables
-from dyngs.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, counted, show
 
 if TYPE_CHECKING:
-    from dyngs.compare.plan import Bench
+    from dyngs.study.compare.plan import Bench
 
 _EPILOG = """\
 examples:
@@ -110,11 +110,11 @@ def run(arguments: argparse.Namespace) -> int:
         return _predict(arguments)
     if arguments.spread:
         raise DyngsError("--spread goes with --predict")
-    from dyngs.compare.bench import compare, is_finished, require_same_comparison
-    from dyngs.compare.plan import planned
-    from dyngs.compare.report import about, table_cells, table_rows, write_report
-    from dyngs.files.lock import writing
+    from dyngs.io.lock import writing
     from dyngs.runs.inputs import inputs_of
+    from dyngs.study.compare.bench import compare, is_finished, require_same_comparison
+    from dyngs.study.compare.plan import planned
+    from dyngs.study.compare.report import about, table_cells, table_rows, write_report
     from dyngs.study.plots import MISSING, can_plot
 
     bench = _bench(arguments)
@@ -153,8 +153,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _predict(arguments: argparse.Namespace) -> int:
     """Compare networks that predict people; with --minutes an avatar that is trained on the same
     images, too."""
-    from dyngs.compare.people import STEM, PeopleBench, compare_people
     from dyngs.ops.native import kernel_threads
+    from dyngs.study.compare.people import STEM, PeopleBench, compare_people
 
     for option in ("steps", "max_mb", "ray"):
         if getattr(arguments, option) is not None:
@@ -182,7 +182,7 @@ def _predict(arguments: argparse.Namespace) -> int:
 
 
 def _bench(arguments: argparse.Namespace) -> Bench:
-    from dyngs.compare.plan import Bench, Limit
+    from dyngs.study.compare.plan import Bench, Limit
 
     if arguments.minutes is None and arguments.steps is None and arguments.max_mb is None:
         raise DyngsError(

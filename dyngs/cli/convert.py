@@ -13,7 +13,7 @@ from dyngs.cli.arguments import (
     print_written,
 )
 from dyngs.cli.splats import add_axes, print_redrawn
-from dyngs.errors import counted
+from dyngs.core.errors import counted
 
 _EPILOG = """\
 examples:
@@ -45,7 +45,13 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from dyngs.export.redrawn import compare_splats
-    from dyngs.splats.formats import chosen_variant, format_of, read_splats, upright, write_splats
+    from dyngs.io.formats.formats import (
+        chosen_variant,
+        format_of,
+        read_splats,
+        upright,
+        write_splats,
+    )
 
     # before a large file is read
     own = chosen_variant(format_of(arguments.target), arguments.spz_version, arguments.compress)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError, as_word, counted, show
+from dyngs.core.errors import DyngsError, as_word, counted, show
 
 if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
@@ -256,7 +256,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 def _inspect_videos(arguments: argparse.Namespace) -> int:
     from dyngs.capture.inspection.video_report import video_report
-    from dyngs.files.containment import images_up_to
+    from dyngs.io.containment import images_up_to
 
     if arguments.image is not None:
         raise DyngsError(
@@ -353,8 +353,8 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
-    from dyngs.human.detection.find_person import write_found_person
-    from dyngs.human.detection.mediapipe import MediaPipe
+    from dyngs.human.detect.find_person import write_found_person
+    from dyngs.human.detect.mediapipe import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
@@ -383,9 +383,9 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
 
 def run_motion(arguments: argparse.Namespace) -> int:
     """Convert the motion and print a summary."""
+    from dyngs.human.body.body_reader import default_template, read_body
     from dyngs.human.motion.amass import write_amass
     from dyngs.human.motion.retarget import read_motion
-    from dyngs.human.template.body_reader import default_template, read_body
 
     out: Path = arguments.out
     if out.exists():
@@ -413,7 +413,7 @@ def _summary(motion: Motion) -> str:
 def run_synth(arguments: argparse.Namespace) -> int:
     """Write the capture and print the command that trains on it."""
     from dyngs.data.synthetic import captures as synthetic
-    from dyngs.files.outputs import require_new_folder
+    from dyngs.io.outputs import require_new_folder
 
     if arguments.scene == "people":
         return _synth_people(arguments)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
-from dyngs.errors import as_word
+from dyngs.core.errors import as_word
 
 
 def add_parser(commands: Commands) -> None:
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo and print the results and the paths of the files."""
     from rich.console import Console
 
-    from dyngs.demo import DemoOptions, result_table, run_demo
+    from dyngs.cli.demo_run import DemoOptions, result_table, run_demo
 
     result = run_demo(arguments.out, DemoOptions(steps=arguments.steps, threads=arguments.threads))
     Console().print(result_table(result))

@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from dyngs.cli.arguments import Commands, add_command
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 _LINK = re.compile(r"\[([^]]+)\]\(([^)#\s:]+)(?:#[^)\s]*)?\)")
 _FRONT = "README"

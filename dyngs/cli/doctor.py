@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from dyngs.cli.arguments import Commands, add_command
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 _SAME = (
     "torch",

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.errors import DyngsError, as_word, show
+from dyngs.core.errors import DyngsError, as_word, show
 
 if TYPE_CHECKING:
-    from dyngs.edit.scene_file import Edits
+    from dyngs.export.edit.scene_file import Edits
 
 _NEGATIVE = re.compile(r"-([xyz]$|\.?\d)")  # values of options that begin with a minus
 _EXIF = Path("exif")
@@ -86,8 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Edit, and print what was done and how the file differs from the scene."""
     with heavy_imports():
         from dyngs.cli.splats import print_redrawn
-        from dyngs.edit.crop import mesh_path
-        from dyngs.edit.scene_file import edit_scene
+        from dyngs.export.edit.crop import mesh_path
+        from dyngs.export.edit.scene_file import edit_scene
 
     source = args.run_of_scene_file(arguments.source)
     mesh = None if arguments.crop is None else mesh_path(arguments.crop)
@@ -111,9 +111,9 @@ def _note(text: str) -> None:
 def _edits(arguments: argparse.Namespace) -> Edits:
     """Return what the options ask for. Raises DyngsError: they do not go together, or are no points
     or numbers."""
-    from dyngs.edit.crop import region_of
-    from dyngs.edit.frame import Frame, direction, geo_frame, number, point, scale_of
-    from dyngs.edit.scene_file import Edits
+    from dyngs.export.edit.crop import region_of
+    from dyngs.export.edit.frame import Frame, direction, geo_frame, number, point, scale_of
+    from dyngs.export.edit.scene_file import Edits
 
     alone = [
         f"--{name}" for name in ("up", "origin", "scale") if getattr(arguments, name) is not None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.errors import counted, escaped
+from dyngs.core.errors import counted, escaped
 
 if TYPE_CHECKING:
     from rich.table import Table

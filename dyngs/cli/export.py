@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_redrawn
-from dyngs.errors import DyngsError, as_word, counted
+from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
@@ -226,7 +226,7 @@ def _kind(arguments: argparse.Namespace) -> str:
 
     Raises DyngsError: an unknown suffix, or one of another format than --format.
     """
-    from dyngs.splats.formats import all_suffixes, known_format
+    from dyngs.io.formats.formats import all_suffixes, known_format
 
     out = arguments.out
     stated = arguments.format
@@ -269,8 +269,8 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
-    from dyngs.camera_paths.path import parse_times
     from dyngs.evaluate.temporal import clamped_times
+    from dyngs.export.camera_paths.path import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
@@ -298,7 +298,7 @@ def _export_splats(
         write_run_splats,
         writing_of,
     )
-    from dyngs.splats.formats import chosen_variant, format_named, known_format, read_splats
+    from dyngs.io.formats.formats import chosen_variant, format_named, known_format, read_splats
 
     own = format_named(kind)
     part = _part(arguments)
@@ -414,8 +414,8 @@ def _export_tracks(
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
     """Write the run as a .dyngs file and print how much its images change."""
+    from dyngs.compress.storage.measure import SMALLEST_CHANGE
     from dyngs.export.scene_file import write_scene_file
-    from dyngs.storage.measure import SMALLEST_CHANGE
 
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
@@ -473,8 +473,8 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
     from dyngs.export.body_nodes import SUFFIX, write_bodies
     from dyngs.export.redrawn import compare_run
     from dyngs.export.splat_files import writing_of
+    from dyngs.io.formats.formats import format_named, read_splats
     from dyngs.runs.opened import open_scene
-    from dyngs.splats.formats import format_named, read_splats
 
     if arguments.format not in (None, "glb"):
         raise DyngsError(f"--bodies goes with --format glb, not with {arguments.format}")

@@ -6,7 +6,7 @@ import argparse
 
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import as_word, counted, show
+from dyngs.core.errors import as_word, counted, show
 
 _EPILOG = """\
 examples:

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.errors import DyngsError, as_word
+from dyngs.core.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from dyngs.compress.prune.search import Promise
     from dyngs.evaluate.comparison import Cost
-    from dyngs.prune.search import Promise
 
 MAX_LOSS = 0.2
 _EPILOG = """\

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError, counted
-from dyngs.files.wrong_place import command_for
+from dyngs.core.errors import DyngsError, counted
+from dyngs.io.wrong_place import command_for
 
 if TYPE_CHECKING:
     from dyngs.export.chosen_path import PathOptions
@@ -200,7 +200,7 @@ def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 
 def _path_options(arguments: argparse.Namespace) -> PathOptions:
-    from dyngs.camera_paths.path import parse_times
+    from dyngs.export.camera_paths.path import parse_times
     from dyngs.export.chosen_path import PathOptions
 
     times = None if arguments.time is None else (arguments.time,)

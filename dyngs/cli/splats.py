@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from dyngs.export.redrawn import Redrawn
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
-"""Names of ``dyngs.splats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not
+"""Names of ``dyngs.io.formats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not
 import them."""
 MOVING = "4dgs"
 """Name and suffix of the format of moving Gaussians."""

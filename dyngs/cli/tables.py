@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dyngs.errors import escaped
+from dyngs.core.errors import escaped
 
 if TYPE_CHECKING:
     from rich.table import Table

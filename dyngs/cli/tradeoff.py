@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.tables import numbers_table, print_tables
-from dyngs.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, counted, show
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.tradeoff.measure import Measurement
-    from dyngs.tradeoff.table import TableRow
+    from dyngs.study.tradeoff.measure import Measurement
+    from dyngs.study.tradeoff.table import TableRow
 
 _EPILOG = """\
 examples:
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     commands."""
     from contextlib import nullcontext
 
-    from dyngs.files.lock import writing
+    from dyngs.io.lock import writing
 
     target = Path(arguments.target)
     out: Path | None = arguments.out or (target / "tradeoff" if target.is_dir() else None)
@@ -83,12 +83,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     from dyngs.study.plots import MISSING, can_plot
-    from dyngs.tradeoff.pareto import exchange_rates
-    from dyngs.tradeoff.report import EXCHANGE_HEAD, exchange_cells, write_report
-    from dyngs.tradeoff.sweep import Plan, sweep
-    from dyngs.tradeoff.table import choose, parse_goal, parse_requirements, table_rows
-    from dyngs.tradeoff.variant_runs import VariantRuns, write_chosen
-    from dyngs.tradeoff.variants import parse_variations
+    from dyngs.study.tradeoff.pareto import exchange_rates
+    from dyngs.study.tradeoff.report import EXCHANGE_HEAD, exchange_cells, write_report
+    from dyngs.study.tradeoff.sweep import Plan, sweep
+    from dyngs.study.tradeoff.table import choose, parse_goal, parse_requirements, table_rows
+    from dyngs.study.tradeoff.variant_runs import VariantRuns, write_chosen
+    from dyngs.study.tradeoff.variants import parse_variations
 
     is_run = Path(arguments.target).is_dir()
     variations = parse_variations(arguments.vary, trains=arguments.train or not is_run)

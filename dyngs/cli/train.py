@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
-from dyngs.errors import DyngsError, as_word, counted, show
+from dyngs.core.errors import DyngsError, as_word, counted, show
 
 if TYPE_CHECKING:
     from dyngs.config import Config

@@ -7,7 +7,7 @@ import threading
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.errors import DyngsError, show
+from dyngs.core.errors import DyngsError, show
 
 _EPILOG = """\
 examples:

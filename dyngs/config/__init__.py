@@ -13,7 +13,7 @@ from dyngs.config.keys.strategy import (
     Strategy,
 )
 from dyngs.config.keys.train import TrainConfig
-from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
+from dyngs.core.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
 
 __all__ = [
     "AutoColour",

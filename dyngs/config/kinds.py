@@ -12,8 +12,8 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Protocol, cast
 
-from dyngs.errors import DyngsError
-from dyngs.section import ModelSection
+from dyngs.core.errors import DyngsError
+from dyngs.core.section import ModelSection
 
 GROUP = "dyngs.models"
 
@@ -21,14 +21,14 @@ OWN = {
     "static": "dyngs.static.kind:STATIC",
     "dynamic": "dyngs.deform.kind:DYNAMIC",
     "human": "dyngs.human.avatar.kind:HUMAN",
-    "human_predictor": "dyngs.human.prediction.kind:HUMAN_PREDICTOR",
-    "gps": "dyngs.gps.kind:GPS",
-    "keypoint_nerf": "dyngs.human_fields.kind:KEYPOINT_NERF",
-    "eg_human_nerf": "dyngs.human_fields.kind:EG_HUMAN_NERF",
-    "predicted_field": "dyngs.human_fields.kind:PREDICTED_FIELD",
-    "ngp": "dyngs.fields.kind:NGP",
-    "nerf": "dyngs.fields.kind:NERF",
-    "bg_triangle": "dyngs.triangles.kind:BG_TRIANGLE",
+    "human_predictor": "dyngs.human.predict.ghg.kind:HUMAN_PREDICTOR",
+    "gps": "dyngs.human.predict.gps.kind:GPS",
+    "keypoint_nerf": "dyngs.human.predict.fields.kind:KEYPOINT_NERF",
+    "eg_human_nerf": "dyngs.human.predict.fields.kind:EG_HUMAN_NERF",
+    "predicted_field": "dyngs.human.predict.fields.kind:PREDICTED_FIELD",
+    "ngp": "dyngs.baselines.fields.kind:NGP",
+    "nerf": "dyngs.baselines.fields.kind:NERF",
+    "bg_triangle": "dyngs.baselines.triangles.kind:BG_TRIANGLE",
 }
 """Entry points of dyngs itself, which a source tree that is not installed has, too."""
 

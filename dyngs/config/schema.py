@@ -20,7 +20,7 @@ from pydantic_core import PydanticUndefined
 
 from dyngs.config import Config
 from dyngs.config.kinds import is_kind, kind_names, section_of_kind
-from dyngs.section import ModelSection
+from dyngs.core.section import ModelSection
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from dyngs.errors import DyngsError, printable, reason
+from dyngs.core.errors import DyngsError, printable, reason
 
 MAX_BYTES = 2**18
 """Largest size of a preset or an override; the longest that we know has 5 KB."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import (
     BODY_KINDS,
     BodyFrames,
@@ -22,10 +23,9 @@ from dyngs.data.capture import (
     all_views,
     each_view,
 )
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import staying_within
-from dyngs.files.fields import LARGEST, first_few, float_array, numbers_of
-from dyngs.files.numpy_files import read_npz
+from dyngs.io.containment import staying_within
+from dyngs.io.fields import LARGEST, first_few, float_array, numbers_of
+from dyngs.io.numpy_files import read_npz
 
 
 def body_frames(

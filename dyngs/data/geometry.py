@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
-from dyngs.errors import DyngsError
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 LARGEST = 1e12

@@ -12,8 +12,9 @@ from threading import Lock
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import DataConfig
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.data.decoding import Ahead, Decoded
 from dyngs.data.geometry import scaled_intrinsics
@@ -29,8 +30,7 @@ from dyngs.data.images.images import (
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.smaller_images import view_size
-from dyngs.errors import DyngsError
-from dyngs.files.containment import images_up_to
+from dyngs.io.containment import images_up_to
 from dyngs.ops.device import CPU, gpu_memory, sent
 
 # mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding

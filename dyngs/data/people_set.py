@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.config import DataConfig
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 PEOPLE_FILE = "people.json"
 """In a set whose people lie in shards, folders of folders: the options that they were made with."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError, NoCaptureError, reading
 from dyngs.data import times
 from dyngs.data.body_frames import with_fitted_body
 from dyngs.data.capture import (
@@ -37,10 +38,9 @@ from dyngs.data.readers import (
 )
 from dyngs.data.scene_space import normalise_capture
 from dyngs.data.smaller_images import with_smaller_images
-from dyngs.errors import DyngsError, NoCaptureError, reading
-from dyngs.files.archive import is_archive, unpacked
-from dyngs.files.containment import images_up_to, inside, staying_within
-from dyngs.files.wrong_place import command_for
+from dyngs.io.archive import is_archive, unpacked
+from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.wrong_place import command_for
 
 # points with larger coordinates are dropped as mistakes; their squares would not fit into float32
 FARTHEST = 1e18

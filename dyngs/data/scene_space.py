@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from dyngs.core.section import Length
 from dyngs.data.body_frames import moved
 from dyngs.data.capture import Capture, PointCloud, View, all_views, each_view
 from dyngs.data.geometry import (
@@ -19,7 +20,6 @@ from dyngs.data.geometry import (
     times_seen,
 )
 from dyngs.data.times import evenly_spaced
-from dyngs.section import Length
 
 NEAR_PER_FOCUS = 0.25  # nearest depth, in distances from the cameras to what they look at
 FAR_PER_BASELINE = 38.0

@@ -11,7 +11,7 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Splits, View, all_views, each_view
 from dyngs.data.geometry import match_size
 from dyngs.data.images.images import header_if_readable, target_size
-from dyngs.files.find import FileFinder, shrunk_folders
+from dyngs.io.find import FileFinder, shrunk_folders
 
 
 def view_size(view: View, options: DataConfig) -> tuple[int, int]:

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, printable
 from dyngs.data.capture import Splits, View, all_views, each_view
 from dyngs.data.geometry import inverse_rigid
-from dyngs.errors import DyngsError, printable
-from dyngs.files.fields import is_number, read_json_object
-from dyngs.files.write import write_text
+from dyngs.io.fields import is_number, read_json_object
+from dyngs.io.write import write_text
 
 SECONDS_FILE = "times.json"
 """Seconds of the images of a capture, next to them: COLMAP's models have no times."""

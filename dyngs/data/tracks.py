@@ -8,11 +8,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
-from dyngs.errors import DyngsError
-from dyngs.files.containment import inside
-from dyngs.files.numpy_files import read_npz
-from dyngs.files.write import atomic_file
+from dyngs.io.containment import inside
+from dyngs.io.numpy_files import read_npz
+from dyngs.io.write import atomic_file
 
 _LARGEST = 1e6
 

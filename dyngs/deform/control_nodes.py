@@ -21,6 +21,8 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
+from dyngs.core.state import Role, State, StateTensor, moved_to, part_of, prefixed
+from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.decoder import head_sizes, offsets_of
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets
 from dyngs.deform.keys import ControlNodesField
@@ -29,8 +31,6 @@ from dyngs.deform.spline_fit import refitted
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.nodes import SPAN, node_penalties, spline_motion
-from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
-from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 NOTHING = torch.zeros(0, 3, device="cpu")
 COMPARED_TIMES = 16  # Times at which the paths of nodes are compared where some of them are to go

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from dyngs.core.initialisation import glorot
 from dyngs.deform.field import Offsets
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians.parameters import Parameters
-from dyngs.initialisation import glorot
 from dyngs.ops.perceptron import Layer, perceptron
 
 

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from dyngs.core.state import State, moved_to, part_of, prefixed
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.skinning import add_offsets_, offset_gradients
-from dyngs.state import State, moved_to, part_of, prefixed
 
 F = TypeVar("F", bound="DeformationField")
 Outer = TypeVar("Outer", bound="OuterField")

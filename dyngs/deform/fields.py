@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
+from dyngs.core.state import Role, State, part_of, with_role
+from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup
@@ -16,8 +18,6 @@ from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.keys import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
 from dyngs.deform.mlp import Mlp
 from dyngs.deform.windows import WindowedField
-from dyngs.state import Role, State, part_of, with_role
-from dyngs.tensor_checks import require_positive, require_tensor
 
 
 def new_field(

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from dyngs.section import Fraction, Positive, SceneModel, Section
+from dyngs.core.section import Fraction, Positive, SceneModel, Section
 
 COPIES_OF_MOVING = 12_000
 """Copies over time of what moves in a static model, at most, that free primitives begin with."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dyngs.core.section import SceneModel
 from dyngs.deform.keys import (
     ControlNodesField,
     DynamicModel,
@@ -12,7 +13,6 @@ from dyngs.deform.keys import (
     MlpField,
 )
 from dyngs.models.kind import ExtendsTo, HasGaussians, Moves
-from dyngs.section import SceneModel
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture

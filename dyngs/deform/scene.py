@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyngs.core.state import Role, State, StateTensor, part_of, prefixed
+from dyngs.core.tensor_checks import require_ascending, require_indices
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.deform.keys import DynamicModel
@@ -16,8 +18,6 @@ from dyngs.gaussians.filters import filter_state, filtered, stored_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, matched
 from dyngs.models.renderable import Renderable, clamped_time
-from dyngs.state import Role, State, StateTensor, part_of, prefixed
-from dyngs.tensor_checks import require_ascending, require_indices
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.training import DeformSchedule
-from dyngs.errors import DyngsError
 from dyngs.gaussians.schedule import Rates
 from dyngs.models.schedule import Length
 

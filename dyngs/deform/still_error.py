@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced, static_cameras

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import Role, State, with_role
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
@@ -38,7 +39,6 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
-from dyngs.state import Role, State, with_role
 
 SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25

@@ -12,11 +12,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from dyngs.core.state import Role, State, prefixed
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
-from dyngs.state import Role, State, prefixed
 
 EDGE = 0.05  # Time over which the logit falls by 1 outside of a window, in units of the clip
 # Edges by which an open window is longer than the clip, at either end: slopes can still be felt

@@ -10,12 +10,12 @@ from statistics import fmean
 import numpy as np
 import torch
 
+from dyngs.core.metrics import psnr
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import parameter_megabytes, scene_of_split, split_views
 from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
-from dyngs.metrics import psnr
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU

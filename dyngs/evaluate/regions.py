@@ -11,10 +11,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dyngs.core.metrics import psnr
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.metrics import psnr
 
 RegionMetric = Literal["psnr_foreground", "psnr_moving", "psnr_static"]
 REGION_METRICS: tuple[RegionMetric, ...] = ("psnr_foreground", "psnr_moving", "psnr_static")

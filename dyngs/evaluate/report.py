@@ -12,19 +12,19 @@ from typing import Any
 
 import torch
 
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.tracks import read_true_tracks
-from dyngs.errors import DyngsError
 from dyngs.evaluate.regions import REGION_METRICS, Regions
 from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import Drawing, PoseScores, ViewScore, means_of, score_views
-from dyngs.files.write import write_text
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.metrics import Lpips, LpipsNet, load_lpips, psnr
+from dyngs.io.write import write_text
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.kind import Moves, capability
 from dyngs.models.renderable import Renderable

@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import MetricValue
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import static_cameras
-from dyngs.errors import DyngsError
 from dyngs.evaluate.view_scores import Drawing
-from dyngs.metrics import MetricValue
 
 MAX_MOMENTS = 60  # number of training times up to which flicker is measured at all of them
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.times import SAME_TIME
 from dyngs.data.tracks import TRACKS_FILE, TrueTracks

@@ -19,14 +19,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import Lpips, flip, psnr, ssim
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
 from dyngs.evaluate.regions import Regions
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.human.avatar.scene import avatar_of
-from dyngs.metrics import Lpips, flip, psnr, ssim
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
 from dyngs.ops.device import finish

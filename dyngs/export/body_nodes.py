@@ -11,18 +11,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from dyngs.core.errors import DyngsError
 from dyngs.deform.bodies.field import BodyField, bodies_of
 from dyngs.deform.scene import field_scene_of
-from dyngs.errors import DyngsError
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, splats_at
-from dyngs.files.gltf import GlbDocument
-from dyngs.files.write import atomic_file
-from dyngs.ops.quaternions import shorter_ways, unit_quats
-from dyngs.runs.inputs import inputs_of
-from dyngs.runs.opened import Opened
-from dyngs.splats.gltf import EXTENSION, add_gaussians
-from dyngs.splats.similarity import Similarity
-from dyngs.splats.splat_file import (
+from dyngs.io.formats.gltf import EXTENSION, add_gaussians
+from dyngs.io.formats.similarity import Similarity
+from dyngs.io.formats.splat_file import (
     SplatFile,
     header_comments,
     offset_notes,
@@ -30,6 +25,11 @@ from dyngs.splats.splat_file import (
     unit_rotations,
     with_degree,
 )
+from dyngs.io.gltf import GlbDocument
+from dyngs.io.write import atomic_file
+from dyngs.ops.quaternions import shorter_ways, unit_quats
+from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import Opened
 
 SUFFIX = ".glb"
 _MOST_DEGREE = 3  # of harmonics in the file

@@ -12,10 +12,10 @@ import numpy as np
 
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
-from dyngs.files.write import atomic_file, write_text
+from dyngs.io.formats.ply_header import double_ply
+from dyngs.io.formats.similarity import Similarity
+from dyngs.io.write import atomic_file, write_text
 from dyngs.runs.inputs import inputs_of
-from dyngs.splats.ply_header import double_ply
-from dyngs.splats.similarity import Similarity
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

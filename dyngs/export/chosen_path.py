@@ -9,10 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.along import path_along
-from dyngs.camera_paths.orbit import frame_orbit_for_points, orbit_of, orbit_path, spiral_path
-from dyngs.camera_paths.path import (
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture, View
+from dyngs.export.camera_paths.along import path_along
+from dyngs.export.camera_paths.orbit import (
+    frame_orbit_for_points,
+    orbit_of,
+    orbit_path,
+    spiral_path,
+)
+from dyngs.export.camera_paths.path import (
     CameraPath,
     path_file,
     read_path,
@@ -20,16 +27,14 @@ from dyngs.camera_paths.path import (
     static_path,
     with_times,
 )
-from dyngs.data.capture import Capture, View
-from dyngs.errors import DyngsError
 from dyngs.export.images import file_stems
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import avatar_of
-from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.io.formats.rotation import AXES
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views
-from dyngs.splats.rotation import AXES
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)

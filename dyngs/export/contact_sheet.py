@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dyngs.data.images.colour_space import srgb_encoded
-from dyngs.files.write import to_uint8
+from dyngs.io.write import to_uint8
 
 GAP = 6
 LABEL_HEIGHT = 22

@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.path import CameraPath
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
-from dyngs.errors import DyngsError
+from dyngs.export.camera_paths.path import CameraPath
 from dyngs.export.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.export.video import VideoWriter
-from dyngs.files.outputs import Inputs
-from dyngs.files.write import to_uint8, write_image
-from dyngs.metrics import psnr
+from dyngs.io.outputs import Inputs
+from dyngs.io.write import to_uint8, write_image
 from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.ops.device import CPU
 from dyngs.runs.inputs import inputs_of

@@ -8,17 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.orbit import frame_orbit_for_points
-from dyngs.camera_paths.path import resize_cameras
-from dyngs.errors import DyngsError, counted
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError, counted
+from dyngs.core.metrics import psnr
+from dyngs.export.camera_paths.orbit import frame_orbit_for_points
+from dyngs.export.camera_paths.path import resize_cameras
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.metrics import psnr
+from dyngs.io.formats.formats import Written, read_splats
+from dyngs.io.formats.rotation import AXES
+from dyngs.io.formats.splat_file import SplatFile, drawing_options, splat_options
 from dyngs.runs.opened import Opened
-from dyngs.splats.formats import Written, read_splats
-from dyngs.splats.rotation import AXES
-from dyngs.splats.splat_file import SplatFile, drawing_options, splat_options
 
 VIEWS = 4
 _LONGEST_SIDE = 240

@@ -9,19 +9,19 @@ from pathlib import Path
 
 from torch import Tensor
 
+from dyngs.compress.storage.file import decoded, encoded, write_scene
+from dyngs.compress.storage.measure import storage_plan
+from dyngs.compress.storage.precision import GREY_LEVELS, Precision, mean_square_change
+from dyngs.compress.storage.tensors import FIELD, drawable
 from dyngs.config.io import load_resolved
-from dyngs.errors import DyngsError
-from dyngs.kinds import restored_model
+from dyngs.core.errors import DyngsError
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.frame import read_frame, write_frame
 from dyngs.runs.inputs import inputs_of
-from dyngs.storage.file import decoded, encoded, write_scene
-from dyngs.storage.measure import storage_plan
-from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
-from dyngs.storage.tensors import FIELD, drawable
+from dyngs.training.new_trainer import restored_model
 
 MISSED = 1.05
 """A file whose images change by so many times what is allowed is not written; less is rounding of

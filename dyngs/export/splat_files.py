@@ -15,15 +15,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from dyngs.conventions import SH_C0
-from dyngs.errors import DyngsError, counted
-from dyngs.files.temporary import temporary_folder_beside
-from dyngs.files.write import atomic_file
+from dyngs.core.conventions import SH_C0
+from dyngs.core.errors import DyngsError, counted
 from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.runs.inputs import inputs_of
-from dyngs.runs.opened import Opened
-from dyngs.splats.formats import (
+from dyngs.io.formats.formats import (
     Format,
     Written,
     fitted,
@@ -32,10 +28,10 @@ from dyngs.splats.formats import (
     turned_file,
     write_splats,
 )
-from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
-from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.sog_levels import write_sog_levels
-from dyngs.splats.splat_file import (
+from dyngs.io.formats.rotation import AXES, axis_of, nearest_axis, turn_between
+from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.sog_levels import write_sog_levels
+from dyngs.io.formats.splat_file import (
     SplatFile,
     drawable,
     from_linear,
@@ -43,6 +39,10 @@ from dyngs.splats.splat_file import (
     offset_notes,
     unit_rotations,
 )
+from dyngs.io.temporary import temporary_folder_beside
+from dyngs.io.write import atomic_file
+from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import Opened
 
 Part = Literal["all", "moving", "still"]
 

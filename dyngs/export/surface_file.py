@@ -12,26 +12,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.baselines.fields import mesh as fields
+from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.scene import FieldScene
+from dyngs.baselines.fields.space import space_of
+from dyngs.baselines.triangles import mesh as triangles
+from dyngs.baselines.triangles.scene import TriangleScene
+from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, writing_of
-from dyngs.fields import mesh as fields
-from dyngs.fields.keys import NgpModel
-from dyngs.fields.scene import FieldScene
-from dyngs.fields.space import space_of
-from dyngs.files.write import atomic_file
 from dyngs.gaussians import surface as gaussians
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.formats.ply_header import double_ply
+from dyngs.io.formats.similarity import Similarity, far_offset
+from dyngs.io.write import atomic_file
 from dyngs.models.surface import Surface
 from dyngs.models.views import training_cameras
 from dyngs.ops.patches import MOST_SEGMENTS
 from dyngs.ops.rays import Space
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.ply_header import double_ply
-from dyngs.splats.similarity import Similarity, far_offset
-from dyngs.triangles import mesh as triangles
-from dyngs.triangles.scene import TriangleScene
 
 SUFFIXES = ".ply", ".glb", ".obj"
 VIEWS = 150  # Of the training views, whose depths are averaged for a surface of Gaussians

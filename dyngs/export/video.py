@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.errors import DyngsError
-from dyngs.files.temporary import temporary_beside
-from dyngs.files.write import require_replaceable
+from dyngs.core.errors import DyngsError
+from dyngs.io.temporary import temporary_beside
+from dyngs.io.write import require_replaceable
 
 
 class VideoWriter:

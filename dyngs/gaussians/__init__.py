@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields, replace
 import torch
 from torch import Tensor
 
-from dyngs.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
-from dyngs.tensor_checks import require_tensor
+from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
+from dyngs.core.tensor_checks import require_tensor
 
 LARGEST_LOG_SCALE = 88  # Natural logarithm of the largest size that float32 can hold, rounded down
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from dyngs.config import DefaultStrategy
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import rotate
-from dyngs.tensor_checks import require_tensor
 
 DENSE_FRACTION = 0.01  # Scale, in reaches, up to which Gaussians are cloned; larger ones are split
 # Scale, in reaches, from which Gaussians are removed after the first opacity reset

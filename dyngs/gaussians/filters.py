@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import Role, State, StateTensor
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians
-from dyngs.state import Role, State, StateTensor
-from dyngs.tensor_checks import require_tensor
 
 FILTER_VARIANCE = 0.2  # Variance of the filter in squared sampling intervals
 NEAR = 0.2

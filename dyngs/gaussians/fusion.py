@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 
 BEHIND = 3.0  # Cells behind a surface that still count as seen
 AT_ONCE = 1 << 21  # Points of the grid that are looked at together

@@ -20,7 +20,7 @@ from dyngs.config import (
     SceneInit,
     Strategy,
 )
-from dyngs.conventions import SH_C0, num_sh_terms
+from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import Capture, View
 from dyngs.data.scene_space import (
     MIN_VIEWS,

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from dyngs.config import AutoColour, DefaultStrategy, SceneInit, SceneModel
-from dyngs.conventions import SH_C0, RasterizeMode
+from dyngs.core.conventions import SH_C0, RasterizeMode
+from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
@@ -29,7 +30,6 @@ from dyngs.models.model import Drawn, Loss, Model, Updated
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.adam import Count
-from dyngs.state import Role, State, prefixed, with_role
 
 S = TypeVar("S", bound=GaussianScene)
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.adam import AdamState
 from dyngs.config import OptimConfig
+from dyngs.core.state import State
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.adam import AdamState
 from dyngs.ops.adam import Count, seen_rows
-from dyngs.state import State
 
 ADAM_EPS = 1e-15
 

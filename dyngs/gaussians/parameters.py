@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from dyngs.adam import MOMENTS, AdamState
+from dyngs.core.state import Role, State, StateTensor, moved_to
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.adam import MOMENTS, AdamState
 from dyngs.ops.adam import AdamUpdate, Count, seen_rows
-from dyngs.state import Role, State, StateTensor, moved_to
-from dyngs.tensor_checks import require_tensor
 
 Roles = Role | Mapping[str, Role]
 

@@ -9,9 +9,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.models.renderable import DrawOptions, Rendering, check_background, check_views
 from dyngs.ops.checks import check_choice, check_count, check_finite, finite_rows

@@ -15,10 +15,12 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import SceneModel
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.tensor_checks import require_moments
 from dyngs.data.scene_space import TYPICAL_EXTENT
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork, RestFrame, network_of
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
@@ -26,8 +28,6 @@ from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import Renderable, TimeStep, near_plane
 from dyngs.models.views import background_colour
-from dyngs.state import Role, State, prefixed, with_role
-from dyngs.tensor_checks import require_moments
 
 S = TypeVar("S", bound="GaussianScene")
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.fusion import OPAQUE, Mesh, Seen, colours_of, fused
 from dyngs.gaussians.scene import GaussianScene

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.state import Role, State, with_role
+from dyngs.core.state import Role, State, with_role
 
 BITS = 8
 

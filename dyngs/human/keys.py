@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from dyngs.section import Fraction, Positive, SceneModel
+from dyngs.core.section import Fraction, Positive, SceneModel
 
 
 class _OnTemplate(SceneModel):

@@ -9,11 +9,11 @@ from typing import Any
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import part_of
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import change_coordinates
-from dyngs.errors import DyngsError
-from dyngs.state import part_of
 
 OTHER_CONFIG = "was its config changed? Otherwise train anew"
 """Advice where a checkpoint and its run do not fit together."""

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 from dyngs.config.kinds import installed_kind
-from dyngs.conventions import ReportProgress
-from dyngs.errors import DyngsError
-from dyngs.section import ModelSection, SceneModel
+from dyngs.core.conventions import ReportProgress
+from dyngs.core.errors import DyngsError
+from dyngs.core.section import ModelSection, SceneModel
 
 if TYPE_CHECKING:
     from pathlib import Path

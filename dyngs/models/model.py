@@ -10,12 +10,12 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.conventions import RasterizeMode
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.state import State
 from dyngs.data.loader import Image
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import Renderable, Rendering
 from dyngs.ops.adam import Count
-from dyngs.state import State
 
 S_co = TypeVar("S_co", bound=Renderable, covariant=True)
 

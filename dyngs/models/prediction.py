@@ -17,16 +17,16 @@ import torch
 from torch import Tensor, nn
 
 from dyngs.config import Config, DataConfig, TrainConfig
-from dyngs.conventions import ReportProgress
+from dyngs.core.conventions import ReportProgress
+from dyngs.core.errors import DyngsError, reading
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError, reading
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.model import Model
 from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.tensor_checks import require_tensor
 
 N = TypeVar("N", bound=nn.Module)
 

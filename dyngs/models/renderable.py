@@ -14,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role, State, fields_moved_to
 from dyngs.data.capture import Capture, Split
-from dyngs.errors import DyngsError
 from dyngs.ops.checks import check_choice, check_finite, check_number
-from dyngs.state import Role, State, fields_moved_to
 
 R = TypeVar("R", bound="Renderable")
 T = TypeVar("T")

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
+from dyngs.core.camera import Cameras
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import scaled_intrinsics
 from dyngs.data.loader import Image

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.device import sent
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import InPlace, has_kernel, launch, register

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import check_choice
 from dyngs.ops.native import core, cuda_core, has_cuda_core
 

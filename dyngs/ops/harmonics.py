@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, empty_like, launch, register
 

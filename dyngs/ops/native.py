@@ -24,7 +24,7 @@ import torch  # first: its libgomp is then the one that both use
 from torch import Tensor
 from torch.utils.dlpack import to_dlpack  # pyright: ignore[reportPrivateImportUsage]
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 _BASELINE = "SSE4.2" if platform.machine() in ("x86_64", "AMD64") else "NEON"
 # instruction sets, x86-64 levels, oldest first

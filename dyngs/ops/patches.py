@@ -16,8 +16,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import check_number, check_size, check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, empty_like, launch, register

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import core_for, num_threads
 from dyngs.ops.registration import Gradient, has_kernel, launch, register
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, empty_like, launch, register
 

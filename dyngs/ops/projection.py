@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.ops.checks import check_memory, check_near_and_far, check_number, check_size
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register

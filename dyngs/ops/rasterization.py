@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import REMEDY, check_memory, check_number, check_size
 from dyngs.ops.native import num_threads
 from dyngs.ops.projection import Projection

@@ -22,7 +22,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import array, core_for, has_cuda_core, writable
 
 NAMESPACE = "dyngs"

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import camera_center
 from dyngs.data.people_set import captures_in
-from dyngs.errors import DyngsError
-from dyngs.files.limits import read_limited
-from dyngs.files.write import write_text
+from dyngs.io.limits import read_limited
+from dyngs.io.write import write_text
 
 RECORD_NAME = "capture.json"
 """In a run folder: the cameras and digests of the files of the training views."""

@@ -18,27 +18,27 @@ from typing import Any
 
 import torch
 
+from dyngs.compress.storage.file import read_scene
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.conventions import RasterizeMode
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError, as_word, reading
 from dyngs.data.capture import View
-from dyngs.errors import DyngsError, as_word, reading
-from dyngs.files.limits import read_limited
-from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
-from dyngs.files.write import write_text
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.kinds import restored_model
+from dyngs.io.limits import read_limited
+from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
+from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
-from dyngs.storage.file import read_scene
 from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
+from dyngs.training.new_trainer import restored_model
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
 _MOST_TIMING_BYTES = 1 << 20
 SCENE_FILE = "scene.dyngs"
-"""Name of the .dyngs file that holds a finished run, see ``dyngs.storage``."""
+"""Name of the .dyngs file that holds a finished run, see ``dyngs.compress.storage``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
 MAX_STEP = 2**53
 BACKGROUNDS = ("white", "black", "random")

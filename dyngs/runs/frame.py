@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.errors import DyngsError, require_regular
-from dyngs.files.write import write_text
-from dyngs.splats.rotation import AXES
-from dyngs.splats.similarity import UNMOVED, Similarity, similarity_of
+from dyngs.core.errors import DyngsError, require_regular
+from dyngs.io.formats.rotation import AXES
+from dyngs.io.formats.similarity import UNMOVED, Similarity, similarity_of
+from dyngs.io.write import write_text
 
 FRAME_NAME = "frame.json"
 _MOST_BYTES = 4096

@@ -11,10 +11,10 @@ from pydantic import BaseModel
 
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
-from dyngs.files.outputs import Inputs
+from dyngs.io.outputs import Inputs
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
     SCENE_FILE,

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from dyngs.errors import DyngsError
-from dyngs.files.limits import read_limited
-from dyngs.files.write import write_text
+from dyngs.core.errors import DyngsError
+from dyngs.io.limits import read_limited
+from dyngs.io.write import write_text
 from dyngs.training.events import Evaluated, Event, StepDone
 
 LOG_NAME = "log.jsonl"

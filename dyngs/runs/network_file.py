@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 
 from dyngs.config import Config
-from dyngs.errors import DyngsError, reading
-from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
+from dyngs.core.errors import DyngsError, reading
+from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Predicts, capability
 from dyngs.runs.checkpoint import info_of

@@ -12,13 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import up_direction
 from dyngs.config import Config, DataConfig
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture, Split, View
-from dyngs.errors import DyngsError, counted
-from dyngs.files.wrong_place import command_for
+from dyngs.export.camera_paths.aim import up_direction
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
+from dyngs.io.formats.rotation import AXES, inverse
+from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.splat_file import Nonfinite, drawing_options
+from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.kind import HasBody, capability
 from dyngs.models.renderable import Posable, Renderable
@@ -27,10 +31,6 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.splats.formats import all_suffixes, format_to_read, read_splats
-from dyngs.splats.rotation import AXES, inverse
-from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.splat_file import Nonfinite, drawing_options
 from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
 
@@ -292,7 +292,7 @@ def open_scene(
     file of Gaussians.
 
     Args:
-        nonfinite: of a file of Gaussians, as ``dyngs.splats.formats.read_splats``.
+        nonfinite: of a file of Gaussians, as ``dyngs.io.formats.formats.read_splats``.
         data_root: where the capture of a run lies by now, if it was moved.
 
     Raises:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import IO, Any
 
 from dyngs.config import Config
-from dyngs.errors import escaped
+from dyngs.core.errors import escaped
 from dyngs.runs.log import LogRecord, record_of
 from dyngs.training.clock import Forecast
 from dyngs.training.events import Evaluated, Event, Message, StepDone, TotalChanged

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.section import SceneModel
+from dyngs.core.section import SceneModel
 
 
 class StaticModel(SceneModel):

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import State
 from dyngs.gaussians.levels import Levels, levels_of
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.models.renderable import Renderable, Rendering, TimeStep, joined_renderings, single_views
-from dyngs.state import State
 from dyngs.static.scene import StaticScene
 
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import State
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
 from dyngs.models.renderable import TimeStep, clamped_time, joined_renderings, single_views
-from dyngs.state import State
 from dyngs.static.sides import Sides
 
 

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import Role, State, StateTensor
+from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.state import Role, State, StateTensor
-from dyngs.tensor_checks import require_indices, require_tensor
 
 _UNSEEN = -30.0  # Logit of an opacity that is never drawn
 

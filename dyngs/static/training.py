@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import DefaultStrategy, SceneInit
+from dyngs.core.camera import Cameras
+from dyngs.core.state import Role, State, StateTensor
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
@@ -23,10 +25,8 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
-from dyngs.state import Role, State, StateTensor
 from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
-from dyngs.tensor_checks import require_tensor
 
 # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
 SURVEYED = 200

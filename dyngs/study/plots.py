@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.files.write import atomic_file, write_text
+from dyngs.io.write import atomic_file, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.errors import DyngsError
-from dyngs.files.child import home_of_dyngs
-from dyngs.files.containment import following_links_of_runs, follows_links_of_runs
+from dyngs.core.errors import DyngsError
+from dyngs.io.child import home_of_dyngs
+from dyngs.io.containment import following_links_of_runs, follows_links_of_runs
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Listener
 

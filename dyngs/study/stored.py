@@ -10,9 +10,9 @@ from typing import Any, TypeVar, cast
 
 from pydantic import ConfigDict, TypeAdapter
 
-from dyngs.errors import DyngsError, printable, reading
-from dyngs.files.limits import read_limited
-from dyngs.files.write import write_text
+from dyngs.core.errors import DyngsError, printable, reading
+from dyngs.io.limits import read_limited
+from dyngs.io.write import write_text
 
 AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
 """How the dataclasses of results are read: nothing else, and only numbers."""

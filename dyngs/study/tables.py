@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from dyngs.errors import escaped, printable
+from dyngs.core.errors import escaped, printable
 
 STYLE = """\
 body { font: 14px sans-serif; max-width: 1060px; margin: 24px auto; }

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image
-from dyngs.metrics import psnr
 
 if TYPE_CHECKING:
     from dyngs.training.loop import Loop

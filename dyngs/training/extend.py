@@ -9,7 +9,7 @@ measured a second time.
 from __future__ import annotations
 
 from dyngs.config import Config, TrainConfig
-from dyngs.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, counted
 from dyngs.gaussians.schedule import learning_rates, means_rate, rates_of
 from dyngs.models.kind import ExtendsTo, HasGaussians, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled

@@ -7,8 +7,8 @@ as exactly as is usual.
 from __future__ import annotations
 
 from dyngs.config import Config
-from dyngs.conventions import num_sh_terms
-from dyngs.errors import DyngsError
+from dyngs.core.conventions import num_sh_terms
+from dyngs.core.errors import DyngsError
 from dyngs.models.kind import HasGaussians, capability, kind_of
 from dyngs.training.processes import Processes
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any, Protocol
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.adam import Count
 from dyngs.training.clock import Stopwatch

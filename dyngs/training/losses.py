@@ -9,8 +9,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
 from dyngs.models.model import Look, Loss
 from dyngs.ops.device import ReadBack, sent
 from dyngs.ops.loss import l1_ssim_loss

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing_extensions import assert_never
 
 from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy, RandomInit
-from dyngs.conventions import num_sh_terms
-from dyngs.errors import DyngsError
+from dyngs.core.conventions import num_sh_terms
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians.schedule import densify_schedule, growth_per_change
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import gpu_memory, num_gpus

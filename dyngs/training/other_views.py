@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.affine import SATURATED

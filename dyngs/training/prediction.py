@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config
-from dyngs.conventions import RasterizeMode
-from dyngs.errors import DyngsError, reading
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError, reading
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
 from dyngs.models.kind import Predicts
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated

@@ -19,7 +19,7 @@ from torch import Tensor, distributed
 from torch.distributed.distributed_c10d import PrefixStore, Store
 from torch.distributed.rendezvous import rendezvous
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 # The others wait while the first one reads, evaluates, or tries settings in small runs
 TIMEOUT = timedelta(days=30)

@@ -12,11 +12,13 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import Config
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError, reading
+from dyngs.core.state import Role, prefixed, tensors_of, with_role
+from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.errors import DyngsError, reading
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
 from dyngs.models.model import Look, Loss, Model
 from dyngs.models.renderable import Rendering
@@ -24,8 +26,6 @@ from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import CPU, sent
-from dyngs.state import Role, prefixed, tensors_of, with_role
-from dyngs.tensor_checks import require_indices
 from dyngs.training.corrections.camera_refinement import CameraRefinement, watched
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import look_at_point
 from dyngs.config import DataConfig
+from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader
+from dyngs.export.camera_paths.aim import look_at_point
 from dyngs.export.chosen_path import orbit_around, points_at
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.models.views import training_cameras

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dyngs.errors import counted
+from dyngs.core.errors import counted
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import has_timeline, views_of

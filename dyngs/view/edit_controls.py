@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dyngs.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, counted
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import viewpoint_of

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.edit.crop import Box, held_by
-from dyngs.edit.scene_file import write_part
-from dyngs.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, counted
+from dyngs.export.edit.crop import Box, held_by
+from dyngs.export.edit.scene_file import write_part
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.runs.opened import Opened
-from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.view.cameras import camera_at
 from dyngs.view.layers import Shot, depth_of
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dyngs.data.times import evenly_spaced
-from dyngs.files.write import to_uint8
+from dyngs.io.write import to_uint8
 from dyngs.runs.opened import Opened
 from dyngs.view.cameras import centers_of, fov_of, pose_of
 from dyngs.view.captured_views import viewpoint_of, views_of

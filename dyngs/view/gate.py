@@ -15,7 +15,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 DEFAULT_PORT = 8080
 COOKIE = "dyngs_view"

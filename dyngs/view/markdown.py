@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from dyngs.errors import printable
+from dyngs.core.errors import printable
 
 _PUNCTUATION = re.compile(r"([!-/:-@\[-`{-~])")
 _IN_LINKS = re.compile(r"(?=://|@)|(?<=www)(?=\.)", re.IGNORECASE)

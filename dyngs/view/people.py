@@ -9,10 +9,10 @@ from pathlib import Path
 
 import torch
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.motion.placement import rest_clip
-from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.runs.opened import Opened
 
 AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"

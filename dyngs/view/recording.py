@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
-from dyngs.camera_paths.path import world_pose
-from dyngs.splats.similarity import Similarity
+from dyngs.core.camera import Cameras
+from dyngs.export.camera_paths.keyframes import Keyframes, interpolate_keyframes
+from dyngs.export.camera_paths.path import world_pose
+from dyngs.io.formats.similarity import Similarity
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import traceback
 from collections.abc import Callable
 from contextvars import copy_context
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.view.session import Session
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.runs.opened import Opened
 from dyngs.view.cameras import fitting_fov, look_point, pose_of
 from dyngs.view.captured_views import viewpoint_of, views_of

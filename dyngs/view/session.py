@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.runs.opened import Opened
 from dyngs.view.cameras import camera_at, in_window, nearest_camera
 from dyngs.view.captured_views import viewpoint_of, views_of

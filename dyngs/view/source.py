@@ -13,15 +13,15 @@ import torch
 from dyngs.api.predict import network_config, predict, require_network
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
+from dyngs.core.errors import DyngsError
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
-from dyngs.files.wrong_place import command_for
+from dyngs.io.formats.formats import format_to_read
+from dyngs.io.wrong_place import command_for
 from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import Opened, open_scene
-from dyngs.splats.formats import format_to_read
 from dyngs.view.layers import coarser
 
 _DEEPEST = 3

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable

@@ -14,18 +14,18 @@ from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, FixedStrategy
 from dyngs.config.io import load_config, load_resolved
+from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.edit.frame import Frame
-from dyngs.edit.scene_file import Edits, edit_scene
-from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
+from dyngs.export.edit.frame import Frame
+from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import Still
-from dyngs.kinds import assemble
 from dyngs.runs.opened import open_run
+from dyngs.training.new_trainer import assemble
 
 BOX = (-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)
 

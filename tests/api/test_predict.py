@@ -13,7 +13,7 @@ from dyngs.api.predict import Prediction, network_config, predict
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_resolved, save_config
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
@@ -117,7 +117,7 @@ def test_a_body_is_fitted_where_none_is_given(
         asked.append((data.root, only_if_needed))
         return data
 
-    monkeypatch.setattr("dyngs.human.prediction.learner.with_fitted_body", fit)
+    monkeypatch.setattr("dyngs.human.predict.ghg.learner.with_fitted_body", fit)
     kept = [path.rename(tmp_path / path.name) for path in sorted(made.capture.glob("body_*.npz"))]
     try:
         with pytest.raises(DyngsError, match="no body parameters"):

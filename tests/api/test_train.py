@@ -42,18 +42,18 @@ from dyngs.config.io import (
     packaged_presets,
     save_config,
 )
+from dyngs.core.errors import DyngsError
 from dyngs.data import read
 from dyngs.data.capture import Capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
-from dyngs.errors import DyngsError
-from dyngs.kinds import assemble
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
 from dyngs.static.keys import StaticModel
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
 from dyngs.training.events import Event, StepDone
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import StepReport, Trainer
 
 # Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.

@@ -18,10 +18,10 @@ from dyngs.capture.background import (
 )
 from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.images.images import read_image
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 HEIGHT, WIDTH, FRAMES, RADIUS = 120, 240, 12, 22
 

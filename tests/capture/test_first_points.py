@@ -25,13 +25,13 @@ from dyngs.capture.first_points import (
 )
 from dyngs.capture.inspection.report import report_on
 from dyngs.config import DataConfig, PointsInit
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import projected
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 
 @pytest.fixture(scope="module")

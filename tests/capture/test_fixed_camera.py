@@ -8,9 +8,9 @@ from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 
 from dyngs.capture.fixed_camera import FOCAL, is_plain_clip, read_fixed_camera, zoomed
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_image
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 
 def frames(folder: Path, count: int, size: tuple[int, int] = (12, 16), channels: int = 3) -> Path:

@@ -14,8 +14,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from dyngs.capture.photos import copied, gather_photos, lay_out
 from dyngs.capture.sfm import estimate_poses
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_header, read_image
-from dyngs.errors import DyngsError
 
 COLOURS = np.kron(np.random.default_rng(0).integers(0, 256, (3, 4, 3)), np.ones((8, 8, 1))).astype(
     np.uint8

@@ -21,7 +21,7 @@ from dyngs.capture.plane_sweep import (
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import projected
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 WIDTH, HEIGHT, FOCAL, SLOPE, DISTANCE = 64, 48, 66.0, 0.3, 4.0
 INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -15,13 +15,13 @@ from skimage.transform import resize_local_mean
 from dyngs.api.load import read_capture
 from dyngs.capture.sfm import SfmResult, _frames_of, estimate_poses
 from dyngs.capture.sfm_work import SfmOptions
-from dyngs.conventions import report_nothing
+from dyngs.core.conventions import report_nothing
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
-from dyngs.errors import DyngsError
 from dyngs.export.video import VideoWriter
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 FAST = SfmOptions(num_threads=1)
 

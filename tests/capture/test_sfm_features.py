@@ -14,7 +14,7 @@ from dyngs.capture.photos import Photo
 from dyngs.capture.sfm_features import find_features
 from dyngs.capture.sfm_work import SfmOptions, SfmTask
 from dyngs.data.images.images import read_header
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 
 def test_weak_features_are_left_out_where_frames_have_many(

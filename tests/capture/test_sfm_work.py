@@ -12,7 +12,7 @@ from PIL import Image
 
 from dyngs.capture.sfm_work import working
 from dyngs.cli import main
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 
 def _stopped(out: Path, task: str) -> None:

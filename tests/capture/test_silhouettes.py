@@ -12,7 +12,7 @@ from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import View
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 RADIUS, FOCAL, SIDE, DISTANCE = 0.4, 60.0, 64, 4.0
 HALF_SIDE = 1.3  # of the cube in which points are drawn

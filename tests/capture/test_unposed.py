@@ -15,11 +15,11 @@ from dyngs.capture.unposed import with_poses
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import save_config
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.export.video import VideoWriter
-from dyngs.files.outputs import SOURCES_NAME
-from dyngs.files.temporary import cache_folder
-from dyngs.files.write import write_image
+from dyngs.io.outputs import SOURCES_NAME
+from dyngs.io.temporary import cache_folder
+from dyngs.io.write import write_image
 
 
 @pytest.fixture(autouse=True)

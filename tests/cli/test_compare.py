@@ -19,10 +19,10 @@ from toy_kind import registered
 
 from dyngs.api.train import train
 from dyngs.cli import main
-from dyngs.compare import result
-from dyngs.compare.result import TRUTH
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.study.compare import result
+from dyngs.study.compare.result import TRUTH
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 OPTIONS = ("--steps", "20", "--threads", "1", "init.num_random=100", "--views", "2")
@@ -227,7 +227,7 @@ def test_a_model_whose_images_were_shrunk_is_left_out(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("dyngs.budget.time.SMALLEST_SIDE", 8)
+    monkeypatch.setattr("dyngs.api.budget.time.SMALLEST_SIDE", 8)
     words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
     assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
     said = "static: too few steps fit into 0.001 minutes of training, so its images were shrunk to 8 px"

@@ -12,8 +12,8 @@ from splat_scenes import cloud, readable
 
 from dyngs.cli import main
 from dyngs.cli.splats import SPLAT_FORMATS
-from dyngs.splats.formats import FORMATS, read_splats, write_splats
-from dyngs.splats.splat_file import SplatFile
+from dyngs.io.formats.formats import FORMATS, read_splats, write_splats
+from dyngs.io.formats.splat_file import SplatFile
 
 Capture = pytest.CaptureFixture[str]
 

@@ -19,12 +19,12 @@ from dyngs.config import DataConfig
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.human.avatar import pose_fit
+from dyngs.human.body import body as body_module
+from dyngs.human.body.body_reader import read_body
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import read_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template import body as body_module
-from dyngs.human.template.body_reader import read_body
 
 PrintedOutput = pytest.CaptureFixture[str]
 

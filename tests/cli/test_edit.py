@@ -13,8 +13,8 @@ from refused import error_line
 from splat_scenes import cloud
 
 from dyngs.cli import main
-from dyngs.splats.formats import read_splats, write_splats
-from dyngs.splats.splat_file import SplatFile
+from dyngs.io.formats.formats import read_splats, write_splats
+from dyngs.io.formats.splat_file import SplatFile
 
 Capture = pytest.CaptureFixture[str]
 LINE = "0,0,0,1,1,1\n1,0,0,2,1,1\n2,0,0,3,1,1\n"

@@ -23,8 +23,8 @@ from dyngs.data.geometry import camera_center
 from dyngs.data.read import read_capture
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
+from dyngs.io.formats.formats import read_splats
 from dyngs.runs.avatar import write_avatar
-from dyngs.splats.formats import read_splats
 
 
 def run_of(still: Path, folder: Path, refine: str) -> Path:

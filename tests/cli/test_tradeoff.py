@@ -9,7 +9,7 @@ from moving_scene import write_moving_run
 from refused import error_line
 
 from dyngs.cli import main
-from dyngs.files.lock import LOCK_NAME, writing
+from dyngs.io.lock import LOCK_NAME, writing
 from dyngs.runs.checkpoint import load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -19,8 +19,8 @@ def test_a_table_files_and_a_chosen_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """But for the memory, measured in processes that import the renderer:
-    tests/tradeoff/test_sweep.py."""
-    monkeypatch.setattr("dyngs.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
+    tests/study/tradeoff/test_sweep.py."""
+    monkeypatch.setattr("dyngs.study.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
     run = str(write_moving_run(tmp_path))
     out = tmp_path / "out"
     words = [

@@ -22,9 +22,9 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import find_preset, load_config, load_resolved, packaged_preset, save_config
-from dyngs.conventions import RasterizeMode
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import ControlNodesField, DynamicModel, HexplaneField, MlpField
-from dyngs.errors import DyngsError
 from dyngs.static.keys import StaticModel
 
 PRESETS = ("static", "blender", "colmap", "static_mcmc", "mip")

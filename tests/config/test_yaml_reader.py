@@ -13,7 +13,7 @@ from refused import error_line
 from dyngs.config.io import load_config, load_resolved, packaged_preset, save_config
 from dyngs.config.schema import config_keys
 from dyngs.config.yaml_reader import MAX_BYTES, MAX_DEPTH, read_file
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 ROOT = "data.root=/x"
 ODD = (

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import (
     about_pelvis,
     body_frames,
@@ -24,7 +25,6 @@ from dyngs.data.body_frames import (
     with_fitted_body,
 )
 from dyngs.data.capture import BodyFrames, Capture, Splits, View
-from dyngs.errors import DyngsError
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)

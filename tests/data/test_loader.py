@@ -13,9 +13,9 @@ from pretend_gpu import GPU, pretend_gpu
 from tiny_captures import random_pixels, write_image
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Lens, Silhouette, View
 from dyngs.data.loader import ImageLoader
-from dyngs.errors import DyngsError
 
 
 def views_of(

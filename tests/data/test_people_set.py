@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.people_set import PEOPLE_FILE, captures_in
-from dyngs.errors import DyngsError
 
 
 def found(root: Path) -> list[str]:

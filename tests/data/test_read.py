@@ -27,13 +27,13 @@ import dyngs
 from dyngs.api.load import read_capture
 from dyngs.capture.inspection.report import format_report, inspect_capture, report_on
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data import readers
 from dyngs.data.capture import Capture, CaptureFormat
 from dyngs.data.geometry import camera_center
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import FORMATS, require_images
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.errors import DyngsError
 
 CAMERAS = ("cam00", "cam01", "cam02")
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import Capture, PointCloud, View, all_views
 from dyngs.data.geometry import (
@@ -31,7 +32,6 @@ from dyngs.data.scene_space import (
     outside_of_cube,
     points_in_frusta,
 )
-from dyngs.errors import DyngsError
 
 
 def circle(

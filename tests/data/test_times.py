@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.times import (
     SECONDS_FILE,
@@ -34,7 +35,6 @@ from dyngs.data.times import (
     videos,
     write_seconds,
 )
-from dyngs.errors import DyngsError
 
 ROOT = Path("capture")
 

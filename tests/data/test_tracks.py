@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.tracks import (
     TRACKS_FILE,
@@ -18,7 +19,6 @@ from dyngs.data.tracks import (
     read_true_tracks,
     write_true_tracks,
 )
-from dyngs.errors import DyngsError
 
 
 def write(path: Path, **changes: Any) -> Path:

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
 from torch import Tensor
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import SMOOTHNESS, ControlNodes
 from dyngs.deform.field import Offsets
 from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)
 

@@ -15,12 +15,12 @@ from tiny_fields import (
     tiny_setup,
 )
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.fields import field_state, new_field, restored_field
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
-from dyngs.state import tensors_of
 
 
 def test_options_decide_the_kind() -> None:

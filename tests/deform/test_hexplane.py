@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from tiny_fields import cloud, stirred_field, tiny_field, tiny_options, tiny_setup
 from torch import Tensor
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.hexplane import Hexplane, time_rows
 from dyngs.deform.keys import HexplaneField
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 
 def field_with_rows(rows: int) -> Hexplane:

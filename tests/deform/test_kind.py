@@ -9,7 +9,7 @@ import pytest
 import dyngs
 from dyngs.deform.training import DynamicTraining
 from dyngs.gaussians.model import GaussianModel
-from dyngs.kinds import assemble
+from dyngs.training.new_trainer import assemble
 
 
 @pytest.mark.parametrize(

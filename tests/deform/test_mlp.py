@@ -8,11 +8,11 @@ import pytest
 import torch
 from tiny_fields import TIMES, cloud, stirred_field, tiny_field, tiny_setup
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.field import Offsets
 from dyngs.deform.keys import MlpField
 from dyngs.deform.mlp import SKIP_LAYER, Mlp, encoded
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 
 def outputs(offsets: Offsets) -> list[torch.Tensor]:

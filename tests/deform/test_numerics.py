@@ -24,8 +24,10 @@ from tiny_fields import (
 )
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import TrainConfig
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
@@ -35,14 +37,12 @@ from dyngs.deform.motion import MAX_SAMPLES, measure_motion
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.time_window import FRONTIER_VIEWS, TimeWindow
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import render
-from dyngs.kinds import assemble, restored_scene
 from dyngs.ops.planes import PlaneLevel, hexplane_features
-from dyngs.state import tensors_of
 from dyngs.static.keys import StaticModel
 from dyngs.static.scene import StaticScene
+from dyngs.training.new_trainer import assemble, restored_scene
 from dyngs.training.trainer import Trainer
 
 LONG = 10_000

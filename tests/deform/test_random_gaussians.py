@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from tiny_fields import cloud
 
 from dyngs.config import OptimConfig
+from dyngs.core.state import tensors_of
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.optimizer import GaussianOptimizer
-from dyngs.state import tensors_of
 
 
 def drawn(gaussians: Gaussians, count: int, extent: float, seed: int) -> Gaussians:

@@ -9,15 +9,15 @@ import torch
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_field, tiny_options
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import tensors_of
 from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.state import tensors_of
 from dyngs.static.scene import StaticScene
 
 ROWS = torch.tensor([1, 4, 5, 8])

@@ -15,7 +15,7 @@ from tiny_fields import cloud
 from torch import Tensor
 from two_balls import cameras_around, two_balls
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.deform.still_error import (

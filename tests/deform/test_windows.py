@@ -12,11 +12,11 @@ import torch
 from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.field import deformed, innermost, with_innermost
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.deform.windows import EDGE, OPEN, WindowedField
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 COUNT = 9
 

@@ -16,13 +16,13 @@ import dyngs
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.conventions import RasterizeMode
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.data.tracks import TrueTracks, write_true_tracks
-from dyngs.errors import DyngsError
 from dyngs.evaluate.report import (
     evaluate_run,
     images_of_split,
@@ -30,10 +30,10 @@ from dyngs.evaluate.report import (
     report_path,
     split_views,
 )
-from dyngs.files.write import write_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
+from dyngs.io.write import write_image
 from dyngs.runs.checkpoint import (
     Checkpoint,
     CheckpointInfo,

@@ -19,10 +19,10 @@ from moving_scene import (
 )
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import static_cameras
-from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import (
     Drawing,
     TimeScore,

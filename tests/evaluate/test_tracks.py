@@ -16,8 +16,8 @@ import torch
 from moving_scene import Sliding, camera, moving_scene, row_of_balls, still_scene
 from scipy.spatial.transform import Rotation
 
-from dyngs.camera import Cameras
 from dyngs.config.io import load_config
+from dyngs.core.camera import Cameras
 from dyngs.data.capture import View, all_views
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.scenes import SceneName

@@ -15,11 +15,12 @@ from moving_scene import Sliding, moving_scene, still_scene
 from moving_scene import camera as one_camera
 
 import dyngs
-from dyngs.camera import Cameras
 from dyngs.cli import main
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import Lpips, psnr, ssim
 from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split
 from dyngs.evaluate.view_scores import (
     Drawing,
@@ -33,7 +34,6 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import avatar_of
-from dyngs.metrics import Lpips, psnr, ssim
 from dyngs.models.renderable import Rendering
 from dyngs.runs.checkpoint import load_run
 from dyngs.static.scene import StaticScene

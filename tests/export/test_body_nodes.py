@@ -12,15 +12,15 @@ from moving_scene import MOVING_ROWS, sliding_nodes, write_moving_run
 from scipy.spatial.transform import Rotation, Slerp
 
 from dyngs.cli import main
+from dyngs.core.errors import DyngsError
 from dyngs.deform.bodies.field import BodyField, BodyRest, bodies_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.windows import WindowedField
-from dyngs.errors import DyngsError
 from dyngs.export.body_nodes import write_bodies
 from dyngs.export.splat_files import Writing, splats_at
-from dyngs.files.gltf import GltfFile
+from dyngs.io.formats.formats import read_splats
+from dyngs.io.gltf import GltfFile
 from dyngs.runs.opened import Opened, open_run
-from dyngs.splats.formats import read_splats
 
 
 @pytest.fixture(scope="module")

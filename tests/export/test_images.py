@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from moving_scene import Sliding, camera, moving_scene, still_scene, write_moving_run
 from two_balls import cameras_around, two_balls
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.path import CameraPath, static_path
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.video import read_frames
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.errors import DyngsError
+from dyngs.export.camera_paths.path import CameraPath, static_path
 from dyngs.export.images import (
     OutputOptions,
     file_stems,

@@ -10,12 +10,12 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
-from dyngs.errors import DyngsError
+from dyngs.compress.storage.precision import Precision
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import prefixed, tensors_of
 from dyngs.export.scene_file import write_scene_file
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.runs.checkpoint import latest_checkpoint, load_run, save_checkpoint
-from dyngs.state import prefixed, tensors_of
-from dyngs.storage.precision import Precision
 
 
 @pytest.mark.parametrize("moves", [True, False])
@@ -81,7 +81,7 @@ def test_a_file_that_changes_images_more_than_allowed_is_not_written(
     before = sorted(run_dir.rglob("*"))
     coarse = {f"gaussians.{name}": 0.5 for name in ("means", "log_scales", "sh_base")}
     monkeypatch.setattr(
-        "dyngs.storage.measure.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5)
+        "dyngs.compress.storage.measure.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5)
     )
     with pytest.raises(
         DyngsError,

@@ -25,7 +25,7 @@ from moving_scene import (
 from scene_kinds import KINDS, onlooker, scene_of_kind
 
 from dyngs.cli import main
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.export import splat_files
 from dyngs.export.splat_files import (
     Part,
@@ -44,10 +44,10 @@ from dyngs.export.splat_files import (
     writing_of,
 )
 from dyngs.gaussians.rendering import render
+from dyngs.io.formats.formats import read_splats
+from dyngs.io.formats.rotation import AXES, turn_between
+from dyngs.io.formats.similarity import Similarity
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
-from dyngs.splats.formats import read_splats
-from dyngs.splats.rotation import AXES, turn_between
-from dyngs.splats.similarity import Similarity
 from dyngs.static.scene import StaticScene
 
 ALL = (0, 1, 2, 3, 4)

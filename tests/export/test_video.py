@@ -12,8 +12,8 @@ from av.container import OutputContainer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.video import read_frames
-from dyngs.errors import DyngsError
 from dyngs.export.video import VideoWriter
 
 

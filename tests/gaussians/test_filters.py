@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import filter_std, fuse_filter
 

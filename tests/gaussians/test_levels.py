@@ -9,8 +9,8 @@ import torch
 from moving_scene import camera
 from splat_scenes import cloud
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians import levels as module
 from dyngs.gaussians.levels import MERGED, Levels, levels_of, merged

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from dyngs.config import OptimConfig
+from dyngs.core.state import part_of, tensors_of
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import ADAM_EPS, GaussianOptimizer
-from dyngs.state import part_of, tensors_of
 
 
 def _gaussians(n: int, seed: int = 0) -> Gaussians:

@@ -9,7 +9,7 @@ import pytest
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.gaussians.order import morton_order, storage_order
-from dyngs.kinds import assemble
+from dyngs.training.new_trainer import assemble
 
 
 def test_corners_of_a_cube_follow_the_z_curve() -> None:

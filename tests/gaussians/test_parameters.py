@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from dyngs.core.state import Role, tensors_of
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.state import Role, tensors_of
 
 RATES = {"weight": 1e-2, "bias": 3e-3, "planes": 2e-2}
 SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}

@@ -11,9 +11,9 @@ import torch
 from scenes import REFERENCE, Limits, Scene, draw, look_around, random_scene, weights
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0, RasterizeMode
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0, RasterizeMode
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions, render, sensitivities
 from dyngs.models.renderable import Rendering

@@ -15,17 +15,17 @@ from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.config import FixedStrategy
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role, part_of, tensors_of
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.kinds import assemble, restored_scene
-from dyngs.state import Role, part_of, tensors_of
 from dyngs.static.keys import StaticModel
+from dyngs.training.new_trainer import assemble, restored_scene
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 

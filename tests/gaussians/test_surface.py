@@ -13,14 +13,14 @@ from scaled_files import scaled
 from seen_ball import HIGH, LOW, RADIUS, views
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.fusion import Mesh, fused
 from dyngs.gaussians.surface import largest_pieces, num_holes, opaque_box, surface_of
+from dyngs.io.formats.similarity import Similarity
 from dyngs.models.surface import Surface
-from dyngs.splats.similarity import Similarity
 from dyngs.static.scene import StaticScene
 
 COUNT = 3000

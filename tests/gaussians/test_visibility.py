@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dyngs.core.state import tensors_of
 from dyngs.gaussians.visibility import VisibilityMasks, matched
-from dyngs.state import tensors_of
 
 TIMES = (0.0, 0.25, 0.5, 1.0)
 

@@ -20,11 +20,11 @@ from dyngs.human.avatar.posing import (
     pose_gaussians,
     rest_offsets,
 )
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body_reader import read_body
 from dyngs.human.motion.motion import motion_clip
 from dyngs.human.motion.placement import place_like, place_on_floor, rest_clip
-from dyngs.human.prediction.network import AtlasNetwork
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body_reader import read_body
+from dyngs.human.predict.ghg.network import AtlasNetwork
 
 
 def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:

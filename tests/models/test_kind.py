@@ -13,9 +13,9 @@ from toy_kind import ToyScene, registered
 import dyngs
 from dyngs.cli import main
 from dyngs.config.io import load_config
+from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.chosen_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
@@ -123,7 +123,7 @@ def test_it_keeps_to_a_time(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("dyngs.budget.time.FEWEST_STEPS", 5)  # whatever else the machine does
+    monkeypatch.setattr("dyngs.api.budget.time.FEWEST_STEPS", 5)  # whatever else the machine does
     run = tmp_path / "run"
     assert main(["train", *options(capture, run), "train.steps=100000", "train.minutes=0.04"]) == 0
     loaded = load_run(run)

@@ -13,15 +13,15 @@ from toy_kind import registered
 
 from dyngs.config import Config, ModelSection
 from dyngs.config.io import load_config
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.human.prediction.learner import PersonPredictor, new_network
-from dyngs.kinds import build, restored_model
+from dyngs.human.predict.ghg.learner import PersonPredictor, new_network
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.kind import KINDS, Kind, kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
-from dyngs.state import Role
+from dyngs.training.new_trainer import build, restored_model
 from dyngs.training.trainer import Trainer
 
 TRAINED = {
@@ -53,7 +53,7 @@ NETWORKS = {"human_predictor", "gps", "keypoint_nerf", "eg_human_nerf"}
 """Kinds that predict scenes: tests of training.prediction, gps.learner and human_fields.learner
 resume them."""
 PREDICTED = {"predicted_field"}
-"""Kinds that are not trained: tests/human_fields/test_scene.py."""
+"""Kinds that are not trained: tests/human/predict/fields/test_scene.py."""
 
 
 @pytest.fixture(autouse=True, scope="module")

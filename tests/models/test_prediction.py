@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import nn
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
-from dyngs.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import (
     load_optimizer,

@@ -16,21 +16,21 @@ from splat_scenes import cloud
 from tiny_field_people import NETWORKS, SIZES
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
-from dyngs.fields.keys import NerfModel, NgpModel
-from dyngs.fields.nerf import NerfField
-from dyngs.fields.ngp import NgpField
-from dyngs.fields.scene import FieldScene
+from dyngs.baselines.fields.keys import NerfModel, NgpModel
+from dyngs.baselines.fields.nerf import NerfField
+from dyngs.baselines.fields.ngp import NgpField
+from dyngs.baselines.fields.scene import FieldScene
+from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human_fields.people import Body, Sources
-from dyngs.human_fields.scene import SECTIONS, PredictedField, network_of
+from dyngs.human.predict.fields.people import Body, Sources
+from dyngs.human.predict.fields.scene import SECTIONS, PredictedField, network_of
 from dyngs.models.renderable import DrawOptions, Renderable
 from dyngs.ops.rays import Space
 from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
 from dyngs.static.sides import Sides
-from dyngs.triangles.scene import TriangleOptions, TriangleScene
 
 SPACE = Space((0.0, 0.0, 0.0), 2.0, 1, 8)
 WITH_CAMERA_GRADIENTS = (*KINDS, "sides")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.models.views import evaluation_background, share_alike
 

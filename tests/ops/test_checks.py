@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dyngs
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.ops.checks import (
     MAX_SIDE,
@@ -314,8 +314,8 @@ def test_nothing_is_known_of_the_system(tmp_path: Path) -> None:
 
 CHILD = """
 import resource, torch
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.native import core
 from dyngs.gaussians.rendering import render

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 import dyngs
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops import device
 from dyngs.ops.device import (
     ReadBack,

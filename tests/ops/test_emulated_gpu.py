@@ -14,8 +14,8 @@ from emulated_gpu import build_module, on_emulated_gpu
 from scenes import Scene, random_scene
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops import native

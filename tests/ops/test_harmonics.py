@@ -10,7 +10,7 @@ import torch
 from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.ops.harmonics import (
     dimmed,
     evaluate_harmonics,

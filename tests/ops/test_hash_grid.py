@@ -11,7 +11,7 @@ from field_reference import reference_features
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.hash_grid import (
     HashLevels,
     hash_features,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.loss import _ssim_map, l1_ssim_loss, l1_ssim_op, reference_l1_ssim, ssim
 
 # Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its

@@ -13,7 +13,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops import native
 from dyngs.ops.native import (
     active_isa,
@@ -184,7 +184,7 @@ def test_formulas_need_no_library_but_the_mathematical_one() -> None:
 FORKED = """
 import os, signal, sys, warnings
 import torch
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.ops.native import kernel_threads, num_threads
 from dyngs.gaussians.rendering import render

@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.native import core

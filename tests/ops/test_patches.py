@@ -10,8 +10,8 @@ import torch
 from patch_reference import bernstein, reference_blend, reference_values, reference_visible
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.patches import (
     Places,

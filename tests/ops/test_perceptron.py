@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import dyngs.ops.perceptron as ops
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.perceptron import (
     Layer,

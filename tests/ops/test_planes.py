@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import core, kernel_threads
 from dyngs.ops.planes import (
     PlaneLevel,

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.posing import Posed, pose_by_joints, posing_backward_op, posing_op
 from dyngs.ops.quaternions import rotation_matrices

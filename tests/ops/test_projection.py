@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scenes import Scene, look_around, random_scene, relative_error, weights
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.ops.projection import (
     Projection,
     ProjectionOptions,

@@ -13,7 +13,7 @@ from reference import shortest_axes
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.deform.nodes import turned
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project

@@ -26,7 +26,7 @@ from scenes import (
 )
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.projection import Projection
 from dyngs.ops.rasterization import (
     MAX_CHANNELS,

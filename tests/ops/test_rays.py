@@ -10,7 +10,7 @@ from field_reference import cell_of, reference_composite, reference_march
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.rays import (
     Rays,

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch._C import DispatchKey, DispatchKeySet
 
 import dyngs.ops
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.ops.registration import Gradient, _kernels, has_kernel, implement, register

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import cloud
 from torch import Tensor
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.skinning import (
     add_offsets_,

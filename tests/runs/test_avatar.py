@@ -18,20 +18,20 @@ from torch import Tensor
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig, DefaultStrategy, RunConfig, TrainConfig
-from dyngs.errors import DyngsError
-from dyngs.files.tensor_file import read_tensors, write_tensors
+from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.io.formats.similarity import Similarity
+from dyngs.io.tensor_file import read_tensors, write_tensors
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.runs import avatar
 from dyngs.runs.avatar import read_avatar, write_avatar
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.frame import RunFrame
 from dyngs.runs.opened import open_run, open_scene
-from dyngs.splats.similarity import Similarity
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ import pytest
 from tiny_people import people
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import change_coordinates
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 from dyngs.runs.capture_record import RECORD_NAME, SAMPLE_BYTES, changed_files, named, write_record
 
 

@@ -15,14 +15,14 @@ import torch
 from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
+from dyngs.compress.storage.tensors import drawable
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
-from dyngs.errors import DyngsError
-from dyngs.files import tensor_file
-from dyngs.files.tensor_file import write_tensors
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
-from dyngs.kinds import restored_scene
+from dyngs.io import tensor_file
+from dyngs.io.tensor_file import write_tensors
 from dyngs.runs import checkpoint
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -35,7 +35,7 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.static.keys import StaticModel
-from dyngs.storage.tensors import drawable
+from dyngs.training.new_trainer import restored_scene
 
 
 def _checkpoint(step: int) -> Checkpoint:
@@ -192,7 +192,7 @@ def test_a_failed_write_leaves_the_earlier_ones(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dyngs.files.tensor_file.save_file", full)
+    monkeypatch.setattr("dyngs.io.tensor_file.save_file", full)
     with pytest.raises(DyngsError, match=r"step_0000010.safetensors.*No space left"):
         save_checkpoint(tmp_path, _checkpoint(10), 2.0)
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [

@@ -13,7 +13,7 @@ import dyngs
 from dyngs.cli import main
 from dyngs.config import Config
 from dyngs.config.io import load_resolved, save_config
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.scene_file import write_scene_file
 from dyngs.runs.checkpoint import latest_checkpoint

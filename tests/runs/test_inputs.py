@@ -17,8 +17,8 @@ from dyngs.api.train import train
 from dyngs.capture.inspection.report import draw_cameras
 from dyngs.config import DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.cameras import write_cameras
 from dyngs.export.chosen_path import PathOptions, choose_path
@@ -26,7 +26,7 @@ from dyngs.export.html.page import write_page
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.scene_file import write_scene_file
 from dyngs.export.splat_files import write_moving, write_run_sequence, write_run_splats
-from dyngs.files.containment import following_links_of_runs
+from dyngs.io.containment import following_links_of_runs
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import open_run

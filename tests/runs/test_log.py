@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from steps import step_done
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.runs.log import LogRecord, RunLog, record_of
 from dyngs.training.events import Evaluated, Message
 

@@ -11,10 +11,10 @@ import torch
 from tiny_stereo import STEREO, stereo_config
 
 from dyngs.config import Config
-from dyngs.errors import DyngsError
-from dyngs.files.tensor_file import FileKind, write_tensors
-from dyngs.gps.surface import GpsNetwork
+from dyngs.core.errors import DyngsError
 from dyngs.human.keys import HumanPredictorModel
+from dyngs.human.predict.gps.surface import GpsNetwork
+from dyngs.io.tensor_file import FileKind, write_tensors
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import load_weights
 from dyngs.runs import network_file

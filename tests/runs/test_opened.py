@@ -13,11 +13,11 @@ import torch
 from moving_scene import write_moving_run
 from two_balls import two_balls
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.io.formats.formats import write_splats
+from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs import opened as opened_module
 from dyngs.runs.opened import FRAME_RATE, SHORTEST, Opened, open_run, open_scene
-from dyngs.splats.formats import write_splats
-from dyngs.splats.splat_file import SplatFile
 
 
 @pytest.fixture(scope="module")

@@ -12,13 +12,13 @@ from scene_kinds import onlooker, scene_of_kind
 from small_triangles import bent
 from splat_scenes import AROUND, cloud
 
-from dyngs.errors import DyngsError
+from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import levels
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
 from dyngs.static.sides import Sides
-from dyngs.triangles.scene import TriangleOptions, TriangleScene
 
 
 def test_near_it_is_the_scene_itself() -> None:

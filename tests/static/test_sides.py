@@ -11,9 +11,9 @@ import torch
 from camera_rings import ring_of
 from splat_scenes import cloud
 
+from dyngs.core.state import tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.state import tensors_of
 from dyngs.static.scene import StaticScene
 from dyngs.static.sides import Sides
 

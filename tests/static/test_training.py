@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import part_of, tensors_of
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
-from dyngs.state import part_of, tensors_of
 from dyngs.static.scene import StaticScene
 from dyngs.static.training import SmallRemoval, StaticTraining
 

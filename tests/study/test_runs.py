@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.study.runs import done_in_turn
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.study.stored import require_same_study
 
 

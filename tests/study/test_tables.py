@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from dyngs.errors import escaped
+from dyngs.core.errors import escaped
 from dyngs.study.tables import csv_text, html_table, markdown_table
 
 ODD = ["<script>alert(1)</script>", "a|b", 'say "x", y', "é"]

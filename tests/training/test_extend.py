@@ -13,6 +13,7 @@ from tiny_fields import busy_config, write_tiny_capture
 from tiny_people import TINY
 
 from dyngs.api.train import train
+from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -24,10 +25,10 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
+from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.schedule import deform_schedule
-from dyngs.errors import DyngsError
 from dyngs.gaussians.schedule import Rates, active_sh_degree
 from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import write_human_capture
@@ -36,7 +37,6 @@ from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.static.keys import StaticModel
 from dyngs.training.extend import told, with_length
 from dyngs.training.trainer import StepReport, Trainer
-from dyngs.triangles.keys import BgTriangleModel
 
 ALL_KINDS = ("default", "mcmc", "control_nodes", "human")
 

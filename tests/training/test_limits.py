@@ -22,14 +22,14 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_config, packaged_preset
+from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.keys import DynamicModel
-from dyngs.errors import DyngsError
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.static.keys import StaticModel
 from dyngs.training.limits import most_gaussians, require_possible, room, within_cap
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 NOTHING = Config(data=DataConfig(root=Path("nowhere")))

@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 from steps import Counting
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TotalChanged
 from dyngs.training.loop import Interrupts, Loop

@@ -8,9 +8,9 @@ import pytest
 import torch
 from scenes import random_scene
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
 from dyngs.models.model import Drawn, Look
 from dyngs.models.renderable import Rendering
 from dyngs.training.losses import SilhouetteLoss, StepCheck

@@ -21,11 +21,10 @@ from dyngs.config import (
     RandomInit,
     TrainConfig,
 )
+from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.keys import DynamicModel
-from dyngs.errors import DyngsError
 from dyngs.human.keys import HumanModel
-from dyngs.kinds import assemble
 from dyngs.training import memory
 from dyngs.training.memory import (
     MemoryForecast,
@@ -40,6 +39,7 @@ from dyngs.training.memory import (
     resident_memory,
     whole_memory,
 )
+from dyngs.training.new_trainer import assemble
 
 GB = 10**9
 PLENTY = MemoryForecast(
@@ -78,7 +78,7 @@ def _config(capture: Path, **changes: object) -> Config:
 def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
     monkeypatch.setattr(memory, "gpu_memory", lambda _: (3 * GB, 8 * GB))
     monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: (2000, 8 * GB))
     config = _config(

@@ -21,7 +21,7 @@ from flat_wall import (
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.models.renderable import Rendering
 from dyngs.training.other_views import FEWEST, OtherViews, grid_of, log_gains

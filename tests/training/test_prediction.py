@@ -11,7 +11,7 @@ from stopped import stopped
 from tiny_people import config, people
 
 from dyngs.api.train import train
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
 from dyngs.training.prediction import network_trainer, rate_at
 

@@ -17,11 +17,11 @@ from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.images import write_split_images
-from dyngs.kinds import assemble, build
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import open_run
+from dyngs.training.new_trainer import assemble, build
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -33,7 +33,7 @@ def config_of(kind: str, root: Path, *more: str) -> Config:
 
 def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.device) -> Trainer:
     """The trainer after all steps."""
-    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: device)
+    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: device)
     trainer = assemble(config)
     while trainer.done < config.train.steps:
         trainer.step()
@@ -96,7 +96,7 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     config = config_of(kind, request.getfixturevalue(capture), *more)
     for name, steps in (("EVERY", 2), ("WARM_UP", 4)):
         # the second time, at step 6, only some cells are looked at
-        monkeypatch.setattr(f"dyngs.fields.occupancy.{name}", steps)
+        monkeypatch.setattr(f"dyngs.baselines.fields.occupancy.{name}", steps)
     expected = trained(config, monkeypatch, torch.device("cpu")).checkpoint().tensors
     with pretend_gpu():
         trainer = trained(config, monkeypatch, GPU)
@@ -117,7 +117,7 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
 
     def checkpoints(device: torch.device) -> list[Checkpoint]:
         """After the last step but one and the last, which is done on what was stored."""
-        monkeypatch.setattr("dyngs.human.prediction.learner.device_for", lambda _: device)
+        monkeypatch.setattr("dyngs.human.predict.ghg.learner.device_for", lambda _: device)
         config = Config.model_validate(
             {"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}}
         )
@@ -158,7 +158,7 @@ def test_a_run_goes_on_there_from_a_checkpoint(
     still: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = config_of("static", still, *STATIC, "camera.refine=always", "train.exposure=always")
-    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: torch.device("cpu"))
+    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: torch.device("cpu"))
     begun = assemble(config)
     expected = assemble(config)
     for _ in range(10):
@@ -166,7 +166,7 @@ def test_a_run_goes_on_there_from_a_checkpoint(
     stored = begun.checkpoint()
     expected.restore(stored)
     with pretend_gpu():
-        monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
+        monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
         resumed = assemble(config, restored=True)
         resumed.restore(stored)
         for _ in range(10):
@@ -193,7 +193,7 @@ def test_how_often_the_host_waits_in_a_step(
     long = ("train.steps=60", *([] if sizes else ["strategy.kind=fixed"]))
     config = config_of(kind, request.getfixturevalue(capture), *more, *long)
     with pretend_gpu() as gpu:
-        monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
+        monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
         trainer = assemble(config)
         for _ in range(8):
             trainer.step()
@@ -284,6 +284,6 @@ def test_with_limits_and_pruning_it_ends_with_the_same_bytes(
         ]
 
     expected = run("cpu")
-    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
     with pretend_gpu():
         assert run("GPU") == expected

@@ -9,7 +9,7 @@ import pytest
 import torch
 from several_processes import run_in, summed
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.training.processes import Processes, _checksum, numbers_of_torchrun
 
 

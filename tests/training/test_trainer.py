@@ -19,20 +19,20 @@ from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role, State, with_role
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.errors import DyngsError
-from dyngs.files.tensor_file import write_tensors
-from dyngs.files.write import write_image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
-from dyngs.kinds import GaussianTrainer, assemble
+from dyngs.io.tensor_file import write_tensors
+from dyngs.io.write import write_image
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
-from dyngs.state import Role, State, with_role
 from dyngs.static.keys import StaticModel
+from dyngs.training.new_trainer import GaussianTrainer, assemble
 from dyngs.training.trainer import ViewSampler
 
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from moving_scene import camera
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import look_at
+from dyngs.core.camera import Cameras
+from dyngs.export.camera_paths.aim import look_at
 from dyngs.view.cameras import camera_at, fitting_fov, look_point, nearest_camera, pose_of
 
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from moving_scene import TEST_TIMES, TRAIN_TIMES, row_of_balls, write_moving_run
 
+from dyngs.io.formats.formats import write_splats
+from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.opened import open_scene
-from dyngs.splats.formats import write_splats
-from dyngs.splats.splat_file import SplatFile
 from dyngs.view.captured_views import has_timeline, viewpoint_of, views_of
 from dyngs.view.source import open_to_view
 

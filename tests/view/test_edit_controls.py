@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from moving_scene import camera, write_moving_run
 
+from dyngs.io.formats.formats import read_splats
 from dyngs.runs.opened import Opened, open_run
-from dyngs.splats.formats import read_splats
 from dyngs.view.cameras import pose_of
 from dyngs.view.edit_controls import EditControls, can_be_edited
 from dyngs.view.session import Eye, Session

@@ -4,7 +4,7 @@ import urllib.request
 
 import pytest
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.view.gate import COOKIE, Gate, free_port, gate_for, guarded, is_loopback, link_to
 
 

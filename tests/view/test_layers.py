@@ -9,7 +9,7 @@ from scene_kinds import scene_of_kind
 from splat_scenes import cloud
 from view_sessions import balls, opened_at
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
 from dyngs.runs.opened import Opened, open_run

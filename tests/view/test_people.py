@@ -6,7 +6,7 @@ from pretend_gpu import GPU, pretend_gpu
 from scene_kinds import scene_of_kind
 from view_sessions import opened_at
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.runs.opened import Opened
 from dyngs.view.people import (
     AS_CAPTURED,

@@ -5,9 +5,9 @@ import pytest
 import torch
 from moving_scene import camera
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.path import read_path
-from dyngs.splats.similarity import Similarity
+from dyngs.core.camera import Cameras
+from dyngs.export.camera_paths.path import read_path
+from dyngs.io.formats.similarity import Similarity
 from dyngs.view.recording import Keyframe, Recording
 
 

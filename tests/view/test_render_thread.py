@@ -4,7 +4,7 @@ import time
 import pytest
 from view_sessions import looking_at_balls
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Session
 

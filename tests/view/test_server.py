@@ -19,7 +19,7 @@ from PIL import Image
 from view_sessions import balls
 
 from dyngs.cli import main
-from dyngs.metrics import ssim
+from dyngs.core.metrics import ssim
 from dyngs.view.pace import Pace
 from dyngs.view.recording import Keyframe, Recording
 from dyngs.view.server import Browsing, Serving, Viewer, notify

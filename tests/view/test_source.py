@@ -5,7 +5,7 @@ from moving_scene import write_moving_run
 from tiny_people import NET, people
 
 import dyngs
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.view.source import first_of, is_network, open_network, open_source
 
 

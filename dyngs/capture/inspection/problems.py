@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading, reason
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
@@ -23,10 +24,9 @@ from dyngs.data.geometry import (
 )
 from dyngs.data.images.images import SUFFIXES, read_header, read_image, read_mask
 from dyngs.data.times import distinct_times, evenly_spaced
-from dyngs.errors import DyngsError, reading, reason
-from dyngs.files.containment import staying_within
-from dyngs.files.fields import read_json_object
-from dyngs.files.find import FileFinder
+from dyngs.io.containment import staying_within
+from dyngs.io.fields import read_json_object
+from dyngs.io.find import FileFinder
 
 MAX_LINES_PER_KIND = 5  # problems of one kind that are listed; the others are counted
 MAX_VIEWS = 300  # views, chosen at random, in which points are looked for

@@ -20,14 +20,14 @@ from dyngs.capture.inspection.problems import (
     transforms_file_problems,
 )
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError, counted, printable, reading
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import camera_center, inverse_rigid, pose_fault
 from dyngs.data.images.lens import is_pinhole, kept_fraction
 from dyngs.data.times import distinct_times
-from dyngs.errors import DyngsError, counted, printable, reading
-from dyngs.files.containment import images_up_to, leaving_links
-from dyngs.files.outputs import Inputs
-from dyngs.files.write import write_image
+from dyngs.io.containment import images_up_to, leaving_links
+from dyngs.io.outputs import Inputs
+from dyngs.io.write import write_image
 
 # factor between the most and the least light up to which images count as equally exposed
 SAME_LIGHT = 1.05

@@ -20,10 +20,10 @@ from dyngs.capture.multi_video.films import (
     read_given,
     shrunk_grey,
 )
+from dyngs.core.errors import as_word, counted, reading
 from dyngs.data.images.video import opened_video, orientation_of, read_frames, videos_in
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import as_word, counted, reading
-from dyngs.files.containment import inside
+from dyngs.io.containment import inside
 
 MAX_FRAMES = 3000  # frames that are looked at, from the first one on
 UNEVEN = 1.5  # longest over typical gap between frames of a rate that varies

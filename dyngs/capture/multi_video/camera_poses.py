@@ -22,10 +22,10 @@ from dyngs.capture.sfm_work import (
     matching_options,
     quiet_colmap,
 )
-from dyngs.conventions import ReportProgress
+from dyngs.core.conventions import ReportProgress
 from dyngs.data.images.video import read_numbered_frames
 from dyngs.data.times import evenly_spaced
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 if TYPE_CHECKING:
     import pycolmap

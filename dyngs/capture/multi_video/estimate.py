@@ -30,17 +30,17 @@ from dyngs.capture.multi_video.films import (
 )
 from dyngs.capture.multi_video.starts import describe_starts, found_starts
 from dyngs.capture.sfm_work import SfmOptions
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.video import colour_notes, read_numbered_frames, videos_in
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import Taken, taken_frames, write_seconds
-from dyngs.errors import DyngsError
-from dyngs.files.containment import images_up_to, inside, staying_within
-from dyngs.files.fields import first_few
-from dyngs.files.outputs import require_new_folder
-from dyngs.files.temporary import temporary_folder_beside
-from dyngs.files.write import write_image, write_text
+from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.fields import first_few
+from dyngs.io.outputs import require_new_folder
+from dyngs.io.temporary import temporary_folder_beside
+from dyngs.io.write import write_image, write_text
 
 if TYPE_CHECKING:
     import pycolmap

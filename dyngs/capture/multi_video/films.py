@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.video import VideoInfo, frame_seconds, probe_video, read_frames
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
-from dyngs.files.fields import first_few, is_number, read_json_object
+from dyngs.io.fields import first_few, is_number, read_json_object
 
 SMALL_SIDE = 160  # longer side of the small images, px
 SMALL_BYTES = 400_000_000  # memory that the small images of all videos take at most

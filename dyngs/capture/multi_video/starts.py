@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.capture.multi_video.films import VIDEOS_FILE, Film
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.images.video import opened_video
-from dyngs.errors import DyngsError, reading
 
 # fraction of the shorter signal that must lie within the other one at every shift that is tried
 MIN_OVERLAP = 0.4

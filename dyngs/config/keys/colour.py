@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.section import Positive, Section
+from dyngs.core.section import Positive, Section
 
 MEASURED_AT = 0.6  # Fraction of a run after which it is measured whose harmonics pay
 

@@ -15,7 +15,7 @@ from dyngs.config.keys.start import PointsInit, RandomInit, SceneInit
 from dyngs.config.keys.strategy import DefaultStrategy, OptimConfig, Strategy
 from dyngs.config.keys.train import TrainConfig
 from dyngs.config.kinds import section_of_kind
-from dyngs.section import ModelSection, SceneModel, Section
+from dyngs.core.section import ModelSection, SceneModel, Section
 
 
 def _model_section(value: object) -> object:

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from dyngs.files.containment import MAX_MEGAPIXELS
-from dyngs.section import Positive, Section
+from dyngs.core.section import Positive, Section
+from dyngs.io.containment import MAX_MEGAPIXELS
 
 
 class DataConfig(Section):

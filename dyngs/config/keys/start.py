@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.section import Length, Section
+from dyngs.core.section import Length, Section
 
 
 class PointsInit(Section):

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.section import Fraction, Positive, Section
+from dyngs.core.section import Fraction, Positive, Section
 
 _OF_30000 = "of a 30,000-step run, scaled with train.steps"
 _EVERY = "steps between these changes; null: a twentieth of the run, 100 at most"

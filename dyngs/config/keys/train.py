@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from dyngs.section import Fraction, Section, as_number
+from dyngs.core.section import Fraction, Section, as_number
 
 
 class TrainConfig(Section):

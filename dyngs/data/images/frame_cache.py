@@ -22,13 +22,13 @@ from typing import BinaryIO
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.video import DECODER_VERSION, VideoInfo, probe_video, read_numbered_frames
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside
-from dyngs.files.limits import read_limited
-from dyngs.files.temporary import CACHE_VARIABLE, cache_folder
-from dyngs.files.write import atomic_file, image_error, write_text
+from dyngs.io.containment import inside
+from dyngs.io.limits import read_limited
+from dyngs.io.temporary import CACHE_VARIABLE, cache_folder
+from dyngs.io.write import atomic_file, image_error, write_text
 
 try:
     import fcntl

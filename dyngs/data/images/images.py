@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.images.exr_layers import Layer, beauty_pass, layers_of
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import check_size, inside, max_decoded_mb
-from dyngs.files.fields import first_few
-from dyngs.files.write import any_text, image_error
+from dyngs.io.containment import check_size, inside, max_decoded_mb
+from dyngs.io.fields import first_few
+from dyngs.io.write import any_text, image_error
 
 if TYPE_CHECKING:
     import OpenImageIO

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, counted, reading, reason
 from dyngs.data.images.colour_space import BT2020, UNSPECIFIED, ColourTags, to_srgb
 from dyngs.data.images.images import files_in, rotated_upright
-from dyngs.errors import DyngsError, counted, reading, reason
-from dyngs.files.containment import check_size
-from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
+from dyngs.io.containment import check_size
+from dyngs.io.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 
 if TYPE_CHECKING:
     import av

@@ -7,6 +7,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import read_body_file, rows_of
 from dyngs.data.capture import (
     BodyFrames,
@@ -27,7 +28,6 @@ from dyngs.data.readers.transforms import (
     read_views,
     tracks_path_of,
 )
-from dyngs.errors import DyngsError
 
 
 def read_blender(root: Path) -> Capture:

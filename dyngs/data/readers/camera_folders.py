@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
 from dyngs.data.geometry import (
     OPENGL_FROM_OPENCV,
@@ -23,9 +24,8 @@ from dyngs.data.images.frame_cache import VideoFrames, planned_frames
 from dyngs.data.images.images import SUFFIXES, files_in
 from dyngs.data.images.video import VideoInfo, colour_notes, videos_in
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
-from dyngs.errors import DyngsError
-from dyngs.files.fields import first_few, is_number, matrix_of, read_json_object
-from dyngs.files.numpy_files import read_npy
+from dyngs.io.fields import first_few, is_number, matrix_of, read_json_object
+from dyngs.io.numpy_files import read_npy
 
 MIN_CAMERAS_TO_HOLD_OUT = 3
 """From this number on, the first camera is for testing where the capture names none."""

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import Capture, CaptureFormat, Lens, Splits, View
 from dyngs.data.geometry import (
     ROTATION_TOLERANCE,
@@ -31,10 +32,9 @@ from dyngs.data.readers.colmap_model import (
 )
 from dyngs.data.readers.transforms import view_name
 from dyngs.data.times import read_seconds
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside
-from dyngs.files.fields import read_text
-from dyngs.files.find import FileFinder, folded, images_folder
+from dyngs.io.containment import inside
+from dyngs.io.fields import read_text
+from dyngs.io.find import FileFinder, folded, images_folder
 
 TEST_LIST = "test.txt"
 """Names of the images for testing, a line each, in the model's folder (as 3DGS has it)."""

@@ -17,10 +17,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import PointCloud
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside
-from dyngs.files.fields import open_text
+from dyngs.io.containment import inside
+from dyngs.io.fields import open_text
 
 NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,

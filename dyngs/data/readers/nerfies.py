@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud, Splits
 from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
-from dyngs.errors import DyngsError
-from dyngs.files.fields import entry, is_number, numbers_of, read_json_object
-from dyngs.files.numpy_files import read_npy
+from dyngs.io.fields import entry, is_number, numbers_of, read_json_object
+from dyngs.io.numpy_files import read_npy
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
 from dyngs.data.geometry import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
 from dyngs.data.readers.transforms import SPLITS
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside
-from dyngs.files.fields import entry, first_few, numbers_of
-from dyngs.files.limits import read_limited
-from dyngs.files.numpy_files import read_npz
-from dyngs.files.pickles import read_pickle, read_pickled_array
+from dyngs.io.containment import inside
+from dyngs.io.fields import entry, first_few, numbers_of
+from dyngs.io.limits import read_limited
+from dyngs.io.numpy_files import read_npz
+from dyngs.io.pickles import read_pickle, read_pickled_array
 
 ALIGNED = "4d_humans/smpl_optimized_aligned_scale.npz"
 ALIGNMENTS = "alignments.npy"

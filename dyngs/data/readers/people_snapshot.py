@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette
 from dyngs.data.geometry import opengl_from_cam
@@ -15,11 +16,10 @@ from dyngs.data.images.images import files_in
 from dyngs.data.images.maps import MASKS
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.readers.camera_folders import open_camera, sequence_views, video_fps
-from dyngs.errors import DyngsError
-from dyngs.files.containment import inside
-from dyngs.files.fields import entry, numbers_of
-from dyngs.files.hdf5 import hdf5_length, read_hdf5
-from dyngs.files.pickles import read_pickle
+from dyngs.io.containment import inside
+from dyngs.io.fields import entry, numbers_of
+from dyngs.io.hdf5 import hdf5_length, read_hdf5
+from dyngs.io.pickles import read_pickle
 
 CAMERA = "camera.pkl"
 MASK_FILE = "masks.hdf5"

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, CaptureFormat
 from dyngs.data.images.images import SUFFIXES, files_in
 from dyngs.data.readers.blender import training_capture
 from dyngs.data.readers.transforms import FrameEntry, FrameFile
-from dyngs.errors import DyngsError
-from dyngs.files.fields import entry, numbers_of, read_json_object
+from dyngs.io.fields import entry, numbers_of, read_json_object
 
 _POLYCAM = (
     ("keyframes/corrected_images", "keyframes/corrected_cameras"),

@@ -13,14 +13,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, counted, reading
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, opengl_from_cam
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
 from dyngs.data.readers.blender import training_capture
 from dyngs.data.readers.transforms import FrameEntry, FrameFile
-from dyngs.errors import DyngsError, counted, reading
-from dyngs.files.containment import inside
-from dyngs.files.fields import first_few, numbers_of
+from dyngs.io.containment import inside
+from dyngs.io.fields import first_few, numbers_of
 
 _HEAD_BYTES = 4096
 _LENS_ERROR = 1e-4

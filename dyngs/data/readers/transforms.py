@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import Lens, PointCloud, Silhouette, Split, VideoFrame, View
 from dyngs.data.geometry import (
     MAX_SIDE,
@@ -26,10 +27,9 @@ from dyngs.data.geometry import (
 )
 from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
 from dyngs.data.readers.point_colours import point_colours
-from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside
-from dyngs.files.fields import is_number, matrix_of, read_json_object
-from dyngs.files.find import FileFinder
+from dyngs.io.containment import inside
+from dyngs.io.fields import is_number, matrix_of, read_json_object
+from dyngs.io.find import FileFinder
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 MAX_FPS = 1e6

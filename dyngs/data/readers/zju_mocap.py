@@ -10,15 +10,15 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
 from dyngs.data.geometry import checked_pose, opengl_from_cam
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
-from dyngs.errors import DyngsError
-from dyngs.files.containment import inside
-from dyngs.files.fields import entry, first_few, numbers_of
-from dyngs.files.pickles import read_pickle, read_pickled_array
+from dyngs.io.containment import inside
+from dyngs.io.fields import entry, first_few, numbers_of
+from dyngs.io.pickles import read_pickle, read_pickled_array
 
 ANNOTATIONS = "annots.npy"
 CAMERAS = "cameras.pkl"

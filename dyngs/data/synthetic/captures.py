@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.polyhedra import polyhedra, true_edges
 from dyngs.data.synthetic.raytrace import (
     CAMERA_ANGLE_X,
@@ -21,9 +22,8 @@ from dyngs.data.synthetic.raytrace import (
 )
 from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
-from dyngs.errors import DyngsError
-from dyngs.files.outputs import new_folder
-from dyngs.files.write import write_image, write_text
+from dyngs.io.outputs import new_folder
+from dyngs.io.write import write_image, write_text
 
 CaptureStyle = Literal["teleport", "moving", "fixed"]
 """One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all

@@ -13,8 +13,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.raytrace import Box, Paint, Scene, Sheet, Sphere, Wave, f32
-from dyngs.errors import DyngsError
 
 SceneName = Literal["spin", "wave", "room", "roll"]
 """The scenes that move."""

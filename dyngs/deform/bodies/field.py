@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyngs.core.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
+from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.bodies.shadows import START, light_left
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -20,8 +22,6 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.harmonics import dimmed, light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
-from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
-from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 RATES = {"places": 3e-4, "quats": 3e-3, "light": 1e-2, "albedo": 5e-3, "sun": 1e-2, "shade": 1e-2}
 """Learning rates; that of places times the scene extent."""

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.bodies.paths import Path, clear_, found_paths
 from dyngs.deform.bodies.shots import Shots

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 
 LONGEST_SIDE, IMAGES = 200, 2000

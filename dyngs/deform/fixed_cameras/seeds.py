@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.hulls import silhouettes_at
 from dyngs.deform.fixed_cameras.linking import Track

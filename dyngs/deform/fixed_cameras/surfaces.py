@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.seeds import LOGIT, Moment
 from dyngs.gaussians import Gaussians

@@ -17,6 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dyngs.baselines.triangles.patches import CORNERS
+from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.deform.field import Offsets
 from dyngs.deform.scene import DynamicScene, field_scene_of
 from dyngs.deform.windows import EDGE, OPEN
@@ -29,8 +31,6 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.ops.nodes import SPAN
-from dyngs.triangles.patches import CORNERS
-from dyngs.triangles.scene import TriangleScene
 
 BONES = 8  # bones that a Gaussian follows on the page
 FINE = ("means", "quats")  # splines of nodes that are stored in 16 bits

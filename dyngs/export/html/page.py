@@ -10,28 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.camera import Cameras
-from dyngs.camera_paths.aim import look_at_point
-from dyngs.conventions import RasterizeMode
+from dyngs.baselines.triangles.scene import TriangleScene
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import counted
 from dyngs.data.capture import Capture, View
 from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
-from dyngs.errors import counted
+from dyngs.export.camera_paths.aim import look_at_point
 from dyngs.export.chosen_path import front_of, orbit_around, points_at, view_to_show
 from dyngs.export.html.element import element_script, text_of
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
 from dyngs.export.html.template import filled, script_safe, source_hash
-from dyngs.files.outputs import new_folder, require_new_folder
-from dyngs.files.write import write_text
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.scene import avatar_of
+from dyngs.io.formats.rotation import AXES
+from dyngs.io.outputs import new_folder, require_new_folder
+from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.rotation import AXES
 from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
-from dyngs.triangles.scene import TriangleScene
 
 PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # in a folder for a web server
 # pixels of the first view that a place at its target may be off where motion is fitted

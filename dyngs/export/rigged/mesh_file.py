@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.skeleton import (
     BodyMesh,
     JointAnimation,
@@ -27,13 +27,13 @@ from dyngs.export.rigged.skeleton import (
 )
 from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
-from dyngs.files.gltf import INDICES, VERTICES, GlbDocument
-from dyngs.files.write import atomic_file
 from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import load_template
 from dyngs.human.keys import HumanModel
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import load_template
+from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
+from dyngs.io.write import atomic_file
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
 

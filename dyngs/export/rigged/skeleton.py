@@ -15,20 +15,20 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.errors import DyngsError
-from dyngs.files.gltf import VERTICES, GlbDocument
+from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.anchors import Anchors, heaviest_joints
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.placement import upright
-from dyngs.human.pose.skinning import (
+from dyngs.human.body.body import BodyTemplate, apply_shape
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.skinning import (
     apply_transforms,
     axis_angle_to_matrix,
     blend_transforms,
     joint_transforms,
 )
-from dyngs.human.template.body import BodyTemplate, apply_shape
-from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.motion.placement import upright
+from dyngs.io.gltf import VERTICES, GlbDocument
 from dyngs.ops.quaternions import shorter_ways
 
 _MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations

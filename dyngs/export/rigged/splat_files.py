@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyngs.conventions import SH_C0
-from dyngs.errors import DyngsError
+from dyngs.core.conventions import SH_C0
+from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.mesh_file import Played, person_and_template
 from dyngs.export.rigged.skeleton import (
     Rig,
@@ -26,16 +26,16 @@ from dyngs.export.rigged.skeleton import (
     rig_of,
 )
 from dyngs.export.rigged.texture import frontal_colours
-from dyngs.files.gltf import GlbDocument
-from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import heaviest_joints
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.io.formats.gltf import EXTENSION, add_gaussians
+from dyngs.io.formats.ply import write_ply
+from dyngs.io.formats.splat_file import SplatFile, require_writable
+from dyngs.io.gltf import GlbDocument
+from dyngs.io.write import atomic_file
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
-from dyngs.splats.gltf import EXTENSION, add_gaussians
-from dyngs.splats.ply import write_ply
-from dyngs.splats.splat_file import SplatFile, require_writable
 
 SUFFIXES = (".ply", ".glb")
 

@@ -15,13 +15,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.export.rigged.texture import SEEN, BakedTexels
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.human.template.atlas import Texels
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.mesh import rasterize
+from dyngs.human.body.atlas import Texels
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.mesh import rasterize
 
 MARGINS = (0.0, 0.004, 0.008, 0.012, 0.016)
 """Distances, m, from the uppermost Gaussians to the surface that are tried: Gaussians reach beyond

@@ -17,9 +17,9 @@ from torch import Tensor
 from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.atlas import Texels
+from dyngs.human.body.skinning import blend_transforms, joint_transforms
 from dyngs.human.motion.placement import rest_clip
-from dyngs.human.pose.skinning import blend_transforms, joint_transforms
-from dyngs.human.template.atlas import Texels
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import rotation_matrices
 

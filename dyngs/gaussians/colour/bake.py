@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import num_sh_terms
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import Shader
 from dyngs.ops.harmonics import harmonics_basis

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import Role, State, with_role
+from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import Shader
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.shading import Sight, num_inputs, shading_inputs
-from dyngs.state import Role, State, with_role
-from dyngs.tensor_checks import require_positive, require_tensor
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from dyngs.config import AutoColour, ColourSection, NetworkColour
+from dyngs.core.initialisation import glorot
+from dyngs.core.state import Role, State, StateTensor
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.initialisation import glorot
 from dyngs.ops.adam import Count
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
-from dyngs.state import Role, State, StateTensor
-from dyngs.tensor_checks import require_tensor
 
 WARM_UP = 100  # Steps in which the network's rate is reached
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions, render
 from dyngs.ops.harmonics import evaluate_harmonics

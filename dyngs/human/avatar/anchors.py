@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dyngs.camera import Cameras
-from dyngs.conventions import num_sh_terms
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import num_sh_terms
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import fields_moved_to
 from dyngs.gaussians import Gaussians
+from dyngs.human.body.atlas import Texels, atlas_texels
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.template.atlas import Texels, atlas_texels
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.ops.quaternions import quats_of
-from dyngs.state import fields_moved_to
 
 # limit on the joints that one Gaussian follows; vertices of the free template follow no more
 MAX_JOINTS = 8

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyngs.core.state import Role, fields_moved_to
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
+from dyngs.human.body.joints import mirrored_joints
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.template.joints import mirrored_joints
 from dyngs.ops.device import sent
-from dyngs.state import Role, fields_moved_to
 
 LR = {
     "poses": 1e-3,  # of single frames, rad

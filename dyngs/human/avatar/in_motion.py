@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.body_reader import load_template
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.feet import feet_kept, sole_points
 from dyngs.human.motion.motion import motion_clip
 from dyngs.human.motion.placement import place_like, up_direction
 from dyngs.human.motion.retarget import read_motion
-from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.kind import InMotion
 from dyngs.models.renderable import Renderable

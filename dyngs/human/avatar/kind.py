@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from dyngs.conventions import ReportProgress
+from dyngs.core.conventions import ReportProgress
 from dyngs.human.keys import HumanModel
 from dyngs.models.kind import ExtendsTo, HasBody, HasGaussians, InMotion
 
@@ -46,7 +46,7 @@ class HumanKind(HasGaussians, HasBody, ExtendsTo):
         from dyngs.human.fit.fitted_capture import with_fitted_body
 
         if is_unposed(data):
-            from dyngs.human.detection.find_person import with_found_person
+            from dyngs.human.detect.find_person import with_found_person
 
             data = with_found_person(data, say=say, report=report)
         return with_fitted_body(

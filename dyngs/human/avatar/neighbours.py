@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions
 from dyngs.human.avatar.anchors import Anchors

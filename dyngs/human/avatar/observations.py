@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.neighbours import mirrored_trust, smoothed, trust_in
 from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
+from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion
-from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
 
 FACING_EXPONENT = 4
 """Exponent of the cosine between normal and view direction in the weights of colours: frontal views

@@ -19,8 +19,8 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.loss import l1_ssim_loss

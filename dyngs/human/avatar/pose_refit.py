@@ -14,13 +14,13 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from dyngs.core.metrics import psnr
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.human.avatar.pose_fit import FIRST_RATES, IMAGES, WINDOW, by_time, fitted_to_images
 from dyngs.human.avatar.posing import frame_pose, posed_joints
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.metrics import psnr
+from dyngs.human.body.joints import JOINT_NAMES
 
 TRIED = 3  # time steps at which a view is left out
 LEAST_GAIN = 0.5  # mean of its PSNR in the person's box, dB, from which all poses are fitted

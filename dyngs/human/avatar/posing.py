@@ -11,16 +11,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
+from dyngs.core.state import fields_moved_to
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.skinning import apply_transforms, joint_transforms
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import apply_transforms, joint_transforms
-from dyngs.human.template.body import BodyTemplate
 from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_of, rotation_matrices
-from dyngs.state import fields_moved_to
 
 # message of files that cannot hold it
 LEFT_OUT = "the learned light is left out: colours are those in even light"

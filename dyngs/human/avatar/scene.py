@@ -10,6 +10,13 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from dyngs.core.state import Role, State, StateTensor, part_of, prefixed, with_role
+from dyngs.core.tensor_checks import (
+    require_indices,
+    require_moments,
+    require_positive,
+    require_tensor,
+)
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
@@ -35,12 +42,10 @@ from dyngs.human.avatar.posing import (
     pose_gaussians,
     rest_offsets,
 )
+from dyngs.human.body.joints import SMPLX_ROWS
+from dyngs.human.body.skinning import check_tree
 from dyngs.human.motion.motion import MotionClip, captured_motion, same_bodies
-from dyngs.human.pose.skinning import check_tree
-from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.models.renderable import Posable, Renderable, clamped_time
-from dyngs.state import Role, State, StateTensor, part_of, prefixed, with_role
-from dyngs.tensor_checks import require_indices, require_moments, require_positive, require_tensor
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dyngs.config import Config
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import drawn_as_trained
@@ -19,9 +19,9 @@ from dyngs.human.avatar.pose_refit import PoseRefit
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import captured_motion
-from dyngs.human.template.body_reader import load_template, rest_shape
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.views import evaluation_background, training_cameras

@@ -8,10 +8,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role, State, with_role
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
@@ -39,7 +40,6 @@ from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
 from dyngs.ops.adam import Count
-from dyngs.state import Role, State, with_role
 
 NEIGHBOURS = 5
 FRAMES_FROM = 0.25

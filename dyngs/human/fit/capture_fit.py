@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from dyngs.config import DataConfig
-from dyngs.conventions import ReportProgress
+from dyngs.core.conventions import ReportProgress
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import numbered
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.errors import DyngsError
 from dyngs.gaussians.parameters import Parameters
+from dyngs.human.body.body import BodyTemplate
 from dyngs.human.fit.keypoints import Joints3D, Keypoints
 from dyngs.human.fit.silhouettes import ObservedFrame, longest_box_side, observed_frame, surface_of
 from dyngs.human.fit.solve import (
@@ -35,7 +36,6 @@ from dyngs.human.fit.solve import (
 )
 from dyngs.human.fit.start import first_poses, num_ticks
 from dyngs.human.motion.motion import CapturedMotion, MotionClip, captured_motion
-from dyngs.human.template.body import BodyTemplate
 
 IMAGE_SIDE = 512  # longest side of the images that are read, px
 RESOLUTION = 48  # texels per side of the atlas whose discs are drawn

@@ -24,7 +24,8 @@ from dyngs.capture.fixed_camera import (
 )
 from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, counted, reading, show
 from dyngs.data.body_frames import numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
@@ -32,12 +33,10 @@ from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, counted, reading, show
-from dyngs.files.lock import make_once
-from dyngs.files.outputs import new_folder
-from dyngs.files.temporary import cache_folder
-from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import has_same_shapes, load_template, read_body
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit.capture_fit import (
     CaptureFit,
     Known,
@@ -60,9 +59,10 @@ from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
 from dyngs.human.fit.solve import LensFit
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import has_same_shapes, load_template, read_body
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.io.lock import make_once
+from dyngs.io.outputs import new_folder
+from dyngs.io.temporary import cache_folder
+from dyngs.io.write import atomic_file, write_image, write_text
 
 _LOOKED_AT, _PRESENT = 128, 0.2
 """Longest side of the images in which somebody is looked for, and the least fraction of the usual

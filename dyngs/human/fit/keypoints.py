@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.lens import undistorted_points
-from dyngs.errors import DyngsError, reading
-from dyngs.files.fields import LARGEST, entry, first_few, float_array, numbers_of, read_json_object
-from dyngs.files.limits import require_at_most
-from dyngs.files.numpy_files import read_arrays, read_npz
-from dyngs.files.pickles import read_pickle
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.io.fields import LARGEST, entry, first_few, float_array, numbers_of, read_json_object
+from dyngs.io.limits import require_at_most
+from dyngs.io.numpy_files import read_arrays, read_npz
+from dyngs.io.pickles import read_pickle
 
 COCO = (
     *(

@@ -12,17 +12,17 @@ from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config
+from dyngs.core.errors import DyngsError, counted, reading
 from dyngs.data.body_frames import read_body_file
 from dyngs.data.capture import BodyFrames, View
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, counted, reading
 from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.body import NUM_FITTED, BodyTemplate
+from dyngs.human.body.body_reader import has_same_shapes, rest_shape
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.human.template.body import NUM_FITTED, BodyTemplate
-from dyngs.human.template.body_reader import has_same_shapes, rest_shape
 
 _BODY, _CONFIG = "body_train.npz", "config.yaml"
 

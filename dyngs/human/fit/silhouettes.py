@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import RasterizeMode
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import RasterizeMode
 from dyngs.data.images.images import area_downscale
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image
@@ -21,9 +21,9 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar.anchors import skinning_weights, texel_gaussians
 from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_gaussians
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.joints import JOINT_NAMES
 
 _WIDTH, _THICKNESS, _INSET = 0.4, 0.075, 0.2
 """Standard deviations of a disc in the tangent plane and along the normal, and its depth below the

@@ -15,15 +15,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose, posed_joints
+from dyngs.human.body.body import NUM_BONE_SHAPES
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.fit.silhouettes import ObservedFrame, ShapedSurface, Surface, drawn_silhouettes
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.template.body import NUM_BONE_SHAPES
-from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
 NUM_TURNED = 22
 """Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""

@@ -12,10 +12,11 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.times import evenly_spaced
 from dyngs.human.avatar.posing import posed_joints
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface
 from dyngs.human.fit.solve import (
     NUM_TURNED,
@@ -31,7 +32,6 @@ from dyngs.human.fit.solve import (
     usual_pose,
 )
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.template.joints import JOINT_NAMES
 
 NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor
 LIKELY = 3  # of these, nearest to the key points, that are tried where there are some

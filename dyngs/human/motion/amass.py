@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import ShapeSpace
-from dyngs.errors import DyngsError, reading
-from dyngs.files.numpy_files import read_arrays
-from dyngs.files.write import atomic_file
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.motion.motion import Motion, UpAxis, require_frame_count, require_frame_rate
 from dyngs.human.motion.placement import place_on_floor
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.joints import SMPLX_ROWS
+from dyngs.io.numpy_files import read_arrays
+from dyngs.io.write import atomic_file
 
 _MODELS = {24: "smpl", 52: "smplh", 55: "smplx", 22: "the body of all three"}
 """Names of the models by their number of joints."""

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError, reading
-from dyngs.files.limits import read_limited, require_at_most
+from dyngs.core.errors import DyngsError, reading
 from dyngs.human.motion.motion import (
     SkeletonMotion,
     frame_chunks,
     require_frame_count,
     require_frame_rate,
 )
+from dyngs.io.limits import read_limited, require_at_most
 
 _END_SITE = -1
 _MOST_JOINTS = 4096

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
-from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
 _SOLES = ("left_ankle", "left_foot", "right_ankle", "right_foot")
 _HEIGHT, _SPEED, _SHORTEST = 0.05, 0.5, 0.1

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import reading
-from dyngs.files.gltf import MOST_JOINTS, Animation, GltfFile
-from dyngs.files.limits import require_at_most
+from dyngs.core.errors import reading
 from dyngs.human.motion.motion import (
     SkeletonMotion,
     frame_chunks,
     require_frame_count,
     sample_times,
 )
+from dyngs.io.gltf import MOST_JOINTS, Animation, GltfFile
+from dyngs.io.limits import require_at_most
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 _VRM_THUMBS = {

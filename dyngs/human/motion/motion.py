@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import fields_moved_to
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, View
-from dyngs.errors import DyngsError
-from dyngs.files.limits import VARIABLE, allowed
-from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
-from dyngs.state import fields_moved_to
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.io.limits import VARIABLE, allowed
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000

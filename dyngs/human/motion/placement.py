@@ -9,9 +9,9 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import Motion, MotionClip, frame_chunks
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
-from dyngs.human.template.body import BodyTemplate
 
 # cosine of 30 degrees: how near to the up direction a world axis must be to replace it
 _ALONG_AXIS = 0.87

@@ -15,15 +15,15 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, reading
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS, SMPLX_ROWS
 from dyngs.human.motion.amass import read_amass
 from dyngs.human.motion.bvh import read_bvh
 from dyngs.human.motion.gltf import read_gltf, read_vrm_animation
 from dyngs.human.motion.motion import Motion, SkeletonMotion, UpAxis, frame_chunks
 from dyngs.human.motion.placement import place_on_floor
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES, JOINT_PARENTS, SMPLX_ROWS
 
 _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "

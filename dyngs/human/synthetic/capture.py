@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.maps import MILLIMETRE
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.data.tracks import TrueTracks, write_true_tracks
-from dyngs.errors import DyngsError
-from dyngs.files.outputs import new_folder
-from dyngs.files.write import write_image, write_text
+from dyngs.human.body.body import BodyTemplate, apply_shape, posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.clips import random_clip, squat, walk
@@ -40,9 +41,8 @@ from dyngs.human.synthetic.keypoints import (
     joint_positions,
     joints_of_triangles,
 )
-from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
+from dyngs.io.outputs import new_folder
+from dyngs.io.write import write_image, write_text
 
 _RADIUS = 3.5  # radius of the ring of cameras, m
 # of a ring that a seed chooses: cameras lie up to so far above or below its height, m

@@ -7,9 +7,9 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from dyngs.human.body.body import BodyTemplate, posed_vertices
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import Motion
-from dyngs.human.template.body import BodyTemplate, posed_vertices
-from dyngs.human.template.joints import JOINT_NAMES
 
 FPS = 12.0
 _Rotations = dict[str, np.ndarray]  # axis-angle vectors (F, 3) or (1, 3) by joint, rad

@@ -14,10 +14,10 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from dyngs.errors import DyngsError
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.mesh import Fragments, interpolate, rasterize, vertex_normals
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.mesh import Fragments, interpolate, rasterize, vertex_normals
 
 _PARTS = {
     "eye": ("eye",),

@@ -9,10 +9,10 @@ from functools import cache
 
 import numpy as np
 
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS
+from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import Motion
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.joints import JOINT_NAMES, JOINT_PARENTS
 
 KEYPOINTS_FILE = "true_keypoints.npz"
 """In a capture of a synthetic person: ``TrueTracks`` of joints in the frames of training."""

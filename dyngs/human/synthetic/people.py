@@ -6,12 +6,12 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError
 from dyngs.data.people_set import PEOPLE_FILE
-from dyngs.errors import DyngsError
-from dyngs.files.outputs import require_new_folder
-from dyngs.files.write import write_text
 from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
+from dyngs.io.outputs import require_new_folder
+from dyngs.io.write import write_text
 
 SHARD = 100
 """People in a folder."""

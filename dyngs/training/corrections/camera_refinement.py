@@ -17,16 +17,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.adam import AdamState
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
+from dyngs.gaussians.adam import AdamState
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.ops.adam import Count, adam_step_
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.tensor_checks import require_tensor
 
 STARTS = 0.05
 """Fraction of the run in which cameras stay as they are: a scene that is not there yet says nothing

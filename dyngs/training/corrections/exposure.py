@@ -21,16 +21,16 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyngs.adam import AdamState
 from dyngs.config import TrainConfig
+from dyngs.core.state import tensors_of
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import videos
+from dyngs.gaussians.adam import AdamState
 from dyngs.gaussians.colour.affine import SATURATED, recoloured
 from dyngs.models.model import Look, Loss
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
-from dyngs.state import tensors_of
-from dyngs.tensor_checks import require_tensor
 from dyngs.training.other_views import Draw, log_gains
 
 WARM_UP = 0.25

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.models.renderable import Rendering
-from dyngs.tensor_checks import require_indices, require_tensor
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 
 # An image is looked at each so many times that it is trained on; in between its mask stays

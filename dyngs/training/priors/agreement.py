@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.geometry import focus_point
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced

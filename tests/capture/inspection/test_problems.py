@@ -16,7 +16,7 @@ from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import cam_from_opengl, pinhole_matrix
 from dyngs.data.read import read_capture
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 
 def clip(count: int, degrees: float) -> Capture:

@@ -14,11 +14,11 @@ from tiny_captures import edit_json, write_cameras_json, write_video
 
 from dyngs.capture.inspection.report import draw_cameras, format_report, inspect_capture, report_on
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.synthetic.captures import StillOptions, hemisphere_cameras, write_still_capture
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 
 def _capture(root: Path, count: int = 6) -> Capture:

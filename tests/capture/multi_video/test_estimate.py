@@ -12,9 +12,9 @@ from stage_videos import camera, corner, write_videos
 from dyngs.api.load import read_capture
 from dyngs.capture.multi_video.estimate import poses_of_videos
 from dyngs.capture.sfm_work import SfmOptions
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
 from dyngs.data.times import static_cameras
-from dyngs.errors import DyngsError
 from dyngs.export.video import VideoWriter
 
 AZIMUTHS = {"left": 32.0, "middle": 41.0, "phone": 49.0, "right": 58.0}

@@ -15,7 +15,7 @@ from dyngs.capture.multi_video.films import (
     displacement,
     read_given,
 )
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 
 NAMES = ["left", "right"]
 

@@ -22,13 +22,13 @@ from tiny_captures import (
 )
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images import frame_cache
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
-from dyngs.files.temporary import cache_folder
+from dyngs.io.temporary import cache_folder
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from PIL.TiffImagePlugin import IFDRational
 from tiny_captures import random_pixels, write_image
 
 from dyngs.capture.photos import gather_photos, lay_out
+from dyngs.core.errors import DyngsError
 from dyngs.data.images import images
 from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.images.images import (
@@ -31,8 +32,7 @@ from dyngs.data.images.images import (
     straight_uint8,
     target_size,
 )
-from dyngs.errors import DyngsError
-from dyngs.files.containment import images_up_to
+from dyngs.io.containment import images_up_to
 
 
 @pytest.mark.parametrize("channels", [3, 4])

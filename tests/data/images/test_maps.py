@@ -11,6 +11,7 @@ import pytest
 import torch
 from tiny_captures import random_pixels, write_image
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Lens, Silhouette, View
 from dyngs.data.images.lens import undistort_map, undistorted_points
 from dyngs.data.images.maps import (
@@ -24,7 +25,6 @@ from dyngs.data.images.maps import (
     silhouette_box,
     taken_at,
 )
-from dyngs.errors import DyngsError
 
 
 def test_sixteen_bits_are_millimetres_and_zero_is_unknown(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from hdr_clips import (
 )
 from tiny_captures import level_of, packet_places, truncate_video, write_video
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.images import video as video_module
 from dyngs.data.images.video import (
     VideoInfo,
@@ -32,8 +33,7 @@ from dyngs.data.images.video import (
     read_frames,
     read_numbered_frames,
 )
-from dyngs.errors import DyngsError
-from dyngs.files.containment import images_up_to
+from dyngs.io.containment import images_up_to
 
 
 @pytest.fixture(scope="module")

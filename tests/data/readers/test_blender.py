@@ -12,6 +12,7 @@ from tiny_captures import edit_json, opengl_pose, pixel_of, random_pixels, write
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View, all_views
 from dyngs.data.images.images import read_image
@@ -23,7 +24,6 @@ from dyngs.data.readers.blender import (
     read_nerfstudio,
 )
 from dyngs.data.readers.transforms import view_name
-from dyngs.errors import DyngsError
 
 
 def test_camera_looks_where_blender_says(blender_root: Path) -> None:

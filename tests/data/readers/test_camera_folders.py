@@ -26,10 +26,10 @@ from tiny_captures import (
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.images.images import read_image
 from dyngs.data.readers.camera_folders import find_cameras, read_camera_folders, read_llff
-from dyngs.errors import DyngsError
 
 NAMES = ("cam00", "cam01", "cam02")
 

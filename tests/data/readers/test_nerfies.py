@@ -20,10 +20,10 @@ from tiny_captures import (
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.images.lens import distort
 from dyngs.data.readers.nerfies import read_nerfies
-from dyngs.errors import DyngsError
 
 
 @pytest.fixture

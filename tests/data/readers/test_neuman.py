@@ -13,10 +13,10 @@ from tiny_captures import write_colmap, write_image
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.readers.neuman import FORMAT, read_neuman
-from dyngs.errors import DyngsError
 
 COUNT = 9
 NAMES = [f"{i:02d}.jpg" for i in range(COUNT)]

@@ -14,9 +14,9 @@ from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.images.maps import cut_out
 from dyngs.data.readers.people_snapshot import FORMAT, read_people_snapshot
-from dyngs.errors import DyngsError
 
 h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
 

@@ -14,9 +14,9 @@ from tiny_captures import FOCAL, SIDE_PIXELS, WIDTH, edit_json, pixel_of, write_
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.readers.phone_apps import read_polycam, read_record3d
-from dyngs.errors import DyngsError
 
 
 def read(root: Path) -> Capture:

@@ -32,10 +32,10 @@ from tiny_captures import edit_json
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.lens import distort
 from dyngs.data.readers.photogrammetry import read_metashape, read_odm, read_realitycapture
-from dyngs.errors import DyngsError
 
 Project = Callable[[np.ndarray, np.ndarray], tuple[float, float]]
 

@@ -14,10 +14,10 @@ from tiny_captures import pixel_of, random_pixels, side_poses, write_image
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.readers.zju_mocap import FORMAT, read_zju_mocap
-from dyngs.errors import DyngsError
 
 K = np.array([[20.0, 0, 7.5], [0, 21, 5.5], [0, 0, 1]])
 LENS = np.array([[0.1], [-0.02], [0.003], [0.004], [0.0005]])

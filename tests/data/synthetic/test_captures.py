@@ -16,6 +16,7 @@ from dyngs.capture.inspection.report import inspect_capture
 from dyngs.cli import main
 from dyngs.cli.data import SYNTHETIC_SCENES
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.geometry import camera_center
 from dyngs.data.people_set import PEOPLE_FILE
@@ -34,8 +35,7 @@ from dyngs.data.synthetic.captures import (
 )
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, render_things
 from dyngs.data.synthetic.scenes import SceneName, scene_at
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.io.write import write_image
 
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
 SHORT = {"human": ("--cameras", "1"), "people": ("--people", "1", "--cameras", "2")}

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import hemisphere_cameras, orbit_cameras
 from dyngs.data.synthetic.raytrace import (
     CAMERA_ANGLE_X,
@@ -22,7 +23,6 @@ from dyngs.data.synthetic.raytrace import (
     render_scene,
 )
 from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
-from dyngs.errors import DyngsError
 
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
 NUM_STILL: dict[SceneName, int] = dict(zip(NAMES, (2, 4, 7, 1), strict=True))

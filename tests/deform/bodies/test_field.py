@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
+from dyngs.core.state import tensors_of
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.gaussians import TopologyEdit
-from dyngs.state import tensors_of
 
 CENTERS = torch.tensor([[0.2, -0.1, 0.3], [-0.4, 0.0, 0.1]])
 RADII = torch.tensor([0.2, 0.3])

@@ -12,7 +12,7 @@ import torch
 from rolling_ball import rolling
 from tiny_fields import cloud
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots, one_camera, shots_of

@@ -24,9 +24,9 @@ from scene_pages import (
     write,
 )
 
+from dyngs.core.metrics import psnr
 from dyngs.export.html.element import element_script
 from dyngs.export.html.page import ELEMENT
-from dyngs.metrics import psnr
 
 POLICY = "default-src 'none'; script-src 'self'; connect-src 'self'; style-src 'self'; "
 POLICY += "require-trusted-types-for 'script'; trusted-types 'none'"

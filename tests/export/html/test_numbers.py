@@ -14,7 +14,7 @@ from scene_kinds import KINDS, scene_of_kind
 
 from dyngs.export.html.numbers import CHUNK, Lists, add_scene
 from dyngs.human.avatar.scene import avatar_of
-from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.quaternions import rotation_matrices
 
 

@@ -30,19 +30,19 @@ from scene_pages import (
 from small_triangles import bent
 from small_triangles import camera as before_triangles
 
-from dyngs.camera import Cameras
-from dyngs.conventions import RasterizeMode
-from dyngs.errors import DyngsError
+from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import psnr, ssim
 from dyngs.export.html import numbers
 from dyngs.export.html.element import SCRIPTS, SHADERS
 from dyngs.export.html.page import MOST_VIEWS, PAGE, write_folder, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.metrics import psnr, ssim
 from dyngs.runs.opened import Opened, open_run, opened_scene
 from dyngs.static.scene import StaticScene
-from dyngs.triangles.scene import TriangleOptions, TriangleScene
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
     page = browser.open((tmp_path / "page.html").as_uri(), 320, 240, touch=True)
     page.wait_for("window.dyngs !== undefined")
     assert page.evaluate("dyngs.parts.bar.hidden")
-    before = page.evaluate("[dyngs.camera.yaw, dyngs.camera.distance]")
+    before = page.evaluate("[dyngs.core.camera.yaw, dyngs.core.camera.distance]")
     session = page.driven.context.new_cdp_session(page.driven)
 
     def touch(kind: str, *places: tuple[int, int]) -> None:
@@ -182,13 +182,13 @@ def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
     touch("touchStart", (100, 100))
     touch("touchMove", (140, 100))
     touch("touchEnd")
-    yaw, distance = page.evaluate("[dyngs.camera.yaw, dyngs.camera.distance]")
+    yaw, distance = page.evaluate("[dyngs.core.camera.yaw, dyngs.core.camera.distance]")
     assert yaw < before[0]
     assert distance == before[1]
     touch("touchStart", (100, 100), (140, 100))
     touch("touchMove", (80, 100), (160, 100))
     touch("touchEnd")
-    assert page.evaluate("dyngs.camera.distance") < 0.7 * distance
+    assert page.evaluate("dyngs.core.camera.distance") < 0.7 * distance
     assert page.errors == []
     page.close()
 

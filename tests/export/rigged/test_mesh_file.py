@@ -13,7 +13,7 @@ from bare_person import bands, bare_run, bare_scene, playing, random_clip, templ
 from gltf_skins import SkinnedGlb
 from moving_scene import write_moving_run
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.mesh_file import Played, write_mesh
 from dyngs.export.rigged.skeleton import body_mesh
 from dyngs.human.avatar.posing import PoseBlendShapes

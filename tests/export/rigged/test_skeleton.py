@@ -12,7 +12,7 @@ from bare_person import bare_run, bare_scene, playing, random_clip, template
 from gltf_skins import SkinnedGlb
 from synthetic_bodies import model, write_npz
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.mesh_file import mesh_document
 from dyngs.export.rigged.skeleton import (
     Rig,
@@ -23,22 +23,22 @@ from dyngs.export.rigged.skeleton import (
     rest_vertices,
     rig_of,
 )
-from dyngs.files.gltf import GlbDocument
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.gltf import read_gltf
-from dyngs.human.motion.placement import upright
-from dyngs.human.pose.skinning import (
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import apply_shape
+from dyngs.human.body.body_reader import read_body
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.skinning import (
     apply_transforms,
     axis_angle_to_matrix,
     blend_transforms,
     joint_transforms,
 )
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import apply_shape
-from dyngs.human.template.body_reader import read_body
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.motion.gltf import read_gltf
+from dyngs.human.motion.placement import upright
+from dyngs.io.gltf import GlbDocument
 
 GREY = np.full((4, 4, 3), 128, np.uint8)
 

@@ -12,13 +12,13 @@ from bare_person import bare_run, playing, random_clip
 from gltf_skins import SkinnedGlb
 from plyfile import PlyData
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.mesh_file import Played
 from dyngs.export.rigged.splat_files import write_rigged_splats
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.placement import upright
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
-from dyngs.splats.formats import read_splats
+from dyngs.io.formats.formats import read_splats
 
 
 def test_the_columns_and_comments_suffice_to_pose_the_person(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from dyngs.export.rigged.skeleton import anchor_normals
 from dyngs.export.rigged.surface import MARGINS, FittedSurface, fitted_surface
 from dyngs.export.rigged.texture import bake_texels
 from dyngs.gaussians import Gaussians
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.body.joints import JOINT_NAMES
 
 BODY = template()
 NORMALS = anchor_normals(bare_scene().anchors, BODY, BODY.vertices)

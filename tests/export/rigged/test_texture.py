@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from bare_person import atlas, bands, bare_scene, template
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.export.rigged.skeleton import anchor_normals
 from dyngs.export.rigged.texture import (
     BakedTexels,
@@ -19,7 +19,7 @@ from dyngs.export.rigged.texture import (
     texture_image,
 )
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.template.atlas import Texels, atlas_texels
+from dyngs.human.body.atlas import Texels, atlas_texels
 
 
 def baked(scene: HumanScene, texels: Texels) -> BakedTexels:

@@ -7,7 +7,7 @@ import torch
 from scenes import random_scene
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.bake import DIRECTIONS, sphere, with_harmonics
 from dyngs.gaussians.rendering import Shader

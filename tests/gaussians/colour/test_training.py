@@ -23,6 +23,7 @@ from dyngs.config import (
     ShColour,
     TrainConfig,
 )
+from dyngs.core.state import tensors_of
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
@@ -35,9 +36,8 @@ from dyngs.gaussians.colour.training import (
     rate_factor,
 )
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.kinds import GaussianTrainer, assemble, restored_scene
-from dyngs.state import tensors_of
 from dyngs.static.keys import StaticModel
+from dyngs.training.new_trainer import GaussianTrainer, assemble, restored_scene
 
 
 def gaussians() -> Gaussians:

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.view_dependence import (
     MeasuredView,

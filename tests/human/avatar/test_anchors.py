@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import (
     FINER,
@@ -25,11 +25,11 @@ from dyngs.human.avatar.anchors import (
     surface_texels,
     texel_gaussians,
 )
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.ops.quaternions import rotation_matrices
 
 RESOLUTION = 48

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.errors import DyngsError
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.anchors import Anchors
@@ -27,10 +27,10 @@ from dyngs.human.avatar.neighbours import (
     strains,
     trust_in,
 )
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body_reader import default_template, load_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.keys import HumanModel
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body_reader import default_template, load_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 
 @settings(max_examples=40, deadline=None)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.camera import Cameras
-from dyngs.conventions import SH_C0
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors

@@ -15,9 +15,9 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.data.capture import Capture, Silhouette, View
 from dyngs.data.loader import ImageLoader
-from dyngs.files.write import write_image
 from dyngs.human.avatar.outlines import OutlineLoss, outline_loss
 from dyngs.human.keys import HumanModel
+from dyngs.io.write import write_image
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Look
 from dyngs.models.renderable import Rendering

@@ -19,7 +19,7 @@ from posed_person import (
     person_and_cameras,
 )
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.pose_fit import (

@@ -11,7 +11,7 @@ import pytest
 import torch
 from posed_person import WHITE, Shown, disturbed, images_of, joints_of, person_and_cameras
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import ImageLoader
 from dyngs.human.avatar.pose_refit import LEAST_GAIN, LEAST_MOVE, PoseRefit
 from dyngs.human.avatar.scene import HumanScene

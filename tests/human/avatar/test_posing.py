@@ -16,7 +16,7 @@ import synthetic_bodies
 import torch
 from torch import Tensor
 
-from dyngs.conventions import SH_C0
+from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, skinning_weights, texel_gaussians
 from dyngs.human.avatar.posing import (
@@ -32,11 +32,11 @@ from dyngs.human.avatar.posing import (
     rest_offsets,
     rotate_sh,
 )
-from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import BodyTemplate, posed_vertices
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import BodyTemplate, posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.harmonics import evaluate_harmonics, light_harmonics
 from dyngs.ops.quaternions import rotation_matrices
 from tests.bare_person import atlas, bare_scene

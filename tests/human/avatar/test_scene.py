@@ -10,7 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
+from dyngs.core.state import part_of, tensors_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.schedule import Rates
@@ -25,12 +26,11 @@ from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body_reader import default_template
-from dyngs.state import part_of, tensors_of
 
 
 def random_clip(frames: int, seed: int = 0) -> MotionClip:

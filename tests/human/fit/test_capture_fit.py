@@ -15,11 +15,12 @@ from smpl_like import write_capture_of, write_smpl_like
 
 from dyngs.capture.fixed_camera import silhouettes_of
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.human.body.body_reader import default_template, read_body, rest_shape
+from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.fit import capture_fit, start
 from dyngs.human.fit.capture_fit import (
     GAIN,
@@ -39,9 +40,8 @@ from dyngs.human.fit.known_person import with_shape
 from dyngs.human.fit.silhouettes import surface_of
 from dyngs.human.fit.solve import VIEWS, InTurn, body_fit, new_fit
 from dyngs.human.motion.motion import captured_motion
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.body_reader import default_template, read_body, rest_shape
+from dyngs.io.write import write_image
 
 OPTIONS = HumanOptions(
     size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5

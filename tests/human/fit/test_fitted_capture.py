@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import moved, read_body_file
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.readers.transforms import read_frame_file, read_views
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image
+from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.fit import fitted_capture, start
 from dyngs.human.fit.fitted_capture import (
     FitInputs,
@@ -34,7 +34,7 @@ from dyngs.human.fit.solve import LensFit
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.body_reader import load_template, rest_shape
+from dyngs.io.write import write_image
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, View
 from dyngs.data.images.lens import distort
-from dyngs.errors import DyngsError
+from dyngs.human.body.body import BodyTemplate, posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.fit.keypoints import INNER, JOINTS, ORDERS, read_joints, read_keypoints
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
-from dyngs.human.template.body import BodyTemplate, posed_vertices
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 
 def view(name: str) -> View:

@@ -13,11 +13,12 @@ from synthetic_bodies import model, write_npz
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, OptimConfig, RunConfig, TrainConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
-from dyngs.errors import DyngsError
-from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.body_reader import default_template, read_body
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit.known_person import (
     AvatarPoses,
     KnownAvatar,
@@ -29,9 +30,8 @@ from dyngs.human.fit.known_person import (
 )
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.human.template.body_reader import default_template, read_body
-from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.kinds import assemble
+from dyngs.io.write import write_image, write_text
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 

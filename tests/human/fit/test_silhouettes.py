@@ -8,10 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import posed_vertices
+from dyngs.human.body.body_reader import default_template, read_body
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.fit.silhouettes import _OPTIONS as OPTIONS
 from dyngs.human.fit.silhouettes import (
     Surface,
@@ -20,10 +24,6 @@ from dyngs.human.fit.silhouettes import (
     observed_frame,
     surface_of,
 )
-from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.body import posed_vertices
-from dyngs.human.template.body_reader import default_template, read_body
 
 
 def image(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Image:

@@ -8,9 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.posing import posed_joints
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit import solve
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import (
@@ -38,8 +40,6 @@ from dyngs.human.fit.solve import (
     with_lens,
 )
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 SIZE = 32
 

@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.human.avatar.posing import posed_joints
+from dyngs.human.body.body_reader import default_template
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import drawn_frame, frame_pose_of, new_fit, usual_pose
 from dyngs.human.fit.start import (
@@ -33,7 +34,6 @@ from dyngs.human.fit.start import (
     up_of,
 )
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.template.body_reader import default_template
 
 
 def cost(errors: np.ndarray, path: tuple[int, ...], weight: float) -> float:

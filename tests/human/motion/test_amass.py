@@ -12,10 +12,10 @@ import torch
 from motion_files import random_motion, slow_vertices, tiny_body
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import read_amass, write_amass
 from dyngs.human.motion.motion import Motion, UpAxis
-from dyngs.human.template.joints import JOINT_NAMES
 
 SHARED = Path(__file__).parents[3] / "../shared/data"
 BODY = tiny_body()

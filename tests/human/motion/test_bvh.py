@@ -20,10 +20,10 @@ from motion_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.bvh import read_bvh
 from dyngs.human.motion.retarget import retarget
-from dyngs.human.template.joints import JOINT_NAMES
 
 TWO = """HIERARCHY
 ROOT Hip Bone {

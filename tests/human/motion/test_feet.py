@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.motion.feet import feet_kept, foot_contact, sole_points
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.motion.placement import moved
-from dyngs.human.pose.skinning import axis_angle_to_matrix
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 FPS = 30.0
 BODY = default_template()

@@ -26,11 +26,11 @@ from motion_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.gltf import read_gltf, read_vrm_animation
 from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import retarget
-from dyngs.human.template.joints import JOINT_NAMES
 
 BODY = tiny_body()
 MOTION = random_motion(5, angle=0.8)

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from motion_files import random_motion, tiny_body
 from scipy.spatial.transform import Rotation
 
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import body_frames
 from dyngs.data.capture import BodyFrames, View
-from dyngs.errors import DyngsError
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.motion.motion import (
     MAX_JOINT_POSES,
     Motion,
@@ -28,7 +29,6 @@ from dyngs.human.motion.motion import (
     same_bodies,
     sample_times,
 )
-from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
 BODY = tiny_body()
 

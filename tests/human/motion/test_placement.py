@@ -16,6 +16,7 @@ from motion_files import (
 )
 from torch import Tensor
 
+from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import MotionClip, motion_clip
 from dyngs.human.motion.placement import (
     place_like,
@@ -24,7 +25,6 @@ from dyngs.human.motion.placement import (
     up_direction,
     upright,
 )
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 
 
 def joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:

@@ -28,16 +28,16 @@ from motion_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.body import posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import (
     Motion,
     SkeletonMotion,
 )
 from dyngs.human.motion.placement import place_on_floor
 from dyngs.human.motion.retarget import RIGS, least_rotation, match_joints, read_motion, retarget
-from dyngs.human.template.body import posed_vertices
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 FILE = Path("walk.bvh")
 SIDED = ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot")

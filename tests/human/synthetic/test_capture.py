@@ -19,12 +19,15 @@ from scipy.spatial import ConvexHull
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.data.tracks import read_true_tracks
-from dyngs.errors import DyngsError
+from dyngs.human.body.body import BodyTemplate, posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import read_motion
 from dyngs.human.synthetic.capture import (
@@ -39,9 +42,6 @@ from dyngs.human.synthetic.capture import (
 )
 from dyngs.human.synthetic.clips import squat, walk
 from dyngs.human.synthetic.clothes import dress_body, paint_texture, random_outfit
-from dyngs.human.template.body import BodyTemplate, posed_vertices
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 TINY = HumanOptions(size=24, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1)
 LIGHT = np.array([0.35, 0.75, 0.56]) / np.linalg.norm([0.35, 0.75, 0.56])

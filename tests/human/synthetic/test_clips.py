@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from dyngs.human.body.body import BodyTemplate, posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.clips import random_clip, squat, walk
-from dyngs.human.template.body import BodyTemplate, posed_vertices
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 DANCE = partial(random_clip, seed=1)
 OTHER = partial(random_clip, seed=2)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.errors import DyngsError
+from dyngs.core.errors import DyngsError
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.synthetic.clothes import Outfit, dress_body, paint_texture, random_outfit
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.mesh import vertex_normals
 
 
 @cache

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.keypoints import (
     NUM_KEYPOINTS,
@@ -12,8 +14,6 @@ from dyngs.human.synthetic.keypoints import (
     joint_positions,
     joints_of_triangles,
 )
-from dyngs.human.template.body_reader import default_template
-from dyngs.human.template.joints import JOINT_NAMES
 
 
 def test_joints_follow_the_motion() -> None:

@@ -10,10 +10,10 @@ import torch
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.tracks import read_true_tracks
-from dyngs.errors import DyngsError
 from dyngs.human.synthetic.keypoints import KEYPOINTS_FILE, NUM_KEYPOINTS
 from dyngs.human.synthetic.people import SHARD, PeopleOptions, person_options, write_people
 

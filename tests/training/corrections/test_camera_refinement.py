@@ -14,13 +14,12 @@ from hypothesis import strategies as st
 from scenes import random_scene
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import CameraConfig, Config, DataConfig, RandomInit, RunConfig, TrainConfig
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import psnr
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
-from dyngs.kinds import assemble
-from dyngs.metrics import psnr
 from dyngs.static.scene import StaticScene
 from dyngs.training.corrections.camera_refinement import (
     MIN_POSES,
@@ -33,6 +32,7 @@ from dyngs.training.corrections.camera_refinement import (
     slopes,
     watched,
 )
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 SIZE = 2.5

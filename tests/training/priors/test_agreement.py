@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.training.priors.agreement import (
     depth_agreement,

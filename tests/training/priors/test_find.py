@@ -11,7 +11,7 @@ from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.kinds import assemble
+from dyngs.training.new_trainer import assemble
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
 

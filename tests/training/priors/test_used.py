@@ -7,7 +7,7 @@ import pytest
 import torch
 from moving_scene import MOVING_ROWS, SETUP, Sliding, camera, row_of_balls
 
-from dyngs.camera import Cameras
+from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.rendering import RenderOptions

@@ -1,0 +1,211 @@
+"""The frame that a scene gets: what is up, where the origin is, how long a unit is, or all of it by
+control points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.core.errors import DyngsError, printable, require_regular
+from dyngs.data.scene_space import MAX_DISTANCE
+from dyngs.io.formats.rotation import AXES, turn_between
+from dyngs.io.formats.similarity import Similarity, fitted
+from dyngs.io.formats.splat_file import geo_comment
+from dyngs.io.limits import require_at_most
+
+_FACTORS = (1e-9, 1e9)
+_MOST_BYTES = 1 << 20  # of a file of control points
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Two points (3,) of the scene, and how long their distance is to be."""
+
+    start: Point
+    end: Point
+    length: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What changes about the frame of a scene; None stays as it is.
+
+    Attributes:
+        up: direction (3,) of the scene that is up; "auto": by the cameras of its run.
+        origin: point (3,) of the scene that becomes the origin.
+        scale: factor, or a distance that is known.
+    """
+
+    up: Point | str | None = None
+    origin: Point | None = None
+    scale: float | Distance | None = None
+
+    def similarity(self, up: Sequence[float] | None, wanted: Sequence[float]) -> Similarity:
+        """Return the similarity that brings the direction ``up`` (3,) to ``wanted`` (3,), and does
+        the rest.
+
+        Without ``up`` nothing is turned. Raises DyngsError: the scale is no positive factor of
+        modest size.
+        """
+        found = Similarity(scale=_factor(self.scale))
+        if up is not None:
+            found = found.after(Similarity(turn_between(tuple(up), tuple(wanted))))
+        if self.origin is None:
+            return found
+        x, y, z = (-found.points(np.array(self.origin))).tolist()
+        return replace(found, shift=(x, y, z))
+
+
+def _factor(scale: float | Distance | None) -> float:
+    if scale is None:
+        return 1.0
+    length = scale.length if isinstance(scale, Distance) else scale
+    now = math.dist(scale.start, scale.end) if isinstance(scale, Distance) else 1.0
+    if not now > 0:
+        raise DyngsError("--scale: the two points are one; give points that are apart")
+    if not _FACTORS[0] <= length / now <= _FACTORS[1]:
+        what = "a positive factor, or two points and their distance"
+        raise DyngsError(
+            f"--scale: {length / now:g} is no factor from {_FACTORS[0]:g} to {_FACTORS[1]:g}; give {what}"
+        )
+    return length / now
+
+
+def point(text: str, option: str) -> Point:
+    """Return the point "x,y,z". Raises DyngsError: it is no such thing."""
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        shown = printable(repr(text), 60)
+        raise DyngsError(
+            f"{option}: {shown} is no point; write three numbers x,y,z without spaces, such as 0,-1.5,2"
+        )
+    return x, y, z
+
+
+def number(text: str, option: str) -> float:
+    """Return a finite number, after which "m" may stand. Raises DyngsError: it is no such thing."""
+    try:
+        found = float(text.removesuffix("m"))
+    except ValueError:
+        found = math.nan
+    if not math.isfinite(found):
+        raise DyngsError(f"{option}: {printable(repr(text), 60)} is no number; write it as 1.25")
+    return found
+
+
+def direction(text: str) -> Point | str:
+    """Return what ``--up`` names: an axis such as "-y", a direction "x,y,z", or "auto". Raises
+    DyngsError."""
+    if text == "auto":
+        return text
+    found = AXES[text] if text in AXES else point(text, "--up")
+    if not math.hypot(*found) > 0:
+        raise DyngsError(f"--up: {text} has no direction; give x,y,z, an axis such as -y, or auto")
+    return found
+
+
+def scale_of(text: str) -> float | Distance:
+    """Return what ``--scale`` names: a factor, or "x,y,z x,y,z LENGTH". Raises DyngsError:
+    neither."""
+    words = text.split()
+    if len(words) == 3:
+        start, end = (point(word, "--scale") for word in words[:2])
+        return Distance(start, end, number(words[2], "--scale"))
+    if len(words) != 1 or "," in text:
+        raise DyngsError(
+            f"--scale: {printable(repr(text), 60)}: give a factor, or 'x,y,z x,y,z LENGTH'"
+        )
+    return number(text, "--scale")
+
+
+@dataclass(frozen=True)
+class GeoFrame:
+    """Control points, or positions of photos, and what follows from them.
+
+    Attributes:
+        similarity: from the scene to the file.
+        offset: (3,) to be added to positions in the file for those in the world: 0, unless these
+            are too large for float32.
+        residuals: (P,) distances in the world that remain.
+        what, notes: what the points are, and lines about them.
+    """
+
+    similarity: Similarity
+    offset: Point
+    residuals: np.ndarray
+    what: str = "control points"
+    notes: tuple[str, ...] = ()
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Lines about the result for people."""
+        each = ", ".join(f"{x:.3g}" for x in self.residuals[:12]) + (
+            ", ..." if len(self.residuals) > 12 else ""
+        )
+        mean = math.sqrt(float(np.square(self.residuals).mean()))
+        count = f"{len(self.residuals):,} {self.what}"
+        found = f"{count}: scale {self.similarity.scale:.6g}; residuals {each}; root mean square {mean:.3g}"
+        return (found, *self.notes, *([self.comment] if any(self.offset) else []))
+
+    @property
+    def comment(self) -> str:
+        """What the header of the file says of the offset."""
+        return geo_comment(self.offset)
+
+
+def geo_frame(path: Path) -> GeoFrame:
+    """Return the frame of control points. Raises DyngsError: no such file, or they do not determine
+    it."""
+    points, world = np.split(_control_points(path), 2, axis=1)
+    try:
+        found = fitted(points, world)
+    except DyngsError as error:
+        raise DyngsError(f"{path}: {error}") from None
+    if not _FACTORS[0] <= found.scale <= _FACTORS[1]:
+        raise DyngsError(
+            f"{path}: the scale would be {found.scale:.3g}; check the units of the control points"
+        )
+    residuals = np.linalg.norm(found.points(points) - world, axis=1)
+    middle = world.mean(axis=0).round()
+    spread = np.linalg.norm(world - middle, axis=1).max()
+    distance = np.linalg.norm(middle)
+    if distance > MAX_DISTANCE * spread:
+        x, y, z = (np.array(found.shift) - middle).tolist()
+        a, b, c = middle.tolist()
+        return GeoFrame(replace(found, shift=(x, y, z)), (a, b, c), residuals)
+    return GeoFrame(found, (0.0, 0.0, 0.0), residuals)
+
+
+def _control_points(path: Path) -> np.ndarray:
+    """Return rows (P, 6) float64 of a text file: x y z in the scene, X Y Z in the world; first
+    names, # remarks."""
+    if not path.exists():
+        raise DyngsError(f"{path}: no such file; give rows of x,y,z,X,Y,Z")
+    require_regular(path)
+    require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of control points")
+    rows: list[list[float]] = []
+    lines = enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
+    told = [(i, line) for i, line in lines if line.strip() and not line.lstrip().startswith("#")]
+    for index, (line_number, line) in enumerate(told):
+        words = line.replace(",", " ").replace(";", " ").split()
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            if index == 0:  # names of columns
+                continue
+            row = []
+        if len(row) != 6 or not np.isfinite(row).all():
+            shown = printable(repr(line), 60)
+            raise DyngsError(
+                f"{path}: line {line_number} is {shown}, not six numbers x,y,z,X,Y,Z (scene, then world)"
+            )
+        rows.append(row)
+    return np.array(rows, np.float64).reshape(-1, 6)

@@ -1,0 +1,222 @@
+"""KeypointNeRF (Mihajlovic et al. 2022): a field whose points are placed by their depth relative to
+key points.
+
+Samples lie where all images show the person. Per image, the network knows a sample by how much
+nearer or farther it is to that camera than each key point nearby, and by the features of the pixel;
+mean and variance over images give the density, and weights by which the colours of the images are
+blended.
+
+Local letters: V images, M samples, J key points, R rays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool2d, softplus
+
+from dyngs.baselines.fields.space import rays_of
+from dyngs.baselines.fields.thinning import kept_samples, reached_samples, thinned_samples
+from dyngs.core.camera import Cameras
+from dyngs.human.body.joints import JOINT_PARENTS
+from dyngs.human.predict.fields.features import (
+    FINE,
+    Perceptron,
+    Seen,
+    begin,
+    between,
+    blended,
+    mean_and_variance,
+)
+from dyngs.human.predict.fields.keys import KeypointNerfModel
+from dyngs.human.predict.fields.network import CHUNK, NEAR, FieldNetwork, Known, Picture
+from dyngs.human.predict.fields.people import KEY_POINTS, Body, Sources
+from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
+
+OCTAVES = 3
+CODE = KEY_POINTS * (1 + 2 * OCTAVES)
+REACH = 0.1  # Standard deviation of how far a key point counts, m
+AROUND = 0.3  # m around the bones that a person fills
+CELLS = 32  # Of the cube around a person, along an axis
+VISIBLE = 0.1  # Alpha from which an image shows the person
+DENSEST = 100.0  # Density, per m, that the network's output is a multiple of
+THICK = 0.065  # How far the surface is from the bones at first, m
+STEEP = 60.0  # By how much raw densities fall at first, per m from the bones
+HINTS = 4  # What is known of a sample from the bones and the silhouettes
+POOLED, GEOMETRY = 32, 24  # Features of a sample per image, and of what is known about its surface
+
+
+@dataclass(frozen=True)
+class Hull:
+    """The cells of a cube that all images show in the silhouette."""
+
+    space: Space
+    occupied: Tensor  # bool of ``space.shape``
+
+
+class KeypointNerf(FieldNetwork):
+    """See the module."""
+
+    def __init__(self, model: KeypointNerfModel, generator: torch.Generator) -> None:
+        super().__init__(model.features)
+        width = model.width
+        colours = 3 + FINE + GEOMETRY
+        self.step = model.step
+        self.per_image = Perceptron(CODE + model.features + FINE, width, width, POOLED)
+        self.geometry = Perceptron(2 * POOLED + HINTS, width, width, 1 + GEOMETRY)
+        self.blend = Perceptron(3 * colours + 4, width, width // 2, 1)
+        begin(self, generator)
+
+    def prepared(self, seen: Seen, body: Body) -> Hull:
+        return hull(seen, body.key_points)
+
+    def picture(
+        self, known: Known, camera: Cameras, generator: torch.Generator | None = None
+    ) -> Picture:
+        rays, _ = rays_of(camera)
+        if generator is None:
+            shifts = rays.origins.new_full((len(rays),), 0.5)
+        else:
+            shifts = torch.rand(len(rays), generator=generator, device="cpu").to(rays.origins)
+        pieces = [len(rays)] if torch.is_grad_enabled() else [CHUNK] * -(-len(rays) // CHUNK)
+        found = []
+        first = 0
+        for size in pieces:
+            some = slice(first, first + size)
+            found.append(self._along(known, rays[some], shifts[some]))
+            first += size
+        colour, through, depth = (torch.cat(x) for x in zip(*found, strict=True))
+        shape = camera.height, camera.width
+        return Picture(colour.view(*shape, 3), through.view(shape), depth.view(shape))
+
+    def _along(self, known: Known, rays: Rays, shifts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return colours before black (R, 3), transmittance (R,), and sums of weight times distance
+        (R,)."""
+        seen = known.seen
+        own = known.own
+        samples = march(rays, shifts, own.space, own.occupied, Steps(NEAR, self.step))
+        learns = torch.is_grad_enabled()
+        with torch.no_grad():  # which samples are worth it takes their densities alone
+            samples = kept_samples(
+                samples, (seen.alpha(places(samples, own.space)) > VISIBLE).all(0)
+            )[0]
+            points = places(samples, own.space)
+            code = spatial_code(points, known.body.key_points, seen.sources)
+            geometry = self._geometry(known, points, code)
+            if learns:
+                samples, which = thinned_samples(density(geometry), samples, shifts)
+            else:
+                samples, which = reached_samples(density(geometry), samples)
+            points = points[which]
+            geometry = geometry[which]
+        if learns:
+            geometry = self._geometry(known, points, code[:, which])
+        densities = density(geometry)
+        colours = self._colours(seen, geometry, points, rays.directions[samples.rays.long()])
+        drawn = composite(densities, colours, samples)
+        return drawn.colour, drawn.transmittance, drawn.depth
+
+    def _geometry(self, known: Known, points: Tensor, code: Tensor) -> Tensor:
+        """Return (M, 1 + GEOMETRY): raw densities, and what is known of the surface at points (M,
+        3).
+
+        Densities begin with those of limbs of one thickness.
+        """
+        looked = known.seen.look(points)
+        bone = from_bones(points, known.body.key_points)[:, None]
+        per_image = self.per_image(torch.cat([code, looked.features], -1))
+        held = torch.stack([looked.alpha.amin(0), looked.alpha.mean(0)], -1)
+        hints = torch.cat([bone / REACH, (bone / REACH).square(), held], -1)
+        found = self.geometry(torch.cat([mean_and_variance(per_image), hints], -1))
+        return torch.cat([found[:, :1] + STEEP * (THICK - bone), found[:, 1:]], -1)
+
+    def _colours(self, seen: Seen, geometry: Tensor, points: Tensor, directions: Tensor) -> Tensor:
+        """Return (M, 3) colours: of the images, blended."""
+        looked = seen.look(points)
+        count = len(seen.sources)
+        own = torch.cat(
+            [looked.rgb, looked.features[..., -FINE:], geometry[:, 1:].expand(count, -1, -1)], -1
+        )
+        both = mean_and_variance(own).expand(count, -1, -1)
+        apart = between(directions, points, seen.sources.centers)
+        logits = self.blend(torch.cat([own, both, apart], -1))[..., 0]
+        return blended(logits, looked.rgb)
+
+
+def density(geometry: Tensor) -> Tensor:
+    """Return (M,) densities, per m, of raw ones in the first column."""
+    return DENSEST * softplus(geometry[:, 0])
+
+
+@torch.no_grad()
+def spatial_code(points: Tensor, key_points: Tensor, sources: Sources) -> Tensor:
+    """Return the code (V, M, CODE) of points (M, 3): their depths relative to each key point (J,
+    3), in each camera.
+
+    dz, then sine and cosine of pi 2^l dz of each octave l, all times exp(-d^2 / (2 REACH^2)) with
+    the distance d in m.
+    """
+    apart = points[:, None] - key_points
+    weight = (-apart.square().sum(-1) / (2 * REACH**2)).exp()[None]
+    axes = sources.cam_from_world[:, 2, :3]
+    dz = (axes @ apart.view(-1, 3).T).view(len(axes), *apart.shape[:2])
+    sine = (math.pi * dz).sin()
+    cosine = (math.pi * dz).cos()
+    parts = [dz]
+    for octave in range(OCTAVES):
+        if octave:
+            sine, cosine = 2 * sine * cosine, 1 - 2 * sine.square()
+        parts += [sine, cosine]
+    return torch.cat([part * weight for part in parts], -1)
+
+
+@torch.no_grad()
+def hull(seen: Seen, key_points: Tensor) -> Hull:
+    """Return the cells of a cube that hold a place which all images show as the person.
+
+    They are no further than ``AROUND`` from the bones between the key points (J, 3).
+    """
+    low = key_points.amin(0)
+    high = key_points.amax(0)
+    half = float((high - low).max()) / 2 + AROUND
+    x, y, z = ((low + high) / 2).tolist()
+    space = Space((x, y, z), half, 1, CELLS)
+    axis = (torch.arange(CELLS, device=low.device) + 0.5) * (2 * half / CELLS) - half
+    z, y, x = torch.meshgrid(*(axis + middle for middle in reversed(space.centre)), indexing="ij")
+    middles = torch.stack([x, y, z], -1).view(-1, 3)
+    grid, depth = seen.projected(middles)
+    sources = seen.sources
+    reach = half / CELLS * math.sqrt(3)
+    occupied = torch.ones(len(middles), dtype=torch.bool, device=low.device)
+    for i in range(len(sources)):
+        nearest = max(float(depth[i].min()), NEAR)
+        # that a cell may reach over
+        pixels = math.ceil(reach * float(sources.intrinsics[i, 0, 0]) / nearest) + 1
+        alpha = max_pool2d(sources.rgba[i : i + 1, 3:], (2 * pixels + 1, 1), 1, (pixels, 0))
+        alpha = max_pool2d(alpha, (1, 2 * pixels + 1), 1, (0, pixels))
+        occupied &= (
+            grid_sample(alpha, grid[i][None, None], mode="nearest", align_corners=False)[0, 0, 0]
+            > VISIBLE
+        )
+    where = occupied.nonzero()[:, 0]
+    occupied[where] = from_bones(middles[where], key_points) < AROUND
+    return Hull(space, occupied.view(space.shape))
+
+
+def from_bones(points: Tensor, key_points: Tensor) -> Tensor:
+    """Return the distance (M,) of points (M, 3) to the nearest bone, m; ``key_points`` (J, 3)."""
+    nearest = (points - key_points[0]).norm(dim=1)
+    for joint, parent in enumerate(JOINT_PARENTS[1 : len(key_points)], start=1):
+        start = key_points[parent]
+        along = key_points[joint] - key_points[parent]
+        at = ((points - start) @ along / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
+        nearest = torch.minimum(nearest, (points - start - at[:, None] * along).norm(dim=1))
+    return nearest
+
+
+def places(samples: Samples, space: Space) -> Tensor:
+    """Return (M, 3) the middles of samples."""
+    return (samples.coords - 0.5) * (2 * space.half) + samples.coords.new_tensor(space.centre)

@@ -1,0 +1,36 @@
+"""Section ``model`` of the network that predicts people from pairs of views."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dyngs.core.section import Fraction, Positive, SceneModel
+
+
+class GpsModel(SceneModel):
+    """A network that predicts people from pairs of neighbouring views (docs/people_network.md)."""
+
+    kind: Literal["gps"] = Field(
+        default="gps",
+        description="a network that predicts people from two neighbouring views, after GPS-Gaussian "
+        "(docs/people_network.md)",
+    )
+    person_px: int = Field(
+        default=256,
+        ge=32,
+        le=4096,
+        description="height of the person in the rectified views, px; a Gaussian per pixel",
+    )
+    widths: tuple[
+        Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]
+    ] = Field(
+        default=(24, 40, 64),
+        description="channels of the features of images at 1/4, 1/8 and 1/16 of the resolution",
+    )
+    depth_fraction: Fraction = Field(
+        default=0.4,
+        description="fraction of the steps in which only the depth is learned, from depth maps",
+    )
+    lr: Positive = Field(default=1e-3, description="highest learning rate of AdamW (one cycle)")

@@ -1,1 +1,0 @@
-"""Body templates: files, rest shape, skinning weights, texture atlas."""

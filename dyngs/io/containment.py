@@ -1,0 +1,138 @@
+"""Containment of untrusted captures: their files must lie in their folder, their images must not be
+too large.
+
+A capture may name any file of the user as one of its images, by a link, an absolute path or ``..``,
+and an image of a few kilobytes may fill all memory. Every path is checked here before it is opened,
+every image before it is decoded.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dyngs.core.errors import DyngsError, require_regular
+
+MAX_MEGAPIXELS = 150.0
+"""Default of ``data.max_megapixels``: 1e6 pixels that an image may have."""
+_MAX_LISTED = 100_000
+"""Entries of a capture that are searched for links."""
+
+
+@dataclass(frozen=True)
+class _Boundary:
+    """The folder that files must lie in: ``root``, and ``real`` with links resolved; ``folders`` is
+    a cache."""
+
+    root: Path
+    real: str
+    folders: dict[str, str] = field(default_factory=dict)
+
+    def resolved(self, path: Path) -> str:
+        """Resolve links in the path; each folder is resolved once."""
+        folder, name = os.path.split(path)
+        if name in ("", ".", "..") or os.path.islink(path):
+            return os.path.realpath(path)
+        if folder not in self.folders:
+            self.folders[folder] = os.path.realpath(folder)
+        return os.path.join(self.folders[folder], name)
+
+
+_boundary: ContextVar[_Boundary | None] = ContextVar("boundary", default=None)
+_links_of_runs: ContextVar[bool] = ContextVar("links_of_runs", default=False)
+_max_megapixels: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
+
+
+@contextmanager
+def staying_within(root: Path, follow_links: bool = False) -> Iterator[None]:
+    """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
+    ``follow_links``."""
+    token = _boundary.set(None if follow_links else _Boundary(root, os.path.realpath(root)))
+    try:
+        yield
+    finally:
+        _boundary.reset(token)
+
+
+@contextmanager
+def following_links_of_runs(allowed: bool) -> Iterator[None]:
+    """Set whether ``data.follow_links`` holds for runs that are opened in the block.
+
+    The user decides this on the command line: the config.yaml of a run may be that of a stranger.
+    """
+    token = _links_of_runs.set(allowed)
+    try:
+        yield
+    finally:
+        _links_of_runs.reset(token)
+
+
+def follows_links_of_runs() -> bool:
+    """Return whether the innermost block of ``following_links_of_runs`` allows it."""
+    return _links_of_runs.get()
+
+
+@contextmanager
+def images_up_to(megapixels: float) -> Iterator[None]:
+    """Set how many 1e6 pixels an image may have in the block, instead of ``MAX_MEGAPIXELS``."""
+    token = _max_megapixels.set(megapixels)
+    try:
+        yield
+    finally:
+        _max_megapixels.reset(token)
+
+
+def inside(path: Path) -> Path:
+    """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
+    boundary = _boundary.get()
+    if boundary is not None and not _is_below(real := boundary.resolved(path), boundary.real):
+        leads = "" if real == str(path) else f" leads to {real}, which"
+        raise DyngsError(
+            f"{path}:{leads} lies outside the capture {boundary.root}; copy the file into the capture, or, if you "
+            "trust it to name files of yours, set data.follow_links=true"
+        )
+    require_regular(path)
+    return path
+
+
+def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
+    """Check that an image is not too large to be decoded; more than four channels count in
+    proportion."""
+    megapixels = width * height * max(channels / 4, 1) / 1e6
+    limit = _max_megapixels.get()
+    if megapixels > limit:
+        many = f" of {channels} channels" if channels > 4 else ""
+        raise DyngsError(
+            f"{path}: {width}x{height} pixels{many} are {megapixels:.5g} megapixels, but data.max_megapixels is "
+            f"{limit:g}; shrink the image, or raise it if there is memory for that (some 30 MB per megapixel)"
+        )
+
+
+def max_decoded_mb() -> int:
+    """Return the 2^20 bytes that the largest allowed image takes with four channels of floats."""
+    return max(1, round(_max_megapixels.get() * 16e6 / 2**20))
+
+
+def leaving_links(root: Path) -> list[tuple[Path, str]]:
+    """List links among the first 100,000 entries below ``root`` that lead out of it, with targets;
+    none is followed."""
+    real = os.path.realpath(root)
+    found = []
+    seen = 0
+    for folder, names, files in os.walk(root):
+        for name in sorted((*names, *files)):
+            path = Path(folder, name)
+            if os.path.islink(path) and not _is_below(os.path.realpath(path), real):
+                found.append((path, os.path.realpath(path)))
+        seen += len(names) + len(files)
+        if seen > _MAX_LISTED:
+            break
+    return found
+
+
+def _is_below(real: str, root: str) -> bool:
+    return real == root or real.startswith(root.rstrip(os.sep) + os.sep)

@@ -1,0 +1,113 @@
+"""JSON files and checks of values in dictionaries from files: required keys, numbers, matrices."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, TextIO, TypeGuard
+
+import numpy as np
+
+from dyngs.core.errors import DyngsError, reading
+from dyngs.io.containment import inside
+from dyngs.io.limits import read_limited
+
+LARGEST = 1e30
+"""Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
+
+
+def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
+    """Read the JSON object in ``path``, UTF-8, 16 or 32. ``what``: the error for anything else."""
+    fields = read_json(path)
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{path}: {what}")
+    return fields
+
+
+def read_json(path: Path) -> object:
+    """Read the JSON in ``path``: UTF-8, 16 or 32."""
+    with reading(path, "it must be a JSON file; copy or export it again"):
+        try:
+            return json.loads(read_limited(inside(path)))
+        except json.JSONDecodeError as error:
+            where = f"{path}, line {error.lineno} column {error.colno}"
+            raise DyngsError(
+                f"{where}: broken JSON ({error.msg}); copy or export it again"
+            ) from error
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file within the limit on its size, UTF-8 or, as its first bytes show,
+    UTF-16 or UTF-32."""
+    data = read_limited(inside(path))
+    return data.decode(json.detect_encoding(data))
+
+
+def open_text(path: Path) -> TextIO:
+    """Open a text file for reading, UTF-8 or, as its first bytes show, UTF-16 or UTF-32."""
+    with inside(path).open("rb") as file:
+        start = file.read(4)
+    return path.open(encoding=json.detect_encoding(start))
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether a value from a JSON file is a number; true and false are not."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def matrix_of(where: str, key: str, value: object) -> np.ndarray:
+    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not
+    checked."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise DyngsError(f"{where}: {key} must hold 4x4 numbers; export it again") from None
+
+
+def entry(where: object, fields: object, key: str) -> Any:
+    """Return ``fields[key]`` of a dictionary from a file."""
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{where}: must be a dictionary with the key '{key}'; export it again")
+    if key not in fields:
+        raise DyngsError(f"{where}: the key '{key}' is missing; export it again")
+    return fields[key]
+
+
+def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
+    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the
+    file may differ."""
+    array = float_array(value)
+    fits = array is not None and (shape is None or array.size == math.prod(shape))
+    if array is None or not fits or not (np.abs(array) <= LARGEST).all():
+        count = "x".join(map(str, shape)) + " " if shape else ""
+        raise DyngsError(f"{where} must hold {count}finite numbers; export it again")
+    return array.ravel() if shape is None else array.reshape(shape)
+
+
+def first_few(items: Collection[object]) -> str:
+    """Return the first five items as text for messages, and how many more there are."""
+    return ", ".join(str(item) for item in list(items)[:5]) + (
+        f" and {len(items) - 5} more" if len(items) > 5 else ""
+    )
+
+
+def float_array(value: object) -> np.ndarray | None:
+    """Return ``value`` as a float64 array, None where it holds anything but numbers."""
+    try:
+        array = np.asarray(value) if _is_numeric(value) else None
+        return (
+            array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
+        )
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _is_numeric(value: object) -> bool:
+    """Whether it holds only numbers: NumPy would pad every text among them to the longest."""
+    if isinstance(value, (list, tuple)):
+        return all(_is_numeric(part) for part in value)
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    return isinstance(value, (int, float, np.generic)) and not isinstance(value, (str, bytes))

@@ -1,0 +1,334 @@
+"""One reader and one writer for all files of Gaussians; the suffix names the format."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+
+import torch
+
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError, reading, require_regular
+from dyngs.gaussians import Gaussians
+from dyngs.io.formats.edit_note import note_path, read_note, write_note
+from dyngs.io.formats.rotation import AXES, axis_of, product, turn_between
+from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.splat_file import (
+    GEO_OFFSET,
+    Nonfinite,
+    SplatFile,
+    drawable,
+    move_to_origin,
+    offset_notes,
+    require_writable,
+    unit_rotations,
+    with_degree,
+)
+from dyngs.io.write import atomic_file
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format of Gaussians."""
+
+    name: str  # as ``--format`` takes it
+    suffixes: tuple[str, ...]  # of its files, lower case; the first one is written
+    up: str  # axis that viewers of these files take for up
+    max_degree: int  # largest degree of the harmonics that it holds
+    states_mode: bool  # whether it can say that the scene is antialiased
+    home: tuple[str, str, str]  # module and the names of its reader and its writer
+    # smallest and largest logarithm of a size that it holds
+    log_scales: tuple[float, float] = (-math.inf, math.inf)
+
+    @property
+    def holds_comments(self) -> bool:
+        """Return whether its files say how they were turned and edited; beside others lies a note
+        about edits."""
+        return self.home[0] in ("ply", "gltf", "usd", "sog")
+
+    @property
+    def reader(self) -> Callable[[Path], SplatFile]:
+        """Return the function that reads it."""
+        return getattr(import_module(f"dyngs.io.formats.{self.home[0]}"), self.home[1])
+
+    @property
+    def writer(self) -> Callable[[Path, SplatFile], None]:
+        """Return the function that writes it."""
+        return getattr(import_module(f"dyngs.io.formats.{self.home[0]}"), self.home[2])
+
+
+FORMATS = (
+    Format(
+        "compressed-ply",
+        (".compressed.ply",),
+        "-y",
+        3,
+        True,
+        ("ply", "read_ply", "write_compressed"),
+    ),
+    Format("ply", (".ply",), "-y", 4, True, ("ply", "read_ply", "write_ply")),
+    Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz"), (-10.0, 5.9375)),
+    Format(
+        "splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")
+    ),
+    Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
+    Format("glb", (".glb",), "y", 3, False, ("gltf", "read_gltf", "write_gltf")),
+    Format("usd", (".usdc", ".usd", ".usda"), "y", 4, False, ("usd", "read_usd", "write_usd")),
+)
+"""All formats; a suffix that ends another one stands after it."""
+SPZ_4 = Format("spz", (".spz",), "y", 4, True, ("spz", "read_spz", "write_spz_4"), (-10.0, 5.9375))
+GLB_OF_SPZ = Format(
+    "glb", (".glb",), "y", 3, True, ("gltf", "read_gltf", "write_compressed"), (-10.0, 5.9375)
+)
+"""Other ways to write files of a suffix."""
+SOG_META, SOG_INDEX = "meta.json", "lod-meta.json"
+"""Files of a .sog as a folder, and of one in levels of detail."""
+CHECKPOINT = Format(
+    "checkpoint", (".ckpt", ".pt"), "z", 4, False, ("checkpoint", "read_checkpoint", "")
+)
+"""Read, never written."""
+SYSTEM_OF_UP = {"y": 4, "-y": 6, "z": 12, "-z": 14}
+"""Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot
+state others."""
+# fraction of the Gaussians that may be of a size that a format does not hold, without a note
+_MOST_LOST = 0.01
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file that was written."""
+
+    path: Path  # of it
+    splat: SplatFile  # what is read from it, but for what the format rounded
+    notes: tuple[str, ...] = ()  # a line about each thing that the format could not hold
+
+
+def format_of(path: Path) -> Format:
+    """Return the format that the suffix of ``path`` names. Raises DyngsError: none does; names all
+    of them."""
+    found = known_format(path)
+    if found is None:
+        given = (
+            f"the suffix {path.suffix!r} names" if path.suffix else "a name without a suffix names"
+        )
+        raise DyngsError(f"{path}: {given} no format of Gaussians; use one of {all_suffixes()}")
+    return found
+
+
+def known_format(path: Path) -> Format | None:
+    """Return the format that the suffix of ``path`` names, None if none does."""
+    name = path.name.lower()
+    for candidate in FORMATS:
+        if any(name.endswith(suffix) and name != suffix for suffix in candidate.suffixes):
+            return candidate
+    return None
+
+
+def format_to_read(path: Path) -> Format | None:
+    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if
+    it is none.
+
+    A run is none, whatever lies in its folder. Raises DyngsError as of ``sog_meta``.
+    """
+    if path.is_dir():
+        is_run = (path / "config.yaml").is_file()
+        return None if is_run or sog_meta(path) is None else format_named("sog")
+    if sog_meta(path) is not None:
+        return format_named("sog")
+    return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
+
+
+def sog_meta(path: Path) -> Path | None:
+    """Return the ``meta.json`` that is, or lies in, ``path``; None: it is something else.
+
+    Raises DyngsError: it is the index of a .sog in levels of detail.
+    """
+    if path.name == SOG_INDEX or (path / SOG_INDEX).is_file():
+        raise DyngsError(
+            f"{path}: is a .sog in levels of detail; give the {SOG_META} of one of its folders, such as 0_0"
+        )
+    if path.name == SOG_META:
+        return path
+    return path / SOG_META if (path / SOG_META).is_file() else None
+
+
+def format_named(name: str) -> Format:
+    """Return the format called ``name``. Raises DyngsError if there is none."""
+    for candidate in FORMATS:
+        if candidate.name == name:
+            return candidate
+    raise DyngsError(
+        f"no format {name!r:.30} of Gaussians; use one of {', '.join(f.name for f in FORMATS)}"
+    )
+
+
+def all_suffixes() -> str:
+    """Return the suffixes of all formats, for messages."""
+    return ", ".join(suffix for found in FORMATS for suffix in found.suffixes)
+
+
+def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFile:
+    """Read a file of Gaussians; its suffix names the format.
+
+    ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the
+    file. Opacities of exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError:
+    an unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated
+    before the header has been compared with the size of the file.
+    """
+    path = Path(path)
+    own = format_to_read(path) or format_of(path)
+    if not path.exists():
+        raise DyngsError(f"{path}: no such file")
+    require_regular(path)
+    path = sog_meta(path) or path
+    with reading(path):
+        splat = own.reader(path)
+        if splat.up is None:
+            splat = replace(splat, up=own.up)
+        if splat.edited == UNMOVED and own.home[0] != "ply":
+            splat = replace(splat, edited=read_note(path))
+        return drawable(move_to_origin(splat), path, nonfinite)
+
+
+def chosen_variant(usual: Format, spz_version: int | None, compress: str | None) -> Format:
+    """Return the format that ``--spz-version`` or ``--compress`` chooses.
+
+    Raises DyngsError: an option of another format.
+    """
+    if spz_version is not None and usual.name != "spz":
+        raise DyngsError(f"--spz-version goes with .spz files, not with {usual.suffixes[0]}")
+    if compress is not None and usual.name != "glb":
+        raise DyngsError(f"--compress goes with .glb files, not with {usual.suffixes[0]}")
+    if compress is not None:
+        return GLB_OF_SPZ
+    return SPZ_4 if spz_version == 4 else usual
+
+
+def write_splats(
+    path: Path | str, splat: SplatFile, *, sh_degree: int | None = None, own: Format | None = None
+) -> Written:
+    """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names
+    the format.
+
+    ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None:
+    up to what the format holds. ``own``: ``SPZ_4`` or ``GLB_OF_SPZ`` instead of the usual format of
+    the suffix. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree
+    that the format does not hold.
+    """
+    path = Path(path)
+    own = own or format_of(path)
+    whole, notes = fitted(path, own, splat, sh_degree)
+    with atomic_file(path) as temporary:
+        try:
+            own.writer(temporary, whole)
+        except DyngsError as error:
+            reason = str(error).removeprefix(f"{temporary}: ")
+            raise DyngsError(f"{path}: not written: {reason}") from error
+    if own is SPZ_4 and whole.up in SYSTEM_OF_UP:
+        whole = upright(whole, own.up, path)  # as its reader turns what states its axes
+    if not own.holds_comments and whole.edited != UNMOVED:
+        write_note(path, whole.edited)
+        notes += (
+            f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does",
+        )
+    return Written(path, whole, notes)
+
+
+def fitted(
+    path: Path, own: Format, splat: SplatFile, sh_degree: int | None
+) -> tuple[SplatFile, tuple[str, ...]]:
+    """Return what a format can hold of a scene, on the CPU, and a line about each thing that it
+    cannot.
+
+    ``path``: for messages. ``sh_degree`` and errors: as of ``write_splats``.
+    """
+    gaussians = splat.gaussians.detach().to(device="cpu", dtype=torch.float32)
+    notes = []
+    require_writable(path, gaussians)
+    if sh_degree is not None and sh_degree > own.max_degree:
+        raise DyngsError(
+            f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}"
+        )
+    degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree
+    if degree < gaussians.sh_degree and bool(gaussians.sh[:, (degree + 1) ** 2 :].any()):
+        why = f"{own.name} holds no more" if sh_degree is None else "as asked for"
+        notes.append(f"harmonics above degree {degree} are left out: {why}")
+    if splat.mode is RasterizeMode.ANTIALIASED and not own.states_mode:
+        notes.append(
+            f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker"
+        )
+    smallest, largest = own.log_scales
+    longest = gaussians.log_scales.amax(1)
+    lost = int(((longest < smallest) | (longest > largest)).sum())
+    if lost > _MOST_LOST * len(gaussians):
+        held = f"{own.name} holds sizes from {math.exp(smallest):.2g} to {math.exp(largest):.2g}"
+        notes.append(
+            f"{held}, those of {lost:,} Gaussians are changed: `dyngs edit --scale` gives another unit"
+        )
+    notes += offset_notes(
+        splat, "the file states it" if own.holds_comments else f"{own.name} cannot state it"
+    )
+    return replace(splat, gaussians=_unit(with_degree(gaussians, degree))), tuple(notes)
+
+
+def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
+    """Return the contents turned so that what points up in them points along the axis ``up`` of a
+    file.
+
+    ``splat``: unchanged where it does not say what points up. ``up``: axis such as "-y"; None: what
+    viewers of the format of ``path`` take for up; "keep": nothing is turned.
+    """
+    if up == "keep" or splat.up is None:
+        return splat
+    wanted = format_of(path).up if up is None else up
+    return turned_file(splat, turn_between(axis_of(splat.up), axis_of(wanted)), wanted)
+
+
+def turned_file(
+    splat: SplatFile, turn: tuple[float, float, float, float], up: str | None
+) -> SplatFile:
+    """Return the contents turned by a quaternion wxyz about the origin, ``up`` being what then
+    points up."""
+    if splat.edited == UNMOVED:
+        gaussians = Similarity(turn).gaussians(splat.gaussians)
+        return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
+    return moved_file(splat, Similarity(turn), up)
+
+
+def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
+    """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what
+    then points up."""
+    edited = replace(
+        splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited)
+    )
+    return edited if how == UNMOVED else _without_offset(edited)
+
+
+def undone_file(splat: SplatFile) -> SplatFile:
+    """Return the contents as they lay before all of ``moved_file``; up is known where it was an
+    axis."""
+    back = splat.edited.inverse()
+    before = None if splat.up is None else back.rotation @ axis_of(splat.up)
+    up = next(
+        (name for name, axis in AXES.items() if before is not None and before @ axis > 1 - 1e-6),
+        None,
+    )
+    return _without_offset(
+        replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
+    )
+
+
+def _without_offset(splat: SplatFile) -> SplatFile:
+    return replace(
+        splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET))
+    )
+
+
+def _unit(gaussians: Gaussians) -> Gaussians:
+    norms = gaussians.quats.double().norm(dim=1, keepdim=True)
+    if bool(((norms - 1).abs() < 1e-6).all()):
+        return gaussians
+    return gaussians.replace(quats=unit_rotations(gaussians.quats))

@@ -1,0 +1,357 @@
+"""Niantic's ``.spz``: 20 bytes per Gaussian and one per number of the harmonics, compressed.
+
+Versions 1 to 3 are one gzip stream of a 16-byte header and the attributes one after the other;
+version 4 is a 32-byte header, a table of sizes, and a Zstandard stream per attribute, which needs
+``pip install 'dyngs[zstd]'``. Version 3 is written by default, which most readers of today know. y
+is up: axes are right, up, back, unless an extension of the header states other ones.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
+from dyngs.core.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.io.formats.formats import SYSTEM_OF_UP
+from dyngs.io.formats.packing import largest_and_others, logit, with_largest
+from dyngs.io.formats.rotation import mirrored, turned
+from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
+from dyngs.io.limits import require_at_most
+
+_MAGIC = b"NGSP"
+_HEADER = struct.Struct("<4sIIBBBB")
+_WHOLE_HEADER = 32  # bytes, of version 4
+_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+_COORDINATE_SYSTEM = 0xADBE0003  # type of Adobe's extension that states one
+_NUM_SYSTEMS = 16
+_STANDARD = 4  # x points right, y up, z back
+_MOST_EXTENSION_BYTES = 1 << 16
+_MOST_RATIO = 1032  # largest compression of deflate
+_MOST_BYTES = 1 << 31
+_COLOUR_SCALE = 0.15
+_FRACTION_BITS, _MOST_FRACTION_BITS = 16, 24
+_ROOT_HALF = float(np.sqrt(0.5))
+_TOP = (1 << 9) - 1
+
+
+def read_spz(path: Path) -> SplatFile:
+    """Read a .spz of version 1 to 4, turned to y up where it states other axes.
+
+    Raises DyngsError if it is damaged or asks for too much memory.
+    """
+    return unpacked_spz(path, path.read_bytes())
+
+
+def unpacked_spz(path: Path, data: bytes) -> SplatFile:
+    """Return what the bytes of a .spz hold; ``path`` is for messages. Errors as of ``read_spz``."""
+    if data[:4] == _MAGIC:
+        return _read_streams(path, data)
+    if data[:2] != b"\x1f\x8b":
+        raise DyngsError(f"{path}: is not a .spz file (it starts neither with NGSP nor as gzip)")
+    head = _inflated(path, data, _HEADER.size)
+    if len(head) < _HEADER.size or head[:4] != _MAGIC:
+        raise DyngsError(f"{path}: is not a .spz file (its gzip stream does not start with NGSP)")
+    _, version, count, degree, fraction_bits, flags, _ = _HEADER.unpack(head)
+    if version not in (1, 2, 3):
+        raise DyngsError(f"{path}: is a .spz of version {version}, only 1 to 4 are known")
+    sizes = _sizes(path, version, count, degree)
+    total = _HEADER.size + sum(sizes.values())
+    require_count(path, count, _MOST_RATIO * len(data), total / max(count, 1))
+    require_at_most(path, total, _MOST_BYTES, "bytes of Gaussians")
+    more = _MOST_EXTENSION_BYTES if flags & _HAS_EXTENSIONS else 0
+    content = _inflated(path, data, total + more)
+    if len(content) < total:
+        raise DyngsError(
+            f"{path}: is truncated: {count:,} Gaussians need {total:,} bytes, found {len(content):,}"
+        )
+    parts = {}
+    start = _HEADER.size
+    for name, size in sizes.items():
+        parts[name] = np.frombuffer(content, np.uint8, size, start)
+        start += size
+    splat = _splat(path, parts, version, degree, fraction_bits, flags)
+    return _standard_axes(path, splat, content[total:] if more else b"")
+
+
+def write_spz(path: Path, splat: SplatFile) -> None:
+    """Write a .spz of version 3. Raises DyngsError as ``packed_spz`` does."""
+    path.write_bytes(packed_spz(splat))
+
+
+def write_spz_4(path: Path, splat: SplatFile) -> None:
+    """Write a .spz of version 4, which states its coordinate system if up is known.
+
+    Raises DyngsError: as ``packed_spz`` does, or the package zstandard is missing.
+    """
+    head, *parts = _packed_parts(splat)
+    compressor = _zstandard(path).ZstdCompressor(level=12)
+    streams = [compressor.compress(part) for part in parts if part]
+    extensions = b""
+    if splat.up is not None and splat.up in SYSTEM_OF_UP:
+        extensions = struct.pack("<III", _COORDINATE_SYSTEM, 4, SYSTEM_OF_UP[splat.up])
+    _, _, count, degree, fraction_bits, flags, _ = _HEADER.unpack(head)
+    flags |= _HAS_EXTENSIONS if extensions else 0
+    start = _WHOLE_HEADER + len(extensions)
+    head = _HEADER.pack(_MAGIC, 4, count, degree, fraction_bits, flags, len(streams)) + struct.pack(
+        "<I12x", start
+    )
+    sizes = [
+        (len(stream), len(part)) for stream, part in zip(streams, filter(None, parts), strict=True)
+    ]
+    table = b"".join(struct.pack("<QQ", *size) for size in sizes)
+    path.write_bytes(b"".join([head, extensions, table, *streams]))
+
+
+def packed_spz(splat: SplatFile) -> bytes:
+    """Return the bytes of a .spz of version 3.
+
+    Raises DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
+    """
+    compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
+    return b"".join(
+        [*(compressor.compress(part) for part in _packed_parts(splat)), compressor.flush()]
+    )
+
+
+def _packed_parts(splat: SplatFile) -> list[bytes]:
+    """Return the header of version 3 and the attributes, in the order of the file."""
+    gaussians = splat.gaussians
+    means = gaussians.means.double().numpy()
+    extent = float(np.abs(means).max())
+    octave = int(np.floor(np.log2(max(extent, 2.0**-_MOST_FRACTION_BITS))))
+    # As fine as needed: more bits for scenes smaller than 1, fewer for what would leave 24 bits.
+    fraction_bits = min(
+        22 - octave, max(_FRACTION_BITS, _FRACTION_BITS - octave), _MOST_FRACTION_BITS
+    )
+    if fraction_bits < 0:
+        raise DyngsError(f"a .spz holds positions up to 8e6, these reach {extent:.2g}")
+    fixed = np.clip(np.round(means * (1 << fraction_bits)), -(1 << 23) + 1, (1 << 23) - 1).astype(
+        "<i4"
+    )
+    sh = gaussians.sh[:, 1:].numpy()
+    # 5 bits, 6 for degree 1; Niantic's default is one less: -5 dB
+    step = np.full((sh.shape[1], 1), 8, np.float32)
+    step[:3] = 4
+    coded_sh = np.clip(np.round(sh * 128 / step) * step + 128, 0, 255).astype(np.uint8)
+    colours = gaussians.sh[:, 0].numpy() * (_COLOUR_SCALE * 255) + 0.5 * 255
+    flags = _ANTIALIASED if splat.mode is RasterizeMode.ANTIALIASED else 0
+    return [
+        _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.sh_degree, fraction_bits, flags, 0),
+        fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
+        _as_bytes(gaussians.opacities.numpy() * 255),
+        _as_bytes(colours),
+        _as_bytes((gaussians.log_scales.numpy() + 10) * 16),
+        _packed_rotations(gaussians.quats.numpy()).astype("<u4").tobytes(),
+        coded_sh.tobytes(),
+    ]
+
+
+def _sizes(path: Path, version: int, count: int, degree: int) -> dict[str, int]:
+    if degree > MAX_SH_DEGREE:
+        raise DyngsError(
+            f"{path}: has harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known"
+        )
+    each = {
+        "means": 6 if version == 1 else 9,
+        "alphas": 1,
+        "colours": 3,
+        "scales": 3,
+        "quats": 3 if version < 3 else 4,
+    }
+    return {
+        name: count * size for name, size in (each | {"sh": 3 * (num_sh_terms(degree) - 1)}).items()
+    }
+
+
+def _inflated(path: Path, data: bytes, most: int) -> bytes:
+    """Return at most ``most`` bytes of a gzip stream; where it ends there, its checksum has been
+    compared."""
+    stream = zlib.decompressobj(31)
+    try:
+        content = stream.decompress(data, most)
+        more = stream.decompress(stream.unconsumed_tail, 1)
+    except zlib.error as error:
+        raise DyngsError(
+            f"{path}: its gzip stream is damaged ({error}); copy or export it again"
+        ) from error
+    if not more and not stream.eof:
+        raise DyngsError(
+            f"{path}: is truncated: its gzip stream does not end; copy or export it again"
+        )
+    return content
+
+
+def _read_streams(path: Path, data: bytes) -> SplatFile:
+    if len(data) < _WHOLE_HEADER:
+        raise DyngsError(f"{path}: is truncated: it ends within its header")
+    _, version, count, degree, fraction_bits, flags, streams = _HEADER.unpack(data[:16])
+    start = int.from_bytes(data[16:20], "little")
+    if version != 4:
+        raise DyngsError(f"{path}: is a .spz of version {version}, only 1 to 4 are known")
+    sizes = {
+        name: size
+        for name, size in _sizes(path, version, count, degree).items()
+        if size or name != "sh"
+    }
+    require_at_most(path, sum(sizes.values()), _MOST_BYTES, "bytes of Gaussians")
+    require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
+    if streams < len(sizes) or start + 16 * streams > len(data):
+        raise DyngsError(
+            f"{path}: is truncated or damaged: its table of streams does not fit; copy or export it again"
+        )
+    table = np.frombuffer(data, "<u8", 2 * streams, start).reshape(-1, 2).tolist()
+    begin = start + 16 * streams
+    parts = {}
+    for (name, size), (packed, whole) in zip(sizes.items(), table, strict=False):
+        if begin + packed > len(data) or whole != size:
+            raise DyngsError(
+                f"{path}: is truncated or damaged in its {name}; copy or export it again"
+            )
+        parts[name] = np.frombuffer(_unpacked(path, data[begin : begin + packed], size), np.uint8)
+        begin += packed
+    parts.setdefault("sh", np.zeros(0, np.uint8))
+    splat = _splat(path, parts, version, degree, fraction_bits, flags)
+    return _standard_axes(
+        path, splat, data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b""
+    )
+
+
+def _standard_axes(path: Path, splat: SplatFile, extensions: bytes) -> SplatFile:
+    """Return the contents with x right, y up and z back, given the extensions of the file: type,
+    size and value."""
+    start = 0
+    while start < len(extensions):
+        kind, size = (
+            int.from_bytes(extensions[start + i : start + i + 4], "little") for i in (0, 4)
+        )
+        value = extensions[start + 8 : start + 8 + size]
+        start += 8 + size
+        if start > len(extensions):
+            raise DyngsError(f"{path}: is damaged in its extensions; copy or export it again")
+        if kind == _COORDINATE_SYSTEM:
+            return _from_system(path, splat, int.from_bytes(value, "little"))
+    return splat
+
+
+def _from_system(path: Path, splat: SplatFile, number: int) -> SplatFile:
+    """Return the contents in standard axes, given in the coordinate system of that number; 0 states
+    none.
+
+    Bits of the number, less one: x points right, y up, z to the front; with the fourth bit z is the
+    vertical axis, and the third bit is y to the back.
+    """
+    if number > _NUM_SYSTEMS:
+        raise DyngsError(
+            f"{path}: states coordinate system {number}, but only 1 to {_NUM_SYSTEMS} exist; export it again"
+        )
+    if number in (0, _STANDARD):
+        return splat
+    right, up, front, is_z_vertical = ((number - 1) >> bit & 1 for bit in range(4))
+    axes = np.diag([2.0 * right - 1, 2.0 * up - 1, 1 - 2.0 * (front ^ is_z_vertical)])
+    if is_z_vertical:
+        axes = axes[:, [0, 2, 1]]
+    gaussians = splat.gaussians
+    if np.linalg.det(axes) < 0:
+        gaussians = mirrored(gaussians)
+        axes[:, 0] *= -1
+    x, y, z, w = Rotation.from_matrix(axes).as_quat(canonical=True).tolist()
+    note = "it states other axes than right, up and back: turned to those"
+    return replace(splat, gaussians=turned(gaussians, (w, x, y, z)), notes=(*splat.notes, note))
+
+
+def _zstandard(path: Path) -> Any:
+    try:
+        import zstandard
+    except ImportError:
+        raise DyngsError(
+            f"{path}: a .spz of version 4 needs the package zstandard: pip install 'dyngs[zstd]' (version 3 does not)"
+        ) from None
+    return zstandard
+
+
+def _unpacked(path: Path, data: bytes, size: int) -> bytes:
+    zstandard = _zstandard(path)
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
+            content = stream.read(size)
+    except zstandard.ZstdError as error:
+        raise DyngsError(
+            f"{path}: a stream of it is damaged ({error}); copy or export it again"
+        ) from error
+    if len(content) < size:
+        raise DyngsError(f"{path}: is truncated: a stream holds {len(content):,} of {size:,} bytes")
+    return content
+
+
+def _splat(
+    path: Path,
+    parts: Mapping[str, np.ndarray],
+    version: int,
+    degree: int,
+    fraction_bits: int,
+    flags: int,
+) -> SplatFile:
+    count = len(parts["alphas"])
+    if fraction_bits > _MOST_FRACTION_BITS:
+        raise DyngsError(
+            f"{path}: positions with {fraction_bits} bits after the point do not exist; the file is damaged"
+        )
+    if version == 1:
+        means = parts["means"].view("<f2").astype(np.float32).reshape(count, 3)
+    else:
+        wide = np.zeros((count, 3, 4), np.uint8)
+        wide[:, :, 1:] = parts["means"].reshape(count, 3, 3)
+        means = (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32) / float(1 << fraction_bits)
+    if version < 3:
+        axes = parts["quats"].reshape(count, 3).astype(np.float32) / 127.5 - 1
+        w = np.sqrt(np.maximum(0, 1 - np.square(axes).sum(axis=1, keepdims=True)))
+        quats = unit_rotations(torch.from_numpy(np.concatenate([w, axes], axis=1)))
+    else:
+        quats = torch.from_numpy(_unpacked_rotations(parts["quats"].view("<u4")))
+    base = (parts["colours"].reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE
+    rest = (parts["sh"].reshape(count, num_sh_terms(degree) - 1, 3).astype(np.float32) - 128) / 128
+    gaussians = Gaussians(
+        means=torch.from_numpy(means),
+        quats=quats,
+        log_scales=torch.from_numpy(parts["scales"].reshape(count, 3).astype(np.float32) / 16 - 10),
+        logit_opacities=torch.from_numpy(logit(parts["alphas"].astype(np.float32) / 255)),
+        sh=torch.from_numpy(np.concatenate([base, rest], axis=1).astype(np.float32)),
+    )
+    return SplatFile(
+        gaussians, RasterizeMode.ANTIALIASED if flags & _ANTIALIASED else RasterizeMode.CLASSIC
+    )
+
+
+def _packed_rotations(quats: np.ndarray) -> np.ndarray:
+    """Return (N,) uint32: which of xyzw is largest in 2 bits, the sign and 9 bits of each of the
+    others."""
+    largest, others = largest_and_others(quats[:, [1, 2, 3, 0]])
+    size = np.minimum(np.abs(others) / _ROOT_HALF * _TOP + 0.5, _TOP).astype(np.uint32)
+    coded = size | ((others < 0).astype(np.uint32) << np.uint32(9))
+    words = largest.astype(np.uint32)
+    for column in coded.T:
+        words = (words << np.uint32(10)) | column
+    return words
+
+
+def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
+    fields = np.stack(
+        [(words >> np.uint32(shift)) & np.uint32(1023) for shift in (20, 10, 0)], axis=1
+    )
+    size = (fields & np.uint32(_TOP)).astype(np.float32) / _TOP * _ROOT_HALF
+    others = np.where(fields >> np.uint32(9), -size, size)
+    return with_largest(words >> np.uint32(30), others)[:, [3, 0, 1, 2]]
+
+
+def _as_bytes(values: np.ndarray) -> bytes:
+    return np.clip(np.round(values), 0, 255).astype(np.uint8).tobytes()

@@ -1,0 +1,248 @@
+"""A lock for one writer at a time in a folder, released by the system when its process ends,
+however it ends."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import platform
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from dyngs.core.errors import DyngsError, warn
+from dyngs.io.containment import leaving_links
+from dyngs.io.outputs import require_within_run
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+LOCK_NAME = "run.lock"
+"""File that exists while a process writes into the folder; one left by a killed process has no
+effect."""
+
+_HELD = (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK)
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+_WAIT = 1.0  # seconds between two looks at a folder that another process makes
+_FAR = 2**30
+"""Offset of the locked byte on Windows, past the end of the file: a locked byte cannot be read by
+others."""
+
+
+class InUseError(DyngsError):
+    """Another process writes into the folder."""
+
+
+class Held:
+    """A folder that this process writes into; ``alone``: no other does, which is not known where
+    there are no locks."""
+
+    def __init__(self, folder: Path, *, alone: bool) -> None:
+        self._folder, self.alone = folder, alone
+        # there it cannot be renamed
+        self._opened = None if sys.platform == "win32" else os.open(folder, os.O_RDONLY)
+
+    def folder(self) -> Path | None:
+        """Return where the folder is by now, also after it was renamed; None: it was removed, or
+        cannot be found."""
+        if self._opened is None or _is_the_same(self._opened, self._folder):
+            return self._folder
+        path = _path_of(self._opened)
+        if path is None or not _is_the_same(self._opened, path):
+            return None
+        self._folder = path
+        return path
+
+    def close(self) -> None:
+        if self._opened is not None:
+            os.close(self._opened)
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[Held]:
+    """Yield the folder, into which no other process writes in the block, if its file system has
+    locks.
+
+    The folder is made where it is missing, and removed where nothing came of it. The file
+    ``run.lock`` says who writes. A file system that has no locks (some network file systems) is
+    told of in a line on stderr.
+
+    Raises:
+        InUseError: another process writes there.
+        DyngsError: nobody can; a link leads out of the folder.
+    """
+    require_within_run(folder)
+    links = leaving_links(folder)
+    if links:
+        raise DyngsError(
+            f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it"
+        )
+    made = _made(folder)
+    try:
+        file, locks = _locked(folder / LOCK_NAME)
+        held = Held(folder, alone=locks)
+        try:
+            yield held
+        finally:
+            _freed((held.folder() or folder) / LOCK_NAME, file)
+            held.close()
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()  # only succeeds if nothing came of it
+
+
+def make_once(
+    folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str
+) -> None:
+    """Create a folder of the cache by calling ``make``, or print ``found`` if it exists.
+
+    One of several processes creates it, the others wait for it. Without file locks each of them
+    calls ``make``, and the first result is kept. Raises DyngsError: as ``make`` does, or the cache
+    cannot be written.
+    """
+    path = folder.with_name(f".{folder.name}.lock")
+    _made(folder.parent)
+    is_told = False
+    while not folder.is_dir():
+        try:
+            file, _ = _locked(path)
+        except InUseError:
+            if not is_told:
+                say(f"{folder}: {_owner(path)}; its result is waited for")
+            is_told = True
+            time.sleep(_WAIT)
+            continue
+        try:
+            if not folder.is_dir():
+                make()
+                return
+        except DyngsError:
+            if not folder.is_dir():
+                raise
+        finally:
+            _freed(path, file)
+    say(found)
+
+
+def _made(folder: Path) -> list[Path]:
+    """Return the folders that had to be made, innermost first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise DyngsError(f"{folder}: is not a folder; give another one") from None
+    except OSError as error:
+        raise DyngsError(f"cannot write {folder}: {error.strerror or error}") from error
+    return missing
+
+
+def _locked(path: Path) -> tuple[int, bool]:
+    """Return the lock file ``path``, open, and whether it is locked."""
+    folder = path.parent
+    while True:
+        file = _opened(path)
+        try:
+            _lock(file)
+            if not _is_the_same(file, path):  # its last owner removed it after we had opened it
+                os.close(file)
+                continue
+            _sign(file)
+            return file, True
+        except OSError as error:
+            if error.errno in _WITHOUT_LOCKS:
+                warn(
+                    f"{folder}: this file system has no locks ({error.strerror}); "
+                    "see to it that no two commands write into that folder at once"
+                )
+                return file, False
+            os.close(file)
+            if error.errno not in _HELD:
+                raise DyngsError(f"cannot lock {path}: {error.strerror or error}") from error
+            raise InUseError(
+                f"{folder}: {_owner(path)}; wait until it has ended, or give another folder"
+            ) from None
+
+
+def _opened(path: Path) -> int:
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        file = os.open(path, flags, 0o666)
+    except OSError as error:
+        link = "; it is a link, remove it" if path.is_symlink() else ""
+        raise DyngsError(f"cannot write {path}: {error.strerror or error}{link}") from error
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise DyngsError(f"cannot write {path}: not a file; remove it")
+    return file
+
+
+def _lock(file: int) -> None:
+    if sys.platform == "win32":
+        os.lseek(file, _FAR, os.SEEK_SET)
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _freed(path: Path, file: int) -> None:
+    """Remove and close the lock file; others that wait to lock it notice that it is gone."""
+    with suppress(OSError):
+        if sys.platform != "win32" and _is_the_same(file, path):
+            path.unlink()
+    with suppress(OSError):
+        os.close(file)
+    if sys.platform == "win32":
+        with suppress(OSError):
+            path.unlink()  # fails if somebody has it by now
+
+
+def _path_of(file: int) -> Path | None:
+    """Return where an open file is by now; None where the system does not say."""
+    try:
+        if sys.platform == "darwin":
+            name = fcntl.fcntl(file, fcntl.F_GETPATH, bytes(1024))
+            return Path(os.fsdecode(name.rstrip(b"\0")))
+        return Path(f"/proc/self/fd/{file}").readlink()
+    except OSError:
+        return None
+
+
+def _is_the_same(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except OSError:
+        return False
+
+
+def _sign(file: int) -> None:
+    """Write who has the lock, for the message to others; without room on the disk nobody is
+    told."""
+    owner = {
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "since": time.strftime("%Y-%m-%d %H:%M:%S"),
+    }
+    with suppress(OSError):
+        os.ftruncate(file, 0)
+        os.lseek(file, 0, os.SEEK_SET)
+        os.write(file, (json.dumps(owner) + "\n").encode())
+
+
+def _owner(path: Path) -> str:
+    """Return the process that writes there, as far as the lock file says."""
+    try:
+        with path.open("rb") as file:
+            known = json.loads(file.read(4096))
+        pid = int(known["pid"])
+        host = str(known["host"])
+        since = str(known["since"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process is writing there"
+    return f"process {pid} on {host} has been writing there since {since}"

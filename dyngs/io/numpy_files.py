@@ -1,0 +1,141 @@
+"""Untrusted NumPy files, checked before memory is allocated: ``.npy`` arrays, arrays of ``.npz``
+archives."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from dyngs.core.errors import DyngsError, reading, reason
+from dyngs.io.containment import inside
+from dyngs.io.fields import entry
+from dyngs.io.limits import require_at_most
+
+MOST_BYTES = 1 << 29
+"""Limit on the arrays of one file, each number counted as at least 8 bytes; SMPL-X takes half of
+it."""
+_HIGHEST_RATIO = 1032
+"""Highest compression ratio of deflate: an archive that claims more is damaged or hostile."""
+_CHUNK = 1 << 20
+
+
+def read_arrays(
+    path: Path, choose: Callable[[Collection[str]], Iterable[str]]
+) -> dict[str, np.ndarray]:
+    """Read the arrays of numbers or text in a ``.npz`` whose names ``choose`` selects; others are
+    not read.
+
+    Raises:
+        DyngsError: the file is missing or damaged, or a selected array holds objects or takes more
+            than ``MOST_BYTES``.
+    """
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: is no file; name a .npz")
+    advice = "it is not a .npz, or a damaged one: copy it again"
+    with reading(path, advice), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        picked = {name: members[name] for name in choose(members)}
+        total = sum(info.file_size for info in picked.values())
+        require_at_most(path, total, MOST_BYTES, "bytes of arrays")
+        found = {}
+        total = 0
+        for name, info in picked.items():
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"'{name:.40}' is packed in a way that NumPy does not write")
+            if info.file_size > _HIGHEST_RATIO * info.compress_size + _CHUNK:
+                raise ValueError(f"'{name:.40}' cannot be as large as the archive says")
+            with archive.open(info) as stream:
+                found[name] = _array(path, name, info.file_size, stream, total)
+            total += _weight(found[name].shape, found[name].dtype)
+        return found
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Read the float64 array of a ``.npy`` file; archives and Python objects are refused."""
+    # NumPy reads the header as Python text; a damaged one raises nearly anything.
+    with (
+        reading(path, "it must be a NumPy array of numbers; copy it again"),
+        inside(path).open("rb") as file,
+    ):
+        return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
+
+
+def read_map(path: Path, key: str) -> np.ndarray:
+    """Read the numbers of a ``.npy``, or the array ``key`` or else the only one of a ``.npz``, as
+    float64."""
+    if not inside(path).is_file():
+        raise DyngsError(f"{path}: no such file; restore it or remove it from the capture")
+    if path.suffix.lower() != ".npz":
+        return read_npy(path)
+    found = read_arrays(path, lambda names: [key] if key in names or len(names) != 1 else names)
+    values = next(iter(found.values()))
+    if values.dtype.kind not in "biuf":
+        raise DyngsError(f"{path}: holds no numbers but {values.dtype}; export it again")
+    return values.astype(np.float64)
+
+
+def read_npz(
+    path: Path, keys: Collection[str], optional: Collection[str] = ()
+) -> dict[str, np.ndarray]:
+    """Read the arrays ``keys`` of a ``.npz`` file, and those of ``optional`` that exist; Python
+    objects are refused."""
+    if not inside(path).is_file():
+        raise DyngsError(
+            f"{path}: no such file; it should hold the body parameters {', '.join(keys)}"
+        )
+    found = read_arrays(path, lambda names: [name for name in (*keys, *optional) if name in names])
+    for key in keys:
+        entry(path, found, key)
+    return found
+
+
+def require_text(raw: bytes | bytearray, dtype: np.dtype) -> None:
+    """Check that the bytes of an array of text are valid characters; raises ValueError."""
+    if dtype.kind == "U" and (np.frombuffer(raw, dtype.byteorder + "u4") > 0x10FFFF).any():
+        raise ValueError("an array of text in it holds what is no text")
+
+
+def _array(path: Path, name: str, size: int, stream: IO[bytes], before: int) -> np.ndarray:
+    """Read one array; ``before`` is the number of bytes of those read earlier."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = (
+            np.lib.format.read_array_header_1_0
+            if version == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
+        shape, by_columns, dtype = read(stream)
+        if dtype.kind not in "biufcSU":
+            raise ValueError(
+                "it holds Python objects" if dtype.hasobject else f"it is of type {dtype!s:.40}"
+            )
+        require_at_most(path, before + _weight(shape, dtype), MOST_BYTES, "bytes of arrays")
+        count = math.prod(shape) * dtype.itemsize
+        if min(shape, default=0) < 0 or size - stream.tell() < count:
+            raise ValueError("it is shorter than its shape")
+        raw = bytearray(count)
+        view = memoryview(raw)
+        for start in range(0, count, _CHUNK):
+            part = stream.read(min(_CHUNK, count - start))
+            view[start : start + len(part)] = part
+        stream.read()  # at the end zipfile compares the checksum
+        require_text(raw, dtype)
+        return np.frombuffer(raw, dtype, math.prod(shape)).reshape(
+            shape, order="F" if by_columns else "C"
+        )
+    except DyngsError:
+        raise
+    except Exception as error:
+        # NumPy reads the header as Python text; a damaged one raises nearly anything
+        raise DyngsError(
+            f"{path}: '{name:.40}' is not an array of numbers ({reason(error)}); export it again"
+        ) from error
+
+
+def _weight(shape: tuple[int, ...], dtype: np.dtype) -> int:
+    return math.prod(shape) * max(dtype.itemsize, 8)

@@ -1,0 +1,246 @@
+"""Trainers and scenes of every kind of model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from dyngs.capture.first_points import with_first_points
+from dyngs.capture.inspection.problems import before_training
+from dyngs.config import Config, ModelSection, PointsInit, RandomInit
+from dyngs.core.errors import DyngsError, reading, warn
+from dyngs.data.capture import Capture
+from dyngs.data.decoding import usual_threads
+from dyngs.data.loader import ImageLoader
+from dyngs.data.read import read_capture, require_images
+from dyngs.data.scene_space import cube_half_side, outside_of_cube
+from dyngs.data.times import evenly_spaced
+from dyngs.gaussians.init import surroundings
+from dyngs.gaussians.model import GaussianModel
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
+from dyngs.gaussians.start import FirstGaussians
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
+from dyngs.models.kind import Moves, Predicts, RunStart, capability, kind_of
+from dyngs.models.renderable import Renderable
+from dyngs.models.views import (
+    background_colour,
+    resolved_background,
+    share_alike,
+    training_cameras,
+    training_times,
+)
+from dyngs.ops.device import device_for
+from dyngs.training.corrections.camera_refinement import CameraRefinement
+from dyngs.training.corrections.exposure import exposures_of
+from dyngs.training.corrections.robust import RobustMasks
+from dyngs.training.limits import within_cap
+from dyngs.training.loop import Trainable
+from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
+from dyngs.training.prediction import network_trainer
+from dyngs.training.priors.find import used_priors
+from dyngs.training.priors.used import UsedPriors
+from dyngs.training.trainer import Trainer, ViewSampler
+
+GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
+
+MANY_ALIKE = 0.05
+"""Fraction of the opaque pixels of the background's colour from which moving things are found by
+their silhouettes."""
+# fraction of train.alpha_weight before other moving things, until their motion is followed
+EARLY_OPACITY = 0.2
+# fraction of the run; measured as the others, see docs/benchmarks.md#backgrounds
+FULL_OPACITY_FROM = 0.6
+ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
+
+
+def build(
+    config: Config,
+    capture: Capture | None = None,
+    *,
+    restored: bool = False,
+    first: FirstGaussians | None = None,
+) -> Trainable:
+    """Return what the loop steps; see ``assemble`` for arguments and errors."""
+    network = capability(config.model, Predicts)
+    if network is not None:
+        return network_trainer(config, network)
+    return assemble(config, capture, restored=restored, first=first)
+
+
+def assemble(
+    config: Config,
+    capture: Capture | None = None,
+    *,
+    restored: bool = False,
+    images: ImageLoader | None = None,
+    held_out: frozenset[int] = frozenset(),
+    first: FirstGaussians | None = None,
+) -> Trainer[Any]:
+    """Return the trainer of a scene: its model begun, nothing trained.
+
+    Args:
+        capture: as ``prepared`` returned it; None: it is read now.
+        restored: a checkpoint will be, so that it does not matter where the model begins: no points
+            are triangulated.
+        images: the training images of another trainer of the same ones; None: they are opened.
+        held_out: indices of training views that are never trained on.
+        first: Gaussians that it goes on from; None: it begins as ``config.init`` says.
+    """
+    if capture is None:
+        capture = read_capture(config.data) if restored else prepared(config)
+    asked = config
+    config = within_cap(config, len(set(training_times(capture))))
+    generator = torch.Generator().manual_seed(config.run.seed)
+    if images is None:
+        images = ImageLoader(
+            capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
+        )
+    priors = _priors(config, capture, images)
+    if not priors.masks:
+        images = images.without_motion_masks()
+    background = resolved_background(config, capture)
+    extent = surroundings(capture).extent
+    model = kind_of(config.model).start(
+        RunStart(config, asked, capture, images, background, extent, generator, first)
+    )
+    # before what asks the images for corrected cameras
+    refinement = _refinement(config, images, extent)
+    robust = _robust(config, capture, images)
+    exposures = exposures_of(config.train, images)
+    early = _early_opacity(config, capture, images, background)
+    findings: list[str] = []
+    if capture.has_alpha and config.train.alpha_weight == 0 and background != "random":
+        findings = [
+            f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
+            "may be transparent"
+        ]
+    losses = [
+        model.colour_loss or ImageLoss(config.train.ssim_weight),
+        SilhouetteLoss(config.train.alpha_weight, early, FULL_OPACITY_FROM * config.train.steps),
+        PenaltyLoss(),
+        *([] if exposures is None else [exposures]),
+        priors,
+        RegularizerLoss(),
+    ]
+    trainer = Trainer(
+        config=config,
+        model=model,
+        capture=capture,
+        images=images,
+        sampler=ViewSampler(len(images)),
+        background=background,
+        extent=extent,
+        losses=losses,
+        generator=generator,
+        held_out=held_out,
+        findings=[*([] if restored else findings), *priors.lines],
+        robust=robust,
+        exposures=exposures,
+        refinement=refinement,
+    )
+    trainer.place(device_for(config.run.device))
+    return trainer
+
+
+def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
+    """Return the scene of a checkpoint of ``model``.
+
+    Raises:
+        DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names
+            the file.
+    """
+    with reading(checkpoint.name, OTHER_CONFIG):
+        try:
+            return kind_of(model).restore(model, checkpoint)
+        except KeyError as missing:
+            raise DyngsError(
+                f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew"
+            ) from None
+
+
+def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
+    """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
+    return require_gaussians(restored_model(checkpoint, model), checkpoint.name)
+
+
+def prepared(config: Config) -> Capture:
+    """Return the capture of a run with the points that its scene begins with, see
+    ``with_first_points``.
+
+    What is suspicious about the capture, and where the points are from, is printed to stderr.
+    """
+    return with_points(require_images(read_capture(config.data)), config)
+
+
+def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
+    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
+    need none."""
+    lines: list[str] = []
+    if "init" in kind_of(config.model).uses:
+        init = config.init
+        if isinstance(init, PointsInit):
+            capture, lines = with_first_points(capture, config.data, init)
+        elif isinstance(init, RandomInit):
+            views = capture.splits["train"]
+            why = outside_of_cube(
+                views, cube_half_side(init.half_extent, views, capture.world_scale)
+            )
+            lines = (
+                []
+                if why is None
+                else [f"init.kind=random draws points around the origin, but {why}: give auto"]
+            )
+    for line in [] if quiet else [*lines, *before_training(capture)]:
+        warn(line)
+    return capture
+
+
+def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors:
+    """Return the priors of the capture that are used; none for kinds that use
+    none."""
+    if "train.priors" not in kind_of(config.model).uses:
+        return UsedPriors()
+    moves = capability(config.model, Moves) is not None and len(set(training_times(capture))) > 1
+    return used_priors(config, capture, images, moves=moves)
+
+
+def _robust(config: Config, capture: Capture, images: ImageLoader) -> RobustMasks | None:
+    """Return the masks of what disagrees between views of a static scene, if they are requested."""
+    kind = kind_of(config.model)
+    if (
+        config.train.robust != "always"
+        or "train.robust" not in kind.uses
+        or isinstance(kind, Moves)
+    ):
+        return None
+    cameras = training_cameras(capture.splits["train"], config.data)
+    return RobustMasks(images, cameras, config.train.steps, images.corrected)
+
+
+def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefinement | None:
+    """Return the refinement of the training cameras, if it is requested; ``images`` have corrected
+    cameras then."""
+    if config.camera.refine != "always":
+        return None
+    refinement = CameraRefinement(images.views, size, config.train.steps)
+    images.corrected = refinement.corrections.applied
+    return refinement
+
+
+def _early_opacity(config: Config, capture: Capture, images: ImageLoader, background: str) -> float:
+    """Return the fraction of train.alpha_weight that counts while motion is not followed yet.
+
+    It depends on the capture alone, so that a moving model begins exactly as a static one.
+    """
+    is_still = len(set(training_times(capture))) < 2
+    if (
+        is_still
+        or not capture.has_alpha
+        or config.train.alpha_weight == 0
+        or background == "random"
+    ):
+        return 1.0
+    shown = (images[i] for i in evenly_spaced(len(images), ALIKE_IMAGES))
+    alike = share_alike(shown, background_colour(background))
+    return 1.0 if alike is None or alike >= MANY_ALIKE else EARLY_OPACITY

@@ -1,0 +1,69 @@
+"""The surface of a known field: a ball."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.mesh import surface_of
+from dyngs.baselines.fields.ngp import NgpField
+from dyngs.baselines.fields.scene import FieldScene
+from dyngs.core.errors import DyngsError
+from dyngs.ops.rays import Space
+
+MIDDLE = torch.tensor([0.3, -0.1, 0.2])
+
+
+@dataclass(frozen=True)
+class Ball(NgpField):
+    """Density exp(10 (radius - distance)) around a point, of radius 0.5, and colours that are the
+    direction."""
+
+    def densities(self, points: torch.Tensor, time: float) -> torch.Tensor:
+        return 25 * torch.exp(10 * (0.5 - (points - MIDDLE).norm(dim=1))) * (1.5 / self.space.half)
+
+    def colours(self, points: torch.Tensor, directions: torch.Tensor, time: float) -> torch.Tensor:
+        return directions / 2 + 0.5
+
+
+@pytest.fixture(scope="module")
+def scene() -> FieldScene:
+    space = Space((0.1, 0.0, 0.0), 1.0, 2, 8)
+    plain = NgpField.new(
+        NgpModel(levels=2, log2_rows=6, finest=16), space, torch.Generator().manual_seed(0)
+    )
+    field = Ball(
+        space,
+        plain.pixels,
+        plain.levels,
+        plain.table,
+        plain.density,
+        plain.colour,
+        plain.occupied,
+        plain.across,
+    )
+    return FieldScene(field)
+
+
+def test_a_ball_is_found_with_faces_outwards_and_colours(scene: FieldScene) -> None:
+    found = surface_of(scene, cells=40)
+    offsets = found.vertices - MIDDLE.numpy()
+    assert np.linalg.norm(offsets, axis=1) == pytest.approx(np.full(len(offsets), 0.5), abs=2e-3)
+    corners = found.vertices[found.faces] - MIDDLE.numpy()
+    volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert volume == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.01), "a negative one is inside out"
+    straight = 0.5 - offsets  # seen from straight ahead: against the normal, of length 1/2
+    assert np.abs(found.colours - straight).max() < 0.05
+
+
+def test_another_level_is_another_surface(scene: FieldScene) -> None:
+    found = surface_of(scene, level=25 * np.e, cells=40)
+    assert np.linalg.norm(found.vertices - MIDDLE.numpy(), axis=1).mean() == pytest.approx(
+        0.4, abs=2e-3
+    )
+    with pytest.raises(DyngsError, match="no surface"):
+        surface_of(scene, level=1e6, cells=10)

@@ -1,0 +1,194 @@
+"""Curved triangles through the commands: trained, resumed, evaluated, drawn, exported; what is
+refused, in a line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from small_triangles import config_of
+
+import dyngs
+from dyngs.baselines.triangles.keys import BgTriangleModel
+from dyngs.baselines.triangles.scene import TriangleScene
+from dyngs.baselines.triangles.tallies import most_pixels
+from dyngs.cli import main
+from dyngs.config.io import load_resolved
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import psnr
+from dyngs.evaluate.report import evaluate_run
+from dyngs.models.views import training_cameras
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.runs.opened import open_run
+from dyngs.study.tradeoff.variant_runs import VariantRuns
+from dyngs.study.tradeoff.variants import Variant
+from dyngs.training.new_trainer import build
+
+STEPS = ["train.steps=120", "train.save_every=60"]
+
+
+@pytest.fixture(scope="module")
+def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "triangles"
+    return dyngs.train(config_of(capture, *STEPS, "model.gaussian_steps=300", f"run.dir={folder}"))
+
+
+def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
+    assert evaluate_run(run).psnr > 18
+    scene = open_run(run).renderable
+    assert isinstance(scene, TriangleScene)
+    assert 100 < len(scene.patches) <= 300
+    assert scene.patches.texture == 3
+    views = open_run(run).capture.splits["train"]
+    assert most_pixels(scene, training_cameras(views, load_resolved(run).data)).min() >= 1
+
+
+def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path) -> None:
+    # cut right after a change and the first texture
+    steps = ["train.steps=112", "train.save_every=56"]
+    run = dyngs.train(
+        config_of(capture, *steps, "model.texture_from=0.5", f"run.dir={tmp_path / 'run'}")
+    )
+    path = checkpoint_paths(run)[-1]
+    whole = path.read_bytes()
+    path.unlink()
+    assert main(["train", "--resume", str(run)]) == 0
+    assert path.read_bytes() == whole
+
+
+def test_it_is_drawn(run: Path, tmp_path: Path) -> None:
+    assert main(["render", str(run), "--out", str(tmp_path / "images"), "--depth"]) == 0
+    assert len(list((tmp_path / "images").rglob("*.png"))) > 1
+
+
+def test_a_file_of_it_is_as_small_as_asked(capture: Path, tmp_path: Path) -> None:
+    """Half of what its 72 values a triangle take at the usual precision: it begins with fewer, and
+    is no larger."""
+    run = tmp_path / "run"
+    keys = ["train.steps=60", "model.gaussian_steps=100", "model.max_triangles=1000"]
+    dyngs.train(config_of(capture, *keys, "budget.max_mb=0.0125", f"run.dir={run}"))
+    file = run / "export" / "scene.dyngs"
+    assert file.stat().st_size <= 12500
+    whole, stored = (open_run(folder).renderable for folder in (run, file.parent))
+    assert isinstance(whole, TriangleScene)
+    assert isinstance(stored, TriangleScene)
+    assert 100 <= len(stored.patches) == len(whole.patches) <= 12500 / (72 * 1.3)
+    view = training_cameras(open_run(run).capture.splits["train"][:1], load_resolved(run).data)[0]
+    assert psnr(stored.render(view).rgb, whole.render(view).rgb) > 30
+
+
+def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        DyngsError, match=r"budget.max_mb=0.005: has no room for 100 triangles; 0.0098 would do"
+    ):
+        dyngs.train(config_of(capture, "budget.max_mb=0.005", f"run.dir={tmp_path / 'run'}"))
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
+def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"mesh{suffix}"
+    assert main(["export", str(run), "--format", "mesh", "--segments", "2", "--out", str(out)]) == 0
+    mesh = trimesh.load(out, force="mesh", process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    scene = open_run(run).renderable
+    assert isinstance(scene, TriangleScene)
+    assert len(mesh.faces) == 4 * len(scene.patches)
+    visual: Any = mesh.visual
+    assert np.ptp(np.asarray(visual.vertex_colors)[:, :3]) > 0
+
+
+def test_its_settings_are_traded(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.study.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
+    out = tmp_path / "tradeoff"
+    settings = ("sh_degree=0", "storage=2", "supersampling=1", "scale=0.5", "prune")
+    vary = [word for setting in settings for word in ("--vary", setting)]
+    words = ["tradeoff", str(run), "--out", str(out), *vary, "--rounds", "1", "--combine", "1"]
+    assert main([*words, "--require", "mb<=1", "--minimize", "mb"]) == 0
+    points = {row["name"]: row for row in json.loads((out / "tradeoff.json").read_text())["points"]}
+    base = points["as it is"]
+    assert base["psnr"] == pytest.approx(evaluate_run(run).psnr)
+    assert base["gaussians"] == len(open_run(run).renderable.state()["triangles.points"].tensor)
+    # and a few bytes
+    assert points["sh_degree=0"]["mb"] == pytest.approx(base["mb"] * 48 / 72, rel=1e-3)
+    assert points["storage=2"]["mb"] < base["mb"] / 2
+    assert all(
+        points[name]["psnr"] != base["psnr"]
+        for name in ("sh_degree=0", "supersampling=1", "scale=0.5")
+    )
+    assert not any("prune" in name for name in points)
+    chosen = next((out / "chosen").iterdir())
+    assert len(open_run(chosen).renderable.state()["triangles.points"].tensor) == base["gaussians"]
+
+
+def test_fewer_triangles_are_trained_for_a_trade(capture: Path, tmp_path: Path) -> None:
+    run = dyngs.train(config_of(capture, "train.steps=60", f"run.dir={tmp_path / 'run'}"))
+    half = VariantRuns(run, tmp_path / "out", 1).folder(Variant(triangles=0.5))
+    model = load_resolved(half).model
+    assert isinstance(model, BgTriangleModel)
+    assert (model.max_triangles, model.num_first) == (150, 75)
+    assert 10 < len(open_run(half).renderable.state()["triangles.points"].tensor) <= 150
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["export", "RUN", "--out", "OUT/scene.ply"], "Gaussians"),
+        (
+            ["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"],
+            "1 to 64",
+        ),
+        (
+            ["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"],
+            "radiance field",
+        ),
+        (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
+        (
+            ["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"],
+            "model.max_triangles",
+        ),
+    ],
+)
+def test_what_does_not_go_is_refused(
+    run: Path,
+    capture: Path,
+    tmp_path: Path,
+    command: list[str],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = " ".join(command)
+    for name, folder in (("RUN", run), ("CAPTURE", capture), ("OUT", tmp_path)):
+        words = words.replace(name, str(folder))
+    assert main(words.split(" ")) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]
+
+
+def test_a_capture_that_shows_no_surface_is_refused(
+    capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Gaussians of images that show nothing need hundreds of steps until they have faded."""
+    monkeypatch.setattr("dyngs.baselines.triangles.first.fused", lambda *_: None)
+    few = ["model.gaussian_steps=2", "run.dir=run"]
+    assert main(["train", f"data.root={capture}", "model.kind=bg_triangle", *few]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
+    assert "2 steps of Gaussians show no surface" in line
+
+
+def test_the_first_triangles_lie_at_the_first_points(capture: Path) -> None:
+    trainer: Any = build(config_of(capture, "model.num_first=40", "model.gaussian_steps=0"))
+    scene: TriangleScene = trainer.model.scene
+    assert len(scene.patches) == 40
+    assert 0.5 < scene.unit < 1.4
+    assert bool((scene.patches.areas > 0).all())
+    assert scene.options.near == pytest.approx(0.05 * scene.unit)
+    torch.testing.assert_close(scene.patches.colours[:, 0], scene.patches.colours[:, 5])

@@ -1,0 +1,114 @@
+"""What words mean as frames, and control points; each word that means nothing is told in one
+line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dyngs.core.errors import DyngsError
+from dyngs.export.edit.frame import Distance, Frame, direction, geo_frame, number, point, scale_of
+from dyngs.io.formats.similarity import Similarity
+
+SCENE = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0.5, 0.5, 1]])
+WORLD = Similarity((0.6, 0.0, 0.8, 0.0), 20.0)
+
+
+def table(path: Path, world: np.ndarray, scene: np.ndarray = SCENE, start: str = "") -> Path:
+    rows = np.concatenate([scene, world], axis=1)
+    path.write_text(start + "\n".join(",".join(repr(float(x)) for x in row) for row in rows) + "\n")
+    return path
+
+
+def test_a_frame_is_one_similarity() -> None:
+    """The origin goes to zero, up goes up, and two points are as far apart as told."""
+    start = (1.0, 2.0, 3.0)
+    end = (1.0, 2.0, 5.0)
+    frame = Frame(origin=(0.0, 1.0, 0.0), scale=Distance(start, end, 1.25))
+    found = frame.similarity((0.0, 0.6, 0.8), (0.0, -1.0, 0.0))
+    np.testing.assert_allclose(found.points(np.array([0.0, 1, 0])), 0, atol=1e-12)
+    np.testing.assert_allclose(found.rotation @ [0.0, 0.6, 0.8], [0, -1, 0], atol=1e-12)
+    assert np.linalg.norm(
+        found.points(np.array(start)) - found.points(np.array(end))
+    ) == pytest.approx(1.25)
+    assert Frame().similarity(None, (0.0, 1.0, 0.0)) == Similarity()
+
+
+def test_words() -> None:
+    assert direction("-y") == (0.0, -1.0, 0.0)
+    assert direction("0,1,-2") == (0.0, 1.0, -2.0)
+    assert direction("auto") == "auto"
+    assert scale_of("2.5") == 2.5
+    assert scale_of("0,0,0 -1,0,0 1.25m") == Distance((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 1.25)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: point("1,2", "--origin"), "--origin: '1,2' is no point; write three numbers"),
+        (lambda: point("1,2,nan", "--origin"), "'1,2,nan' is no point"),
+        (lambda: number("x", "--max-loss"), "--max-loss: 'x' is no number"),
+        (lambda: direction("0,0,0"), "has no direction"),
+        (lambda: direction("up"), "'up' is no point"),
+        (lambda: scale_of("0,0,0 1,0,0"), "give a factor, or"),
+        (lambda: scale_of("nan"), "'nan' is no number"),
+        (lambda: Frame(scale=0.0).similarity(None, ()), "--scale: 0 is no factor"),
+        (lambda: Frame(scale=-2.0).similarity(None, ()), "--scale: -2 is no factor"),
+        (lambda: Frame(scale=1e300).similarity(None, ()), "is no factor from 1e-09 to 1e"),
+        (
+            lambda: Frame(scale=scale_of("1,1,1 1,1,1 2m")).similarity(None, ()),
+            "the two points are one",
+        ),
+    ],
+)
+def test_words_that_mean_nothing(call: Callable[[], object], said: str) -> None:
+    with pytest.raises(DyngsError, match=said) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_control_points(tmp_path: Path) -> None:
+    found = geo_frame(
+        table(tmp_path / "a.csv", WORLD.points(SCENE), start="x,y,z,X,Y,Z\n# measured in May\n\n")
+    )
+    np.testing.assert_allclose(found.similarity.points(SCENE), WORLD.points(SCENE), atol=1e-9)
+    assert found.offset == (0.0, 0.0, 0.0)
+    assert len(found.lines) == 1
+    assert "4 control points: scale 20; residuals" in found.lines[0]
+    bent = WORLD.points(SCENE) + np.array([[0.3, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    found = geo_frame(table(tmp_path / "b.csv", bent))
+    np.testing.assert_allclose(
+        found.residuals, np.linalg.norm(found.similarity.points(SCENE) - bent, axis=1)
+    )
+    assert 0.01 < found.residuals.max() < 0.3
+
+
+def test_coordinates_too_large_for_float32_get_an_offset(tmp_path: Path) -> None:
+    world = WORLD.points(SCENE) + np.array([691000.25, 5334000.5, 520])
+    found = geo_frame(table(tmp_path / "a.csv", world))
+    np.testing.assert_allclose(found.similarity.points(SCENE) + found.offset, world, atol=1e-6)
+    assert np.abs(found.similarity.points(SCENE)).max() < 100
+    assert "to be added to positions: 691002 5334018 507" in found.lines[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "0 control points do not determine"),
+        ("0 0 0 1 1 1\n1 0 0 2 1 1\n", "2 control points"),
+        ("0 0 0 1 1 1\n1 1 1 2 2 2\n2 2 2 3 3 3\n", "lie on one line in the scene"),
+        ("0 0 0 1 1 1\n1 1 2\n", "line 2 is '1 1 2', not six numbers"),
+        ("a b\n0 0 0 1 1 nan\n", "line 2 is '0 0 0 1 1 nan'"),
+        ("0 0 0 0 0 0\n1 0 0 1e12 0 0\n0 1 0 0 1e12 0\n", "the scale would be 1e"),
+    ],
+)
+def test_control_points_that_are_none(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(DyngsError, match=said) as caught:
+        geo_frame(tmp_path / "a.txt")
+    assert str(caught.value).startswith(f"{tmp_path / 'a.txt'}: ")
+    with pytest.raises(DyngsError, match="no such file"):
+        geo_frame(tmp_path / "b.txt")

@@ -1,0 +1,588 @@
+"""Body files: synthetic ones of every kind against slow loops over the raw arrays, and wrong ones
+of every kind."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+import sys
+import types
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_files import tiny_body
+from synthetic_bodies import (
+    NUM_JOINTS,
+    Arrays,
+    M,
+    T,
+    model,
+    parents_of,
+    slow_vertices,
+    write_npz,
+    write_obj,
+    write_pickle,
+    write_python2_pickle,
+)
+
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import BodyFrames, ShapeSpace
+from dyngs.human.body.body import BodyTemplate, apply_shape, posed_vertices
+from dyngs.human.body.body_reader import (
+    default_template,
+    has_same_shapes,
+    load_template,
+    read_body,
+    rest_shape,
+)
+from dyngs.human.keys import HumanModel
+
+TEMPLATE = Path(inspect.getfile(BodyTemplate)).parent / "files" / "anny_smplx55.npz"
+
+
+def assert_same(body: BodyTemplate, arrays: Arrays) -> None:
+    """The loaded body poses as the raw arrays say, in float32 and float64, to a micrometre."""
+    generator = np.random.default_rng(1)
+    count = arrays["shapedirs"].shape[2]
+    poses = 0.5 * generator.standard_normal((2, len(body.joints), 3))
+    trans = generator.standard_normal((2, 3))
+    beta = generator.standard_normal(count)
+    expected = slow_vertices(arrays, poses, trans, beta)
+    shapes = body.num_shapes
+    assert shapes + body.num_expressions == count
+    for dtype in (torch.float32, torch.float64):
+        given = (
+            torch.from_numpy(x).to(dtype) for x in (poses, trans, beta[:shapes], beta[shapes:])
+        )
+        found = posed_vertices(body.to(dtype=dtype), *given)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+@pytest.fixture
+def chumpy(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], object]:
+    """Wraps an array as chumpy does; its class can be named in pickles but is gone when they are
+    read."""
+
+    class Ch:
+        def __init__(self, x: object) -> None:
+            self.x = x
+            self.dterms = ("x",)
+
+    Ch.__module__, Ch.__qualname__ = "chumpy.ch", "Ch"
+    module = types.ModuleType("chumpy.ch")
+    module.Ch = Ch  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
+    monkeypatch.setitem(sys.modules, "chumpy.ch", module)
+    return Ch
+
+
+def refusal(path: Path, uv: Path | None = None) -> str:
+    """The one line that a wrong file ends in; it names the file."""
+    with pytest.raises(DyngsError) as caught:
+        read_body(path, uv)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(uv or path) in message
+    return message
+
+
+# --- right files
+# ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", NUM_JOINTS)
+def test_an_npz_poses_as_the_paper_says(kind: str, tmp_path: Path) -> None:
+    arrays = model(kind)
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
+    assert body.name == kind
+    assert body.parents == tuple(parents_of(kind))
+    np.testing.assert_array_equal(body.faces, arrays["f"].astype(np.int64))
+    assert body.vertices.dtype == torch.float32
+    assert_same(body, arrays)
+
+
+@pytest.mark.parametrize("kind", NUM_JOINTS)
+@pytest.mark.parametrize("protocol", range(6))
+def test_a_pickle_is_the_same_as_an_npz(kind: str, protocol: int, tmp_path: Path) -> None:
+    """With a sparse regressor, arrays of another memory order, and a class beside them that is of
+    no use."""
+    arrays = model(kind)
+    whole = read_body(write_npz(tmp_path / "model.npz", arrays))
+    changed = arrays | {
+        "J_regressor": scipy.sparse.csc_matrix(arrays["J_regressor"]),
+        "posedirs": np.asfortranarray(arrays["posedirs"]),
+        "v_template": arrays["v_template"].T.copy().T,
+        "shapedirs": arrays["shapedirs"].transpose(1, 0, 2).copy().transpose(1, 0, 2),
+        "weights": arrays["weights"].astype(">f8"),
+        "joint2num": np.array({"Pelvis": 0}, dtype=object),
+        "weights_prior": np.zeros(0),
+        "sex": np.float64(1),
+    }
+    assert_equal(read_body(write_pickle(tmp_path / "model.pkl", changed, protocol)), whole)
+
+
+def assert_equal(one: BodyTemplate, other: BodyTemplate) -> None:
+    for name, value in vars(one).items():
+        expected = getattr(other, name)
+        assert (
+            torch.equal(value, expected) if isinstance(value, torch.Tensor) else value == expected
+        ), name
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2])
+def test_pickles_of_python_2_with_chumpy(
+    chumpy: Callable[[object], object], protocol: int, tmp_path: Path
+) -> None:
+    """As the original SMPL files are; chumpy is not installed when they are read."""
+    arrays = model("smpl")
+    whole = read_body(write_npz(tmp_path / "model.npz", arrays))
+    old = arrays | {
+        key: chumpy(arrays[key]) for key in ("v_template", "shapedirs", "posedirs", "weights")
+    }
+    old["J"] = chumpy(None)
+    old["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])
+    path = write_python2_pickle(tmp_path / "model.pkl", old, protocol)
+    assert b"chumpy.ch" in path.read_bytes()
+    assert b"numpy.core" in path.read_bytes()
+    for name in ("chumpy", "chumpy.ch"):
+        del sys.modules[name]
+    assert_equal(read_body(path), whole)
+
+
+@pytest.mark.parametrize(
+    "make", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.csr_array]
+)
+def test_sparse_regressors(make: Callable[[object], object], tmp_path: Path) -> None:
+    arrays = model("smpl")
+    regressor = np.where(arrays["J_regressor"] > 0.02, arrays["J_regressor"], 0)
+    whole = read_body(write_npz(tmp_path / "model.npz", arrays | {"J_regressor": regressor}))
+    found = read_body(
+        write_pickle(tmp_path / "model.pkl", arrays | {"J_regressor": make(regressor)})
+    )
+    assert torch.equal(found.joints, whole.joints)
+    assert_equal(found, whole)
+
+
+@pytest.mark.parametrize(
+    ("kind", "directions", "shapes"),
+    [("smplx", 20, 10), ("smplx", 400, 300), ("smplx", 16, 16), ("smpl", 300, 300)],
+)
+def test_expressions_follow_the_shapes(
+    kind: str, directions: int, shapes: int, tmp_path: Path
+) -> None:
+    arrays = model(kind, directions=directions)
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
+    assert (body.num_shapes, body.num_expressions) == (shapes, directions - shapes)
+    found = [x for x in (body.shape_dirs, body.expression_dirs) if x is not None]
+    np.testing.assert_array_equal(
+        torch.cat(found, 2), np.asarray(arrays["shapedirs"], dtype=np.float32)
+    )
+
+
+def test_the_template_is_what_its_file_says() -> None:
+    body = default_template()
+    with np.load(TEMPLATE, allow_pickle=False) as raw:
+        np.testing.assert_array_equal(body.vertices, raw["v_template"])
+        np.testing.assert_array_equal(body.joints, raw["J"])
+        np.testing.assert_array_equal(body.faces, raw["f"])
+        np.testing.assert_array_equal(body.uv_faces, raw["ft"])  # pyright: ignore[reportArgumentType]
+        assert body.parents == tuple(raw["kintree_table"][0].tolist())
+        for row in range(0, len(body.weights), 997):
+            expected = np.zeros(55)
+            for joint, fraction in zip(
+                raw["weights_idx"][row], raw["weights_val"][row], strict=True
+            ):
+                expected[joint] += fraction
+            np.testing.assert_allclose(body.weights[row], expected, rtol=0, atol=2e-7)
+
+
+def test_weights_in_half_precision_are_made_shares_again(tmp_path: Path) -> None:
+    arrays = model("smpl")
+    arrays["weights"] = arrays["weights"].astype(np.float16)
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
+    torch.testing.assert_close(body.weights.sum(1), torch.ones(M), rtol=0, atol=2e-7)
+
+
+# --- texture coordinates
+# ----------------------------------------------------------------------------------------------
+
+
+def textured() -> tuple[Arrays, np.ndarray, np.ndarray]:
+    """A body, texture coordinates, and the triangles into those, other in number than the
+    vertices."""
+    arrays = model("smpl")
+    generator = np.random.default_rng(0)
+    return arrays, generator.uniform(0, 1, (M + 7, 2)), generator.integers(0, M + 7, (T, 3))
+
+
+def test_uvs_of_the_file_belong_to_corners(tmp_path: Path) -> None:
+    arrays = model("smplx")
+    body = read_body(write_npz(tmp_path / "model.npz", arrays))
+    assert body.uv is not None
+    assert body.uv_faces is not None
+    np.testing.assert_array_equal(body.uv_faces, arrays["ft"].astype(np.int64))
+    np.testing.assert_allclose(body.uv, arrays["vt"], atol=1e-7)
+    assert read_body(write_npz(tmp_path / "other.npz", model("smpl"))).uv is None
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6))
+def test_uvs_of_an_obj_belong_to_corners_in_whatever_order(seed: int) -> None:
+    """Triangles in another order that begin at another corner or run the other way: each corner
+    keeps its own."""
+    arrays, uv, uv_faces = textured()
+    faces = arrays["f"].astype(np.int64)
+    generator = np.random.default_rng(seed)
+    order = generator.permutation(T)
+    corners = generator.permuted(np.tile(np.arange(3), (T, 1)), axis=1)
+    one = np.take_along_axis(faces[order], corners, 1)
+    other = np.take_along_axis(uv_faces[order], corners, 1)
+    file = write_npz(Path("model.npz"), arrays)
+    obj = write_obj(Path("uv.obj"), one, uv, other)
+    body = read_body(file, obj)
+    assert body.uv is not None
+    assert body.uv_faces is not None
+    np.testing.assert_array_equal(body.uv_faces, uv_faces)
+    np.testing.assert_allclose(body.uv, uv, atol=1e-7)
+
+
+def test_an_obj_comes_before_the_uvs_of_the_file(tmp_path: Path) -> None:
+    _, uv, uv_faces = textured()
+    arrays = model("smplx")
+    obj = write_obj(tmp_path / "uv.obj", arrays["f"].astype(np.int64), uv, uv_faces)
+    body = read_body(write_npz(tmp_path / "model.npz", arrays), obj)
+    np.testing.assert_array_equal(body.uv_faces, uv_faces)  # pyright: ignore[reportArgumentType]
+
+
+def test_numbers_from_the_end_in_an_obj(tmp_path: Path) -> None:
+    arrays, uv, uv_faces = textured()
+    obj = write_obj(
+        tmp_path / "uv.obj", arrays["f"].astype(np.int64) - M - 1, uv, uv_faces - len(uv) - 1
+    )
+    body = read_body(write_npz(tmp_path / "model.npz", arrays), obj)
+    np.testing.assert_array_equal(body.uv_faces, uv_faces)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("v 0 0 0", "", "has 29 vertices and 40 triangles, the body has 30 and 40"),
+        ("f ", "# ", "has 30 vertices and 39 triangles, the body has 30 and 40"),
+        ("f ", "f 1 2 3\n# ", r"line \d+: 'f 1 2 3' is not understood; .*'f v/vt v/vt v/vt'"),
+        ("f ", "f 1//1 2//1 3//1\n# ", r"line \d+: 'f 1//1 2//1 3//1' is not"),
+        ("f ", "f 1/1 ", r"line \d+: 'f 1/1 "),
+        ("f ", "f 99/1 1/1 2/2\n# ", "does not exist"),
+        ("f ", "f 1/99 2/1 3/1\n# ", "does not exist"),
+        ("f ", "f -99/1 2/1 3/1\n# ", "does not exist"),
+        ("f ", "f 1/1 1/1 1/1\n# ", "the body has no triangle of the vertices 1 1 1"),
+        ("vt 0.", "vt 7.", r"texture coordinate 0 is 7\.\d+ 0\.\d+; they must lie in \[0, 1\]"),
+        ("vt 0.", "vt nan#", r"line \d+: 'vt nan#"),
+        ("vt 0.", "vt nan 0.", "texture coordinate 0 is nan"),
+        ("vt ", "# ", "texture coordinate"),
+    ],
+)
+def test_wrong_objs(old: str, new: str, words: str, tmp_path: Path) -> None:
+    arrays, uv, uv_faces = textured()
+    file = write_npz(tmp_path / "model.npz", arrays)
+    obj = write_obj(tmp_path / "uv.obj", arrays["f"].astype(np.int64), uv, uv_faces)
+    text = obj.read_text()
+    text = text.replace(old, new) if old == "vt " else text.replace(old, new, 1)
+    obj.write_text(text)
+    assert re.search(words, refusal(file, obj))
+
+
+def test_an_obj_of_another_body_is_not_read_to_its_end(tmp_path: Path) -> None:
+    file = write_npz(tmp_path / "model.npz", model("smpl"))
+    for line in ("v 0 0 0", "vt 0 0", "v 0 0 0\nvt 0 0\nf 1/1 1/1 1/1"):
+        (tmp_path / "uv.obj").write_text(f"{line}\n" * 50_000 + "f that would be a fault\n")
+        assert "the body has 30 and 40; give the .obj made for this body" in refusal(
+            file, tmp_path / "uv.obj"
+        )
+
+
+def test_templates_of_many_vertices_are_refused_before_they_become_larger(tmp_path: Path) -> None:
+    """Weights of 55 joints: 300,000 vertices in a megabyte would become 130 MB."""
+    arrays = model("smplx") | {"v_template": np.zeros((300_000, 3), np.int8)}
+    assert "asks for 300,000 vertices, of which 250,000 are read" in refusal(
+        write_npz(tmp_path / "m.npz", arrays)
+    )
+
+
+def test_an_obj_that_is_not_there_or_no_text(tmp_path: Path) -> None:
+    file = write_npz(tmp_path / "model.npz", model("smpl"))
+    assert "No such file" in refusal(file, tmp_path / "none.obj")
+    assert "the body has 30 and 40" in refusal(file, file)
+
+
+# --- wrong files
+# ------------------------------------------------------------------------------------------------------
+
+
+def changed(key: str, change: Callable[[np.ndarray], object], kind: str = "smpl") -> Arrays:
+    arrays = model(kind)
+    return arrays | {key: change(np.array(arrays[key]))}
+
+
+def with_entry(value: np.ndarray, where: tuple[int, ...], entry: float | list[float]) -> np.ndarray:
+    value[where] = entry
+    return value
+
+
+def with_parents(change: dict[int, int]) -> Arrays:
+    def table(value: np.ndarray) -> np.ndarray:
+        value = value.astype(np.int64)
+        for joint, parent in change.items():
+            value[0, joint] = parent
+        return value
+
+    return changed("kintree_table", table)
+
+
+WRONG: dict[str, tuple[Arrays, str]] = {
+    "cycle": (with_parents({4: 7, 7: 4}), "must list parents before their children"),
+    "own parent": (with_parents({3: 3}), "joint 3 has the parent 3"),
+    "no root": (with_parents({0: 23}), "joint 0 has the parent 23"),
+    "two roots": (with_parents({5: -1}), "joint 5 has no parent; only joint 0"),
+    "order": (with_parents({4: 5}), "parents before their children, but joint 4 has the parent 5"),
+    "stray parent": (with_parents({4: 99}), "joint 4 the parent 99, which does not exist"),
+    "numbering": (
+        changed("kintree_table", lambda x: with_entry(x, (1, 4), 5)),
+        "must number the joints 0 to 23",
+    ),
+    "joints": (changed("kintree_table", lambda x: x[:, :23]), "has 23 joints; SMPL has 24"),
+    "weights": (
+        changed("weights", lambda x: with_entry(x, (3, 0), 2)),
+        r"'weights' of vertex 3 sum to \d",
+    ),
+    "no weights": (changed("weights", lambda x: 0 * x), "'weights' of vertex 0 sum to 0;"),
+    "negative": (
+        changed("weights", lambda x: with_entry(x, (3,), [1.5, -0.5] + [0] * 22)),
+        "of vertex 3 include -0.5",
+    ),
+    "shape": (changed("weights", lambda x: x[:-1]), "'weights' must be 30 x 24, is 29 x 24"),
+    "no vertices": (changed("v_template", lambda x: x[:0]), "'v_template' must be n x 3, is 0 x 3"),
+    "dims": (changed("f", lambda x: x[:, :2]), "'f' must be n x 3, is 40 x 2"),
+    "other kind": (
+        changed("posedirs", lambda x: x[..., :99]),
+        "'posedirs' must be 30 x 3 x 207, is 30 x 3 x 99",
+    ),
+    "shapedirs": (
+        changed("shapedirs", lambda x: x[..., 0]),
+        "'shapedirs' must be 30 x 3 x n, is 30 x 3",
+    ),
+    "regressor": (
+        changed("J_regressor", lambda x: x.T),
+        "'J_regressor' must be 24 x 30, is 30 x 24",
+    ),
+    "NaN": (
+        changed("v_template", lambda x: with_entry(x, (4, 1), np.nan)),
+        "'v_template' holds NaN",
+    ),
+    "Inf": (
+        changed("posedirs", lambda x: with_entry(x, (4, 1, 5), np.inf)),
+        "'posedirs' holds NaN or huge",
+    ),
+    "faces": (
+        changed("f", lambda x: with_entry(x, (4, 1), M)),
+        "'f' must hold whole numbers from 0 to 29",
+    ),
+    "fractions": (changed("f", lambda x: x + 0.5), "'f' must hold whole numbers"),
+    "text": (
+        changed("v_template", lambda _: np.array("no")),
+        "'v_template' must hold numbers, not <U2",
+    ),
+    "uv": (changed("vt", lambda x: x + 0.5, "smplx"), r"texture coordinate \d+ is 1\.\d+"),
+    "uv corners": (changed("ft", lambda x: x[1:], "smplx"), "'ft' must be 40 x 3, is 39 x 3"),
+    "half a uv": ({k: v for k, v in model("smplx").items() if k != "ft"}, "has 'vt' but not 'ft'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_arrays_are_named(case: str, tmp_path: Path) -> None:
+    arrays, words = WRONG[case]
+    with pytest.raises(DyngsError, match=words):
+        read_body(write_npz(tmp_path / "model.npz", arrays))
+    refusal(tmp_path / "model.npz")
+
+
+@pytest.mark.parametrize(
+    "key", ["v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs", "posedirs"]
+)
+def test_missing_keys_are_named(key: str, tmp_path: Path) -> None:
+    arrays = {name: value for name, value in model("smpl").items() if name != key}
+    words = f"lacks '{key}'; give a body file of SMPL, SMPL-H or SMPL-X"
+    assert words in refusal(write_npz(tmp_path / "model.npz", arrays))
+    assert words in refusal(write_pickle(tmp_path / "model.pkl", arrays))
+
+
+def test_a_template_without_its_joints(tmp_path: Path) -> None:
+    with np.load(TEMPLATE, allow_pickle=False) as raw:
+        arrays: Arrays = {key: raw[key] for key in raw if key != "J"}
+        wrong = arrays | {"J": raw["J"], "weights_idx": raw["weights_idx"] + 50}
+    assert "lacks 'J'" in refusal(write_npz(tmp_path / "model.npz", arrays))
+    assert "'weights_idx' must hold whole numbers from 0 to 54" in refusal(
+        write_npz(tmp_path / "model.npz", wrong)
+    )
+
+
+def test_files_that_are_no_body_files(tmp_path: Path) -> None:
+    assert "No such file" in refusal(tmp_path / "none.npz")
+    assert "no such file" in refusal(tmp_path / "none.pkl")
+    assert "is a folder" in refusal(tmp_path)
+    (tmp_path / "model.fbx").touch()
+    assert "must end in .npz or .pkl" in refusal(tmp_path / "model.fbx")
+    for name, words in (("empty.npz", "damaged"), ("empty.pkl", "cannot be read as a pickle")):
+        (tmp_path / name).touch()
+        assert words in refusal(tmp_path / name)
+    assert "not hold a dictionary" in refusal(write_pickle(tmp_path / "list.pkl", [1, 2]))
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    assert "not a .npz" in refusal((tmp_path / "one.npy").rename(tmp_path / "one.npz"))
+
+
+@pytest.mark.parametrize("name", ["model.npz", "model.pkl"])
+def test_truncated_files(name: str, tmp_path: Path) -> None:
+    path = (write_npz if name.endswith("npz") else write_pickle)(tmp_path / name, model("smpl"))
+    whole = path.read_bytes()
+    for fraction in (0.001, 0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(whole[: int(fraction * len(whole))])
+        assert "copy it again" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [(b"(30, 24)", b"(30, 25)"), (b"}", b")"), (b"{", b"'"), (b"<f8", b"|O8")]
+)
+def test_a_damaged_array_inside_a_sound_archive(old: bytes, new: bytes, tmp_path: Path) -> None:
+    path = write_npz(tmp_path / "model.npz", model("smpl"))
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    parts["weights.npy"] = parts["weights.npy"].replace(old, new, 1)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    assert "'weights' is not an array of numbers" in refusal(path)
+
+
+# --- files that want to run code
+# -------------------------------------------------------------------------------------
+
+
+class Evil:
+    """Pickled as a call of anything with any arguments."""
+
+    def __init__(self, function: object, *arguments: object) -> None:
+        self.call = (function, arguments)
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self.call  # pyright: ignore[reportReturnType]
+
+
+@pytest.mark.parametrize("key", ["weights", "of no use"])
+def test_a_pickle_that_wants_to_run_code_is_refused_and_does_not(key: str, tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+    evil = Evil(os.system, f"touch {mark}")
+    message = refusal(write_pickle(tmp_path / "model.pkl", model("smpl") | {key: [evil]}))
+    assert f"it holds '{os.system.__module__}.system', but only numbers" in message
+    assert not mark.exists()
+
+
+def test_arrays_of_objects_are_refused_where_needed_and_left_alone_elsewhere(
+    tmp_path: Path,
+) -> None:
+    mark = tmp_path / "ran"
+    evil = np.array([Evil(os.system, f"touch {mark}")], dtype=object)
+    wrong = write_npz(tmp_path / "model.npz", model("smpl") | {"weights": evil})
+    assert "'weights' is not an array of numbers (ValueError: it holds Python objects)" in refusal(
+        wrong
+    )
+    read_body(write_npz(tmp_path / "model.npz", model("smpl") | {"part2num": evil}))
+    assert not mark.exists()
+    objects = np.array([1, 2], dtype=object)
+    assert "'f' is not an array of numbers" in refusal(
+        write_pickle(tmp_path / "a.pkl", model("smpl") | {"f": objects})
+    )
+    assert "'f' is not an array of numbers" in refusal(
+        write_pickle(tmp_path / "a.pkl", model("smpl") | {"f": "text"})
+    )
+
+
+def test_the_free_template_is_the_default() -> None:
+    assert torch.equal(load_template(HumanModel()).vertices, default_template().vertices)
+
+
+def test_a_body_file_is_read(tmp_path: Path) -> None:
+    found = load_template(HumanModel(body=write_npz(tmp_path / "x.npz", model("smplx"))))
+    assert found.name == "smplx"
+
+
+def test_files_are_read_again_only_when_they_have_changed(tmp_path: Path) -> None:
+    named = HumanModel(body=write_npz(tmp_path / "x.npz", model("smpl", seed=1)))
+    first = load_template(named)
+    assert load_template(named) is first
+    write_npz(tmp_path / "x.npz", model("smpl", seed=2))
+    assert not torch.equal(load_template(named).vertices, first.vertices)
+
+
+def test_texture_coordinates_alone_are_an_error() -> None:
+    with pytest.raises(DyngsError, match=r"goes with model\.body"):
+        load_template(HumanModel(uv=Path("smplx_uv.obj")))
+
+
+def parameters(betas: torch.Tensor, shape_space: ShapeSpace) -> BodyFrames:
+    row = np.zeros((1, 3))
+    return BodyFrames(
+        (0,), np.zeros((1, 55, 3)), row, betas.numpy(), np.ones(1), shape_space=shape_space
+    )
+
+
+def test_shape_parameters_that_a_template_lacks_are_left_out() -> None:
+    body = tiny_body(shapes=2)
+    betas = torch.tensor([0.5, -1.0, 3.0])
+    vertices, joints = rest_shape(body, parameters(betas, "smpl"))
+    wanted = apply_shape(body, betas[:2])
+    assert torch.equal(vertices, wanted[0])
+    assert torch.equal(joints, wanted[1])
+
+
+def test_shape_parameters_count_in_their_own_shape_space_only() -> None:
+    betas = torch.tensor([0.5, -1.0, 3.0])
+    free = default_template()
+    other = tiny_body(shapes=2)
+    assert torch.equal(rest_shape(free, parameters(betas, "smpl"))[0], free.vertices)
+    assert torch.equal(rest_shape(other, parameters(betas, "anny"))[1], other.joints)
+    assert torch.equal(rest_shape(free, parameters(betas, "anny"))[1], apply_shape(free, betas)[1])
+
+
+def test_the_shape_of_a_fit_counts_for_its_file_only(tmp_path: Path) -> None:
+    first, second = (
+        read_body(write_npz(tmp_path / f"{i}.npz", model("smpl", seed=i))) for i in (0, 1)
+    )
+    given = replace(parameters(torch.ones(10), "smpl"), fitted_to=first.fingerprint)
+    assert has_same_shapes(first, given)
+    assert not has_same_shapes(second, given)
+    assert torch.equal(rest_shape(first, given)[0], apply_shape(first, torch.ones(10))[0])
+    assert torch.equal(rest_shape(second, given)[0], second.vertices)
+    assert has_same_shapes(second, parameters(torch.ones(10), "smpl")), "of other programs"
+
+
+def test_a_fingerprint_tells_files_apart_by_mesh_shapes_and_joints(tmp_path: Path) -> None:
+    arrays = model("smpl")
+    body = read_body(write_npz(tmp_path / "a.npz", arrays))
+    again = read_body(write_pickle(tmp_path / "a.pkl", arrays))
+    assert again.fingerprint == body.fingerprint, "whatever kind of file it is"
+    more = np.concatenate([arrays["shapedirs"], arrays["shapedirs"]], axis=2)
+    longer = read_body(write_npz(tmp_path / "b.npz", arrays | {"shapedirs": more}))
+    assert longer.fingerprint == body.fingerprint, "only ten shapes are fitted"
+    others = [replace(body, name="smplh")] + [
+        read_body(write_npz(tmp_path / f"{key}.npz", arrays | {key: 1.01 * arrays[key]}))
+        for key in ("v_template", "shapedirs")
+    ]
+    assert len({x.fingerprint for x in (body, *others)}) == 4

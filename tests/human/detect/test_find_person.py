@@ -1,0 +1,211 @@
+"""A person found in a clip: the files for the fit, and the capture that comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from dyngs.api.train import with_capture
+from dyngs.capture.fixed_camera import read_fixed_camera
+from dyngs.config import DataConfig
+from dyngs.config.io import load_config
+from dyngs.core.conventions import report_nothing
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture, all_views
+from dyngs.data.images.images import read_image
+from dyngs.data.read import read_capture
+from dyngs.human.detect import find_person as module
+from dyngs.human.detect.detector import Detection
+from dyngs.human.detect.find_person import find_person, with_found_person, write_found_person
+from dyngs.human.detect.mediapipe import VARIABLE
+from dyngs.human.fit.keypoints import JOINTS, read_keypoints
+from dyngs.io.write import write_image
+from tests.detections import person
+
+HEIGHT, WIDTH, COUNT = 120, 160, 10
+
+
+def truth(number: int) -> np.ndarray:
+    """Mask (H, W) of somebody with legs apart who walks to the right."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    across = columns - (30 + 10 * number)
+    trunk = (abs(across) < 12) & (rows > 20) & (rows < 70)
+    legs = (abs(abs(across) - 8) < 4) & (rows >= 70) & (rows < 108)
+    return trunk | legs | (across**2 + (rows - 14) ** 2 < 49)
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(3)
+    ground = rng.uniform(60, 200, (HEIGHT // 8, WIDTH // 8, 3)).repeat(8, 0).repeat(8, 1)
+    clothes = rng.uniform(0, 255, (HEIGHT // 4, WIDTH // 4, 3)).repeat(4, 0).repeat(4, 1)
+    for number in range(COUNT):
+        moved = np.roll(clothes, 10 * number, axis=1)
+        image = np.where(truth(number)[..., None], moved, ground) + rng.normal(
+            0, 1.5, (HEIGHT, WIDTH, 3)
+        )
+        write_image(tmp_path / "clip" / f"f{number}.png", np.clip(image, 0, 255).astype(np.uint8))
+    return tmp_path / "clip"
+
+
+class Rough:
+    """Finds the person with outlines that are 1 px off, and nobody in image 4; smaller, somebody
+    who stands apart."""
+
+    name = "Rough"
+
+    def __init__(self, beside: bool = False, nobody: bool = False) -> None:
+        self.beside, self.nobody = beside, nobody
+
+    def detect(self, images: Sequence[Path]) -> list[list[Detection]]:
+        shown = [read_image(path).shape[:2] for path in images]
+        scale = shown[0][0] / HEIGHT
+        step = COUNT // len(images)  # frames 0, 4 and 8, or all of them
+        numbers = range(0, COUNT, step) if step == 1 else (0, 4, 8)
+        return [[] if self.nobody or n == 4 else self._people(n, scale) for n in numbers]
+
+    def _people(self, number: int, scale: float) -> list[Detection]:
+        grown = (ndimage.binary_dilation, ndimage.binary_erosion)[number % 2](truth(number))
+        grown = grown[:: round(1 / scale), :: round(1 / scale)]
+        points = person(30 + 10 * number, 90.0).keypoints * np.array(
+            [scale, scale, 1.0], np.float32
+        )
+        walker = Detection(points.astype(np.float32), (255 * grown).astype(np.uint8))
+        small = np.zeros_like(walker.mask)
+        small[-8:, -8:] = 255
+        return [Detection(person(150, 20.0).keypoints, small), walker] if self.beside else [walker]
+
+
+def capture_of(clip: Path) -> Capture:
+    return read_fixed_camera(DataConfig(root=clip))
+
+
+def overlap(folder: Path, number: int) -> float:
+    found = read_image(folder / f"f{number}.png")[..., 0].numpy() > 127
+    return float((found & truth(number)).sum() / (found | truth(number)).sum())
+
+
+@pytest.mark.parametrize("side", [960, 80])
+def test_masks_and_key_points_of_all_views(
+    clip: Path, tmp_path: Path, side: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SIDE", side)
+    said: list[str] = []
+    found = find_person(
+        capture_of(clip), Rough(beside=side == 960), tmp_path / "found", report_nothing, said.append
+    )
+    assert found.masks is not None
+    assert found.keypoints is not None
+    seen = [number for number in range(COUNT) if number != 4]
+    # at half the size
+    assert min(overlap(found.masks, number) for number in seen) > (0.93 if side == 960 else 0.7)
+    assert overlap(found.masks, 4) == 0
+    points = read_keypoints(found.keypoints, capture_of(clip).splits["train"])
+    assert set(points) == {f"f{number}" for number in seen}
+    ankle = points["f2"][JOINTS["left_ankle"]].numpy()
+    np.testing.assert_allclose(ankle, person(50, 90.0).keypoints[15], atol=1e-3)
+    assert any("finds the person" in line and "in 9 of 10 images" in line for line in said)
+    assert any(line.startswith("warning: other people in 9 of 10 images") for line in said) == (
+        side == 960
+    )
+    assert not list((tmp_path / "found" / "frames").iterdir()), (
+        "images for the detector only live while it runs"
+    )
+
+
+def test_another_person_and_nobody(clip: Path, tmp_path: Path) -> None:
+    found = find_person(
+        capture_of(clip),
+        Rough(beside=True),
+        tmp_path / "found",
+        report_nothing,
+        [].append,
+        number=2,
+    )
+    assert found.masks is not None
+    assert overlap(found.masks, 2) < 0.1
+    with pytest.raises(DyngsError, match="--person 3, but people found: 2"):
+        find_person(
+            capture_of(clip),
+            Rough(beside=True),
+            tmp_path / "found",
+            report_nothing,
+            [].append,
+            number=3,
+        )
+    with pytest.raises(DyngsError, match="Rough finds nobody in 10 images"):
+        find_person(
+            capture_of(clip), Rough(nobody=True), tmp_path / "found", report_nothing, [].append
+        )
+
+
+def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Path) -> None:
+    capture = capture_of(clip)
+    first = list(capture.splits["train"])
+    others = [replace(view, camera_id=1, name=f"other_{view.name}") for view in first]
+    detector = Rough()
+    once = detector.detect
+    answers = iter([once, lambda images: [[] for _ in images]])
+    detector.detect = lambda images: next(answers)(images)  # type: ignore[method-assign]
+    said: list[str] = []
+    both = capture.replace(splits={"train": (*first, *others)})
+    found = find_person(both, detector, tmp_path / "found", report_nothing, said.append)
+    assert "warning: camera 1: Rough finds nobody, its images are left out" in said
+    assert found.masks is not None
+    assert not any(read_image(found.masks / f"{view.name}.png").any() for view in others)
+    assert overlap(found.masks, 2) > 0.93
+
+
+def test_a_capture_of_the_person_comes_out(
+    clip: Path, tmp_path: Path, short_fits: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 2)
+    out = tmp_path / "ann"
+    result = write_found_person(DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append)
+    assert result.root == out
+    capture = read_capture(DataConfig(root=out))
+    assert capture.body is not None
+    assert capture.has_alpha
+    assert len(all_views(capture.splits)) == 2, "the image without anybody is left out"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ann", "clip"], (
+        "nothing else is left behind"
+    )
+    with pytest.raises(DyngsError, match=r"exists|not empty"):
+        write_found_person(DataConfig(root=clip), out, Rough(), say=[].append)
+
+
+def test_a_clip_is_looked_at_once(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "MediaPipe", Rough)
+    made: list[Path] = []
+
+    def write(options: DataConfig, out: Path, *_: object) -> SimpleNamespace:
+        assert options.root == clip
+        out.mkdir(parents=True)
+        made.append(out)
+        return SimpleNamespace(summary=lambda: "fitted")
+
+    monkeypatch.setattr(module, "write_found_person", write)
+    said: list[str] = []
+    for frames in ("0:8", "0:8", "0:4"):
+        data = with_found_person(DataConfig(root=clip, frames=frames), say=said.append)
+        assert (data.root, data.frames) == (made[-1], None)
+    assert len(made) == 2
+    assert [line for line in said if "found before" in line] == [said[2]]
+
+
+def test_without_a_detector_training_says_what_to_install(
+    clip: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    config = load_config("human", [f"data.root={clip}"])
+    with pytest.raises(DyngsError, match="install MediaPipe"):
+        with_capture(config, say=[].append)

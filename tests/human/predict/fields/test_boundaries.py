@@ -1,0 +1,133 @@
+"""Depths of meshes and of the boundaries of a body, by known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dyngs.core.camera import Cameras
+from dyngs.human.predict.fields.boundaries import INWARDS, OUTWARDS, Boundaries, depths
+from dyngs.human.predict.fields.people import Body, Person, metric
+
+DISTANCE, RADIUS = 3.0, 0.3
+
+
+def sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles, anticlockwise from outside, of a fine sphere."""
+    rings, steps = 40, 80
+    angles = (
+        np.linspace(0, np.pi, rings + 1)[:, None],
+        np.linspace(0, 2 * np.pi, steps, endpoint=False)[None],
+    )
+    around = np.ones_like(angles[1])
+    ring = np.sin(angles[0])
+    x = ring * np.cos(angles[1])
+    y = np.cos(angles[0]) * around
+    z = ring * np.sin(angles[1])
+    vertices = radius * np.stack([x, y, z], -1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(rings), np.arange(steps), indexing="ij")
+    a = i * steps + j
+    b = i * steps + (j + 1) % steps
+    faces = np.concatenate(
+        [np.stack([a, b, b + steps], -1), np.stack([a, b + steps, a + steps], -1)]
+    )
+    return vertices, faces.reshape(-1, 3)
+
+
+def camera() -> Cameras:
+    pose = torch.eye(4)[None].clone()
+    pose[0, 2, 3] = DISTANCE
+    return Cameras(pose, torch.tensor([[[100.0, 0, 16], [0, 100, 12], [0, 0, 1]]]), 32, 24)
+
+
+def true_depths(radius: float, sign: float) -> torch.Tensor:
+    """Where rays through pixel centres meet a sphere at the origin first (-1) or last (1), z in
+    m."""
+    y, x = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
+    local = torch.stack([(x - 16) / 100, (y - 12) / 100, torch.ones_like(x)], -1).double()
+    a = local.square().sum(-1)
+    b = -2 * DISTANCE * local[..., 2]
+    c = DISTANCE**2 - radius**2
+    root = b.square() - 4 * a * c
+    return torch.where(
+        root > 0, (-b + sign * root.clamp_min(0).sqrt()) / (2 * a), torch.inf
+    ).float()
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_sphere_is_met_first_and_last(last: bool) -> None:
+    vertices, faces = sphere(RADIUS)
+    found = depths(vertices, faces, camera(), last=last)
+    expected = true_depths(RADIUS, 1.0 if last else -1.0)
+    both = found.isfinite() & expected.isfinite()
+    assert int((found.isfinite() != expected.isfinite()).sum()) < 0.1 * int(both.sum())
+    torch.testing.assert_close(found[both], expected[both], atol=0.02, rtol=0)
+    assert float((found - expected)[both].abs().mean()) < 2e-3
+    if not last:
+        assert torch.equal(depths(vertices, faces, camera(), front_faces=True), found)
+    turned = depths(vertices, faces[:, ::-1], camera(), front_faces=True)
+    middle = turned[12, 16]
+    assert float(middle) == pytest.approx(DISTANCE + RADIUS, abs=2e-3), "seen from inside alone"
+
+
+def test_nothing_is_seen_behind_the_camera() -> None:
+    vertices, faces = sphere(RADIUS)
+    assert bool(depths(vertices - [0, 0, 2 * DISTANCE], faces, camera()).isinf().all())
+
+
+def test_boundaries_of_a_ball_are_balls() -> None:
+    vertices, faces = sphere(RADIUS)
+    body = Body(
+        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
+    )
+    found = Boundaries(body).interval(camera())
+    middle = found.begin[12, 16], found.body[12, 16], found.end[12, 16]
+    expected = (DISTANCE - RADIUS - OUTWARDS, DISTANCE - RADIUS, DISTANCE - RADIUS + INWARDS)
+    torch.testing.assert_close(torch.stack(middle), torch.tensor(expected), atol=2e-3, rtol=0)
+    outside = found.body.isinf() & found.begin.isfinite()
+    assert bool(outside.any())
+    expected_end = true_depths(RADIUS + OUTWARDS, 1.0)
+    sure = outside & expected_end.isfinite() & true_depths(RADIUS, 1.0).isinf()
+    assert float((found.end - expected_end)[sure].abs().median()) < 5e-3, (
+        "what misses the body comes out again"
+    )
+
+
+def test_heights_above_a_ball_are_distances_to_it() -> None:
+    vertices, faces = sphere(RADIUS)
+    body = Body(
+        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
+    )
+    direction = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    heights = torch.linspace(-0.5 * RADIUS, RADIUS, 50)
+    found = Boundaries(body).height((RADIUS + heights)[:, None] * direction)
+    torch.testing.assert_close(found, heights, atol=0.02, rtol=0.02)
+    assert bool((found.sign() == heights.sign())[heights.abs() > 0.02].all())
+
+
+def test_a_thin_body_ends_behind_its_front() -> None:
+    """Eroded by more than its radius it is inside out, and its back would come first."""
+    vertices, faces = sphere(0.03)
+    body = Body(
+        torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
+    )
+    found = Boundaries(body).interval(camera())
+    assert float(found.end[12, 16]) > float(found.body[12, 16])
+
+
+def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None:
+    body, scale = person.body_in(person.views[0])
+    image = person.images[0]
+    found = Boundaries(body).interval(metric(image.cameras, scale))
+    assert image.depth is not None
+    assert image.alpha is not None
+    solid = (image.alpha > 0.99) & (image.depth > 0)
+    truth = (image.depth / scale)[solid]
+    inside = (found.begin[solid] <= truth) & (truth <= found.end[solid])
+    assert float(inside.float().mean()) > 0.9
+    met = found.body.isfinite() & found.begin.isfinite()
+    assert bool((found.end > found.body)[met].all()), "also of mouth, eyes and fingers"
+    assert float(found.begin.isfinite().float().mean()) < 0.6

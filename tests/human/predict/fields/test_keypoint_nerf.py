@@ -1,0 +1,131 @@
+"""The code of key points, the cells that hold a person, and pictures of KeypointNeRF."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dyngs.human.body.joints import JOINT_PARENTS
+from dyngs.human.predict.fields.features import Seen
+from dyngs.human.predict.fields.keypoint_nerf import (
+    CODE,
+    REACH,
+    KeypointNerf,
+    from_bones,
+    hull,
+    spatial_code,
+)
+from dyngs.human.predict.fields.keys import KeypointNerfModel
+from dyngs.human.predict.fields.network import Known
+from dyngs.human.predict.fields.people import Body, Person, Sources, metric, sources_of, window
+
+MODEL = KeypointNerfModel(features=8, width=16, step=0.03)
+
+
+@pytest.fixture(scope="module")
+def network() -> KeypointNerf:
+    return KeypointNerf(MODEL, torch.Generator().manual_seed(0))
+
+
+def given(person: Person, views: tuple[int, ...] = (0, 2, 4)) -> tuple[Sources, Body, float]:
+    body, scale = person.body_in(person.views[0])
+    return sources_of([person.images[i] for i in views], scale), body, scale
+
+
+def known(network: KeypointNerf, person: Person, views: tuple[int, ...] = (0, 2, 4)) -> Known:
+    sources, body, _ = given(person, views)
+    with torch.no_grad():
+        return network.look(sources, body)
+
+
+def test_the_code_is_that_of_the_paper(person: Person) -> None:
+    """Number by number, in float64."""
+    sources, body, _ = given(person)
+    points = body.key_points[:5] + torch.tensor([0.05, -0.02, 0.08])
+    found = spatial_code(points, body.key_points, sources)
+    assert found.shape == (3, 5, CODE)
+    for view in range(3):
+        pose = sources.cam_from_world[view].double()
+        depths = [
+            (x.double() @ pose[:3, :3].T + pose[:3, 3])[:, 2] for x in (points, body.key_points)
+        ]
+        for m in range(5):
+            for j in range(22):
+                dz = float(depths[0][m] - depths[1][j])
+                near = math.exp(
+                    -float((points[m] - body.key_points[j]).double().square().sum())
+                    / (2 * REACH**2)
+                )
+                waves = [
+                    f(math.pi * 2**octave * dz) for octave in range(3) for f in (math.sin, math.cos)
+                ]
+                expected = torch.tensor([near * x for x in (dz, *waves)])
+                torch.testing.assert_close(found[view, m, j::22], expected, atol=2e-5, rtol=0)
+
+
+def test_bones_are_segments(person: Person) -> None:
+    _, body, _ = given(person)
+    points = body.vertices[::500]
+    steps = torch.linspace(0, 1, 400)[:, None, None]
+    starts = body.key_points[list(JOINT_PARENTS[1:22])]
+    along = (starts + steps * (body.key_points[1:] - starts)).flatten(0, 1)
+    expected = torch.cdist(points, along).amin(1)
+    torch.testing.assert_close(from_bones(points, body.key_points), expected, atol=2e-3, rtol=0)
+
+
+def test_the_cells_hold_the_body_and_nothing_far_away(
+    network: KeypointNerf, person: Person
+) -> None:
+    """What two opposite images leave open is closed by the bones."""
+    for views in ((0, 2, 4), (0, 4)):
+        own = known(network, person, views)
+        found = own.own
+        cells = (found.space.unit(own.body.vertices) * found.space.cells).long()
+        x, y, z = cells.unbind(1)
+        shown = (own.seen.alpha(own.body.vertices) > 0.5).all(0)
+        assert float(shown.float().mean()) > 0.5, "at 40 px many vertices lie on the outline"
+        assert bool(found.occupied[0, z, y, x][shown].all())
+        assert 0.001 < float(found.occupied.float().mean()) < 0.15
+
+
+def test_cells_are_empty_where_an_image_shows_nobody(network: KeypointNerf, person: Person) -> None:
+    sources, body, _ = given(person)
+    rgba = sources.rgba.clone()
+    rgba[1] = 0
+    seen = known(network, person).seen
+    empty = hull(Seen(replace(sources, rgba=rgba), seen.coarse, seen.fine), body.key_points)
+    assert not bool(empty.occupied.any())
+
+
+def test_a_part_of_a_picture_is_the_same_alone(network: KeypointNerf, person: Person) -> None:
+    """And pictures do not depend on the order of the images."""
+    own, (_, _, scale) = known(network, person), given(person)
+    image = person.images[1]
+    with torch.no_grad():
+        whole = network.picture(own, metric(image.cameras, scale))
+        part = network.picture(own, metric(window(image, 8, 10, 16).cameras, scale))
+        turned = network.picture(known(network, person, (4, 0, 2)), metric(image.cameras, scale))
+    torch.testing.assert_close(part.colour, whole.colour[10:26, 8:24], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(turned.transmittance, whole.transmittance, atol=1e-4, rtol=1e-3)
+    assert image.alpha is not None
+    alpha = 1 - whole.transmittance
+    assert float(alpha[image.alpha > 0.9].mean()) > 0.5, "an untrained network fills the cells"
+    assert float(alpha.mean()) < 0.5
+
+
+def test_all_weights_are_learned(network: KeypointNerf, person: Person) -> None:
+    """The same random numbers give the same gradients."""
+    sources, body, scale = given(person)
+    camera = metric(window(person.images[1], 8, 10, 16).cameras, scale)
+    grads = []
+    for _ in range(2):
+        picture = network.picture(
+            network.look(sources, body), camera, torch.Generator().manual_seed(1)
+        )
+        total = picture.colour.square().sum() + picture.transmittance.sum()
+        grads.append(torch.autograd.grad(total, list(network.parameters())))
+    assert all(torch.equal(a, b) for a, b in zip(*grads, strict=True))
+    assert all(bool(x.abs().sum() > 0) for x in grads[0])

@@ -1,0 +1,139 @@
+"""Bodies, images and views of captured people, in metres."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
+from dyngs.human.avatar.observations import project_points
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.predict.fields.people import (
+    KEY_POINTS,
+    Person,
+    metric,
+    moments,
+    person_of,
+    require_shown,
+    sources_of,
+    spread,
+    window,
+)
+
+
+def test_key_points_are_the_true_ones(person: Person, folder: Path) -> None:
+    """In the world of the capture, once metres are its units."""
+    body, scale = person.body_in(person.views[0])
+    with np.load(folder / "s0000" / "p000000" / "true_keypoints.npz") as found:
+        true = next(x for x in (found[name] for name in found) if x.ndim >= 2 and x.shape[-1] == 3)
+    true = torch.from_numpy(true.reshape(-1, 3)[:KEY_POINTS]).float()
+    torch.testing.assert_close(scale * body.key_points, true, atol=1e-4, rtol=0)
+    low = body.vertices.amin(0)
+    high = body.vertices.amax(0)
+    assert 1.2 < float((high - low).max()) < 2.4
+    assert scale != 1
+
+
+def test_metres_look_the_same(person: Person) -> None:
+    """The silhouette of the body lies where the image shows the person."""
+    body, scale = person.body_in(person.views[0])
+    image = person.images[0]
+    at, _, _ = project_points(body.vertices, metric(image.cameras, scale))
+    expected, _, _ = project_points(scale * body.vertices, image.cameras)
+    torch.testing.assert_close(at, expected, atol=1e-3, rtol=0)
+    column, row = at.long().unbind(1)
+    assert image.alpha is not None
+    assert float((image.alpha[row, column] > 0).float().mean()) > 0.9
+
+
+def test_sources_are_the_images_around_the_person(person: Person) -> None:
+    """Padded to one size; what a point shows is what it shows in the whole image."""
+    images = [person.images[i] for i in (0, 2, 5)]
+    body, scale = person.body_in(person.views[0])
+    sources = sources_of(images, scale)
+    height, width = sources.rgba.shape[2:]
+    assert (height % 8, width % 8, len(sources)) == (0, 0, 3)
+    for i, image in enumerate(images):
+        assert image.alpha is not None
+        assert float(sources.rgba[i, 3].sum()) == pytest.approx(float(image.alpha.sum()))
+        whole = torch.cat([image.rgb_premultiplied, image.alpha[..., None]], -1)
+        cut = sources.rgba[i].permute(1, 2, 0)
+        found = []
+        for camera, rgba in ((sources.camera(i), cut), (metric(image.cameras, scale), whole)):
+            at, _, _ = project_points(body.key_points[:12], camera)
+            column, row = at.long().unbind(1)
+            found.append(rgba[row, column])
+        torch.testing.assert_close(*found)
+        torch.testing.assert_close(sources.centers[i], image.cameras.centers[0] / scale)
+
+
+@pytest.mark.parametrize(
+    ("left", "top", "corner"), [(7, 9, (9, 7)), (-5, 90, (28, 0)), (35, -2, (0, 28))]
+)
+def test_a_window_is_moved_into_the_image(
+    person: Person, left: int, top: int, corner: tuple[int, int]
+) -> None:
+    image = person.images[0]
+    found = window(image, left, top, 12)
+    row, column = corner
+    assert torch.equal(
+        found.rgb_premultiplied, image.rgb_premultiplied[row : row + 12, column : column + 12]
+    )
+    assert found.depth is not None
+    assert image.depth is not None
+    assert torch.equal(found.depth, image.depth[row : row + 12, column : column + 12])
+    point = torch.tensor([[0.1, 0.9, 0.0]])
+    there, whole = (project_points(point, x.cameras)[0] for x in (found, image))
+    torch.testing.assert_close(there + torch.tensor([column, row]), whole)
+    assert window(image, 3, 3, 100).alpha is not None
+    assert window(image, 3, 3, 100).cameras.width == 40
+
+
+def test_views_are_spread_around_a_moment(person: Person) -> None:
+    views = person.views
+    (ring,) = moments(views).values()
+    assert sorted(ring) == list(range(len(views)))
+    angles = np.unwrap([np.arctan2(*views[i].cam_from_world[2, [0, 2]]) for i in ring])
+    assert (np.diff(angles) > 0).all() or (np.diff(angles) < 0).all()
+    assert spread(range(12), 4) == [0, 3, 6, 9]
+    assert spread(range(12), 3, 11) == [11, 3, 7]
+    later = [replace(view, frame=1, time=0.5) if i % 2 else view for i, view in enumerate(views)]
+    assert [len(x) for x in moments(later).values()] == [(len(views) + 1) // 2, len(views) // 2]
+
+
+def test_captures_that_do_not_do_are_refused(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder / "s0000" / "p000000", tmp_path / "ann"))
+    (copy / "body_train.npz").unlink()
+    with pytest.raises(
+        DyngsError, match="ann: has no body parameters, which say where the key points are"
+    ):
+        person_of(DataConfig(root=copy), default_template())
+
+
+def test_a_body_that_is_elsewhere_is_told(person: Person) -> None:
+    """Wrong focal lengths, a camera that looks past the person or away from it, and masks that show
+    nobody."""
+    image, (body, scale) = person.images[0], person.body_in(person.views[0])
+    require_shown("ann", image, body, scale)
+    camera = image.cameras
+    turn = torch.eye(4)
+    assert image.alpha is not None
+
+    def told(message: str, **changes: object) -> None:
+        with pytest.raises(DyngsError, match=f"ann: .*{message}"):
+            require_shown("ann", replace(image, **changes), body, scale)
+
+    long = camera.intrinsics * torch.tensor([[1.6], [1.6], [1.0]])
+    told("calibration or the body is wrong", cameras=replace(camera, intrinsics=long))
+    for degrees, message in ((20, "px from where the body is"), (180, "lies behind the camera")):
+        c = np.cos(np.radians(degrees))
+        s = np.sin(np.radians(degrees))
+        turn[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        told(message, cameras=replace(camera, cam_from_world=turn @ camera.cam_from_world))
+    told("shows no silhouette", alpha=torch.zeros_like(image.alpha))

@@ -1,0 +1,108 @@
+"""What was predicted: drawn, stored, restored; not trained; broken files are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_field_people import NETWORKS, SIZES
+
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import tensors_of
+from dyngs.human.predict.fields.keys import PredictedFieldModel
+from dyngs.human.predict.fields.people import Person, sources_of
+from dyngs.human.predict.fields.scene import (
+    SECTIONS,
+    PredictedField,
+    around_in,
+    network_of,
+    refusal,
+    stored_field,
+)
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.renderable import DrawOptions
+from dyngs.training.new_trainer import restored_model
+
+KINDS = sorted(NETWORKS)
+
+
+@pytest.fixture(params=KINDS)
+def scene(request: pytest.FixtureRequest, person: Person) -> PredictedField:
+    model = SECTIONS[request.param].model_validate(
+        {"kind": request.param} | SIZES | NETWORKS[request.param]
+    )
+    body, scale = person.body_in(person.views[0])
+    sources = sources_of([person.images[i] for i in (0, 2, 4)], scale)
+    network = network_of(model, torch.Generator().manual_seed(0))
+    return PredictedField(model, network, sources, body, scale, background=torch.ones(3))
+
+
+def checkpoint_of(scene: PredictedField, **changes: torch.Tensor) -> Checkpoint:
+    tensors = tensors_of(scene.state()) | {f"field.{name}": x for name, x in changes.items()}
+    return Checkpoint(
+        CheckpointInfo(0, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors, Path("it")
+    )
+
+
+def test_it_is_stored_and_drawn_the_same(scene: PredictedField, person: Person) -> None:
+    model = PredictedFieldModel.model_validate({"network": scene.model.kind})
+    found = restored_model(checkpoint_of(scene), model)
+    camera = person.images[1].cameras
+    options = DrawOptions(depth="expected")
+    one, other = (x.render(camera, 0.3, options=options) for x in (scene, found))
+    assert torch.equal(one.rgb, other.rgb)
+    assert torch.equal(one.transmittance, other.transmittance)
+    assert one.depth is not None
+    distance = float(camera.centers[0].norm())
+    solid = one.alpha > 0.9
+    assert bool(solid.any())
+    assert bool(((one.depth[solid] - distance).abs() < 1.2 * scene.scale).all())
+    low, high = scene.bounds
+    assert bool((low < scene.scale * scene.body.key_points).all())
+    assert bool((high > scene.scale * scene.body.key_points).all())
+    assert bool((one.rgb[0, 0, 0] == 1).all()), "white beside the person"
+
+
+def test_only_the_part_with_the_person_is_drawn(scene: PredictedField, person: Person) -> None:
+    camera = person.images[1].cameras
+    box = scene.bounds
+    part = around_in(camera, box)
+    assert part is not None
+    assert (part.camera.width % 8, part.camera.height % 8) == (0, 0)
+    away = camera.intrinsics.clone()
+    away[:, 0, 2] += 200
+    nowhere = Cameras(camera.cam_from_world, away, camera.width, camera.height)
+    assert around_in(nowhere, box) is None
+    drawn = scene.render(nowhere)
+    assert bool((drawn.alpha == 0).all())
+    behind = camera.cam_from_world.clone()
+    behind[:, 2, 3] -= 100
+    assert around_in(replace(camera, cam_from_world=behind), box) is None
+    inside = camera.cam_from_world.clone()
+    inside[:, :3, 3] = -(inside[:, :3, :3] @ box.mean(0)[:, None])[..., 0]
+    whole = around_in(replace(camera, cam_from_world=inside), box)
+    assert whole is not None
+    assert whole.camera.width == camera.width
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["numbers", "body.vertices", "body.faces", "sources.rgba", "network.encoder.fine.weight"],
+)
+def test_what_does_not_fit_is_refused(scene: PredictedField, name: str) -> None:
+    whole = checkpoint_of(scene)
+    own = whole.tensors[f"field.{name}"]
+    broken = own + 10**9 if name == "body.faces" else own[..., :-1]
+    for changed in (broken, own * float("nan") if own.is_floating_point() else broken):
+        with pytest.raises(DyngsError, match="it: "):
+            restored_model(checkpoint_of(scene, **{name: changed}), PredictedFieldModel())
+    del whole.tensors[f"field.{name}"]
+    with pytest.raises(KeyError):
+        stored_field(str(scene.model.kind), whole)
+
+
+def test_it_is_not_trained() -> None:
+    assert "not trained" in refusal(None)

@@ -1,0 +1,264 @@
+"""Maps of images: the colours of a painted person, what is hidden, silhouettes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dyngs.core.camera import Cameras
+from dyngs.data.capture import BodyFrames, Capture, View
+from dyngs.data.geometry import cam_from_opengl
+from dyngs.data.loader import Image
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
+from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.body.atlas import Texels, atlas_texels
+from dyngs.human.body.body import BodyTemplate, posed_vertices
+from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.body.mesh import interpolate, rasterize
+from dyngs.human.keys import HumanPredictorModel
+from dyngs.human.predict.ghg.person import (
+    CapturedPerson,
+    captured_person,
+    colours_nearby,
+    mirror_texels,
+)
+from dyngs.human.predict.ghg.texel_maps import (
+    HULL_LIMIT,
+    from_atlas,
+    observe_texels,
+    to_atlas,
+)
+from dyngs.human.synthetic.capture import PosedMesh, render_mesh
+from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
+
+
+@cache
+def texels() -> Texels:
+    body = default_template()
+    return atlas_texels(body, 64, body.vertices)
+
+
+def test_mirror_texels_lie_on_the_other_side() -> None:
+    """Within two widths of a texel (3 cm), and mirrored twice most come back to where they were."""
+    points = texels().points
+    mirror = mirror_texels(texels())
+    there = points[mirror] * torch.tensor([-1.0, 1.0, 1.0])
+    assert (there - points).norm(dim=1).quantile(0.95) < 0.06
+    assert (points[mirror[mirror]] - points).norm(dim=1).quantile(0.95) < 0.06
+
+
+def test_unseen_texels_take_colours_from_their_surroundings() -> None:
+    """The back of a person seen from the front: legs like legs, the chest like the chest; what is
+    seen stays."""
+    points = texels().points
+    normals = texels().normals
+    seen = normals[:, 2].clamp_min(0)
+    rgb = torch.where(
+        (points[:, 1] > 0)[:, None], torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
+    )
+    found = colours_nearby(texels(), rgb * (seen > 0)[:, None], seen)
+    assert torch.equal(found[seen > 0], rgb[seen > 0])
+    away = (seen == 0) & (points[:, 1].abs() > 0.15)
+    assert away.sum() > 100
+    assert ((found - rgb)[away].abs().amax(1) < 0.01).float().mean() > 0.99
+
+
+def test_few_or_no_seen_texels_are_enough() -> None:
+    rgb = torch.rand(len(texels()), 3)
+    none = torch.zeros(len(texels()))
+    assert (colours_nearby(texels(), rgb, none) == 0.5).all()
+    one = none.clone()
+    one[7] = 1.0
+    torch.testing.assert_close(colours_nearby(texels(), rgb, one), rgb[7].expand_as(rgb))
+    assert torch.equal(colours_nearby(texels(), rgb, none + 1), rgb)
+
+
+SIZE = 96
+FRONT = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3.5], [0, 0, 0, 1]])
+RIGHT = np.array([[0.0, 0, -1, -3.5], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""OpenGL poses that look at the middle of the template from before it, and from its right side."""
+
+
+@cache
+def body() -> BodyTemplate:
+    return default_template()
+
+
+def sitter(poses: Tensor) -> CapturedPerson:
+    """A person of whom there is one view, in the pose (55, 3), scaffolds at 0 and 4 cm."""
+    view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
+    frames = BodyFrames(
+        (0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1)
+    )
+    capture = Capture(
+        Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames}
+    )
+    return captured_person(
+        capture, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)), body()
+    )
+
+
+def arms_before_the_chest() -> Tensor:
+    """(55, 3): forearms before the chest, across."""
+    poses = torch.zeros(55, 3)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        poses[JOINT_NAMES.index(f"{side}_shoulder")] = torch.tensor([0.0, -1.2 * sign, 0.0])
+        poses[JOINT_NAMES.index(f"{side}_elbow")] = torch.tensor([0.0, -1.5 * sign, 0.0])
+    return poses
+
+
+def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """(256, 256, 3) texture by positions (P, 3) of the T-pose and the joint (P,) that moves
+    each."""
+    uv, uv_faces = texture_coordinates(body())
+    columns, rows = texel_coordinates(uv, 256)
+    fragments = rasterize(
+        np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256
+    )
+    around = body().faces.numpy()[fragments.faces]
+    positions = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
+    joints = interpolate(fragments.barycentric, body().weights.double().numpy()[around]).argmax(1)
+    texture = np.full((256 * 256, 3), 0.5)
+    texture[fragments.index] = colour_of(positions, joints)
+    return texture.reshape(256, 256, 3)
+
+
+def image(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Image:
+    exact, (uv, uv_faces) = body().to(dtype=torch.float64), texture_coordinates(body())
+    vertices = posed_vertices(exact, poses[None].double(), torch.zeros(1, 3).double())[0].numpy()
+    pixels = render_mesh(
+        PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2
+    )
+    rgba = torch.from_numpy(pixels).float()
+    focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
+    intrinsics = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]).float()
+    camera = Cameras(
+        torch.from_numpy(cam_from_opengl(pose)).float()[None], intrinsics[None], SIZE, SIZE
+    )
+    return Image("v", camera, rgba[..., :3] * rgba[..., 3:], rgba[..., 3], None, None, 0)
+
+
+def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
+    names = np.array(JOINT_NAMES)[np.asarray(joints)]
+    arm = ("shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
+    return np.array([any(part in name for part in arm) for name in names])
+
+
+def posing(of: CapturedPerson) -> BodyPose:
+    return of.pose_in(of.views[0])
+
+
+def test_distances_from_the_edge_are_those_of_the_outline() -> None:
+    """From the front, texels on the outer side of the legs lie on it, and those 4 cm above them 4
+    cm outside."""
+    shown = sitter(torch.zeros(55, 3))
+    seen = image(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
+    maps = observe_texels(shown, [(seen, shown.pose_in(shown.views[0]))])
+    points = shown.texels.points
+    normals = shown.texels.normals
+    outer = (
+        (normals[:, 0] * points[:, 0].sign() > 0.98) & (points[:, 1] < -0.1) & (points[:, 1] > -0.7)
+    )
+    assert outer.sum() > 10
+    assert maps.hull[0, outer].abs().max() < 0.025
+    torch.testing.assert_close(maps.hull[1, outer].mean(), torch.tensor(-0.04), atol=0.008, rtol=0)
+    middle = (points[:, 1] - 0.3).abs() < 0.05
+    assert (maps.hull[:, middle & (points[:, 0].abs() < 0.05)] == HULL_LIMIT).all()
+    assert maps.count == 1
+
+
+def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
+    """Arms red, the rest blue: of the texels seen, nearly all have their own colour, and parts of
+    the chest are hidden that are seen when the arms are aside. Mixed colours remain where a pixel
+    covers both."""
+    texture = painted(
+        lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9])
+    )
+    crossed = sitter(arms_before_the_chest())
+    maps = observe_texels(
+        crossed, [(image(arms_before_the_chest(), texture, FRONT), posing(crossed))]
+    )
+    arms = torch.from_numpy(is_arm(crossed.texels.weights.argmax(1)))
+    redness = maps.rgb[0, :, 0] / maps.rgb[0].sum(1).clamp_min(1e-6)
+    seen = maps.seen[0] > 0.3
+    assert (redness[seen & arms] > 0.5).float().mean() > 0.9, "fingers are thinner than a pixel"
+    assert (redness[seen & ~arms] < 0.5).float().mean() > 0.98
+    aside = sitter(torch.zeros(55, 3))
+    free = observe_texels(aside, [(image(torch.zeros(55, 3), texture, FRONT), posing(aside))])
+    x, y, _ = aside.texels.points.T
+    chest = (free.seen[0] > 0.8) & ~arms & (x.abs() < 0.2) & ((y - 0.55).abs() < 0.08)
+    assert (maps.seen[0][chest] == 0).float().mean() > 0.1, "forearms cover a part of it"
+
+
+def test_a_texel_has_the_colour_of_its_place() -> None:
+    """A smooth colour over the body, from two sides; up to the light and half a pixel of its
+    change."""
+    texture = painted(lambda positions, _: 0.5 + 0.4 * np.sin(3 * positions))
+    aside = sitter(torch.zeros(55, 3))
+    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    maps = observe_texels(aside, shown)
+    seen = maps.seen[0] > 0.5
+    truth = 0.5 + 0.4 * torch.sin(3 * aside.texels.points)
+    hue = [x / x.sum(1, keepdim=True).clamp_min(1e-6) for x in (maps.rgb[0][seen], truth[seen])]
+    assert (hue[0] - hue[1]).abs().amax(1).quantile(0.95) < 0.05
+    assert seen.float().mean() > 0.4
+
+
+def test_only_what_faces_a_camera_is_seen() -> None:
+    """From before: nothing of the back, and most of the front; more from two sides than from
+    one."""
+    texture = np.full((8, 8, 3), 0.5)
+    aside = sitter(torch.zeros(55, 3))
+    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    one = observe_texels(aside, shown[:1])
+    two = observe_texels(aside, shown)
+    normals = aside.texels.normals
+    assert (one.seen[0][normals[:, 2] < -0.2] == 0).all()
+    assert (one.seen[0][normals[:, 2] > 0.8] > 0).float().mean() > 0.85, "not inside the mouth"
+    assert (two.seen >= one.seen).all()
+    assert (two.seen[0] > 0).sum() > 1.2 * (one.seen[0] > 0).sum()
+    assert (one.offsets - normals).norm(dim=1).quantile(0.99) < 0.2, "two ways of averaging normals"
+
+
+def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
+    """At 0 nearly all texels are inside, at 4 cm those that point aside are not; a second view
+    carves more."""
+    texture = np.full((8, 8, 3), 0.5)
+    aside = sitter(torch.zeros(55, 3))
+    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    one = observe_texels(aside, shown[:1])
+    two = observe_texels(aside, shown)
+    assert (one.inside[0] == 1).float().mean() > 0.9
+    assert (one.inside[1] == 1).float().mean() < 0.8
+    assert (two.inside[1] == 1).float().mean() < 0.8 * (one.inside[1] == 1).float().mean()
+    body_up = aside.texels.normals[:, 1] > 0.9
+    assert one.inside[1][body_up].mean() < 0.5
+
+
+def test_without_alpha_everything_is_inside() -> None:
+    aside = sitter(torch.zeros(55, 3))
+    rest = torch.zeros(55, 3)
+    opaque = replace(image(rest, np.full((8, 8, 3), 0.5), FRONT), alpha=None)
+    assert (observe_texels(aside, [(opaque, posing(aside))]).inside == 1).all()
+
+
+def test_no_image_is_an_error() -> None:
+    with pytest.raises(ValueError, match="must be an image"):
+        observe_texels(sitter(torch.zeros(55, 3)), [])
+
+
+def test_to_the_atlas_and_back() -> None:
+    texels = sitter(torch.zeros(55, 3)).texels
+    values = torch.rand(len(texels), 3, generator=torch.Generator().manual_seed(0))
+    atlas = to_atlas(values, texels)
+    assert atlas.shape == (3, 64, 64)
+    assert torch.equal(from_atlas(atlas, texels), values)
+    assert (atlas != 0).any(0).sum() == len(texels)

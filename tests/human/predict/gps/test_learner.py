@@ -1,0 +1,237 @@
+"""The stereo network in training and at work: the same bytes, exact resuming, scenes for other
+commands, refusals."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from camera_rings import UP, cameras_at
+from stopped import stopped
+from tiny_stereo import STEREO, stereo_config, stereo_people
+
+from dyngs.api.predict import predict
+from dyngs.api.train import train
+from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import psnr
+from dyngs.data.loader import ImageLoader
+from dyngs.data.people_set import captures_in
+from dyngs.data.read import read_capture
+from dyngs.evaluate.report import evaluate_run
+from dyngs.export.camera_paths.aim import look_at
+from dyngs.human.predict.gps.learner import learner, predictor
+from dyngs.human.predict.gps.pairs import neighbours
+from dyngs.human.synthetic.people import PeopleOptions, write_people
+from dyngs.models.prediction import Predictor
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.static.scene import StaticScene
+from dyngs.training.prediction import network_trainer
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return stereo_people(tmp_path_factory.mktemp("people") / "set")
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(stereo_config(folder, tmp_path_factory.mktemp("run") / "net"))
+
+
+def person_of(folder: Path) -> Path:
+    return captures_in(DataConfig(root=folder))[0].root
+
+
+def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_path: Path) -> None:
+    """Resumed between the two stages: of what is learned in the second alone there are no moments
+    yet."""
+    middle, last = checkpoint_paths(run)
+    config = stereo_config(folder, tmp_path / "parts")
+    resumed = train(config, resume_from=stopped(config, 2))
+    assert checkpoint_paths(resumed)[-1].read_bytes() == last.read_bytes()
+    before = load_checkpoint(middle)
+    after = load_checkpoint(last)
+    assert not any(name.startswith("optimizer.exp_avg.heads") for name in before.tensors)
+    assert any(name.startswith("optimizer.exp_avg.heads") for name in after.tensors)
+    assert not torch.equal(
+        before.tensors["model.network.heads.bias"], after.tensors["model.network.heads.bias"]
+    )
+
+
+def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:
+    """Of depth in the first half, of images in the second, on the same examples."""
+    trainer = network_trainer(stereo_config(folder, tmp_path / "run", steps=80))
+
+    @torch.no_grad()
+    def error(step: int) -> float:
+        draws = (torch.Generator().manual_seed(i) for i in range(6))
+        return sum(float(trainer.learner.example(0, step, draw).loss) for draw in draws)
+
+    depth = error(1)
+    for _ in range(40):
+        trainer.step()
+    image = error(80)
+    assert error(1) < 0.9 * depth
+    for _ in range(40):
+        trainer.step()
+    assert error(80) < 0.9 * image
+    assert trainer.num_gaussians > 200
+
+
+def test_a_prediction_is_a_run_of_a_static_scene(run: Path, folder: Path, tmp_path: Path) -> None:
+    """Which is drawn, measured and trained on like any other; the same views give the same
+    bytes."""
+    person = person_of(folder)
+    made = predict(run, person, tmp_path / "two", ("f000_c03.png", "f000_c05.png"))
+    found = load_run(made.run_dir)
+    assert isinstance(found.scene, StaticScene)
+    assert (found.config.model.kind, found.step, found.config.data.root) == ("static", 0, person)
+    assert len(found.scene) == made.num_gaussians > 200
+    assert (made.steps, len(made.views)) == (0, 2)
+    again = predict(run, person, tmp_path / "again", ("f000_c05.png", "f000_c03.png"))
+    assert torch.equal(load_run(again.run_dir).scene.gaussians.means, found.scene.gaussians.means)
+    report = evaluate_run(made.run_dir, "train", threads=1)
+    assert report.psnr > 5
+    longer = found.config.model_copy(
+        update={"train": found.config.train.model_copy(update={"steps": 2})}
+    )
+    assert load_run(train(longer, resume_from=made.run_dir)).step == 2
+
+
+def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) -> None:
+    """Between two views the surface of these two is drawn, as if there were no others; so it is
+    after storing."""
+    person = person_of(folder)
+    all_round = predict(run, person, tmp_path / "12", 12)
+    assert len(all_round.views) == 12
+    found = load_run(all_round.run_dir).scene
+    assert isinstance(found, StaticScene)
+    assert found.sides is not None
+    assert len(found.sides.toward) == 12
+    side = 3
+    views = [
+        v
+        for x in read_capture(DataConfig(root=person)).splits.values()
+        for v in x
+        if v.name in all_round.views
+    ]
+    pair = neighbours(
+        "p", views, [[v.name for v in views].index(name) for name in all_round.views]
+    )[side]
+    names = (views[pair.left].name, views[pair.right].name)
+    two = load_run(predict(run, person, tmp_path / "2", names).run_dir).scene
+    eye = (2 * found.sides.toward[side] + found.sides.middle).numpy()
+    middle = found.sides.middle.numpy()
+    between = cameras_at(look_at(eye, middle, UP)[None]).to(dtype=torch.float32)
+    assert float(two.render(between).alpha.mean()) > 0.01
+    torch.testing.assert_close(found.render(between).rgb, two.render(between).rgb)
+
+
+def changed(
+    person: Path, out: Path, change: Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
+) -> Path:
+    """A copy of the capture with other frames."""
+    shutil.copytree(person, out)
+    whole = json.loads((out / "transforms_train.json").read_text())
+    (out / "transforms_train.json").write_text(
+        json.dumps(whole | {"frames": change(whole["frames"])})
+    )
+    return out
+
+
+def test_one_moment_of_several_is_what_its_run_is_trained_on(
+    run: Path, folder: Path, tmp_path: Path
+) -> None:
+    person = changed(
+        person_of(folder),
+        tmp_path / "moving",
+        lambda frames: [
+            frame | {"frame": i % 2, "time": float(i % 2)} for i, frame in enumerate(frames)
+        ],
+    )
+    (person / "body_train.npz").unlink()
+    data = DataConfig(root=person)
+    found: Predictor = predictor(
+        stereo_config(folder, tmp_path), load_checkpoint(checkpoint_paths(run)[-1]), data
+    )
+    later = [i for i, view in enumerate(found.views) if view.frame == 1][:2]
+    assert found.run_config(later).data.frames == "1:2"
+    made = predict(run, person, tmp_path / "out", tuple(found.views[i].name for i in later))
+    assert load_run(made.run_dir).scene.is_static
+    assert evaluate_run(made.run_dir, "train", threads=1).num_views == 10, (
+        "two of twelve are held out for testing"
+    )
+
+
+def without_depth(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{key: x for key, x in frame.items() if key != "depth_file_path"} for frame in frames]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda frames: frames[::3],
+            "p: no view stands between two others that are at most 50 degrees apart",
+        ),
+        (without_depth, "p: has no depth maps, from which depth is learned"),
+    ],
+)
+def test_what_cannot_be_trained_on_is_refused(
+    folder: Path, tmp_path: Path, change: Any, message: str
+) -> None:
+    changed(person_of(folder), tmp_path / "set" / "p", change)
+    with pytest.raises(DyngsError, match=message):
+        learner(stereo_config(tmp_path / "set", tmp_path), torch.Generator())
+
+
+def test_steps_on_the_images_are_refused(run: Path, folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="gps is not trained on the images of one person"):
+        predict(run, person_of(folder), tmp_path / "out", 2, steps=3)
+    assert not (tmp_path / "out").exists()
+    assert STEREO.source_views == 2
+
+
+def test_published_weights_predict_somebody_unknown(tmp_path: Path) -> None:
+    """In the box of the person on white, from the middle between two views; 26.3 dB when this was
+    written."""
+    weights = (
+        Path(__file__).parents[4]
+        / "packaging"
+        / "weights"
+        / "dyngs_people_weights"
+        / "gps.safetensors"
+    )
+    if not weights.is_file():
+        pytest.skip("no published weights here: they come with the repository alone")
+    person = captures_in(
+        DataConfig(root=write_people(tmp_path / "set", PeopleOptions(1, 192, seed=7)))
+    )[0].root
+    made = predict(weights, person, tmp_path / "two", ("f000_c03.png", "f000_c05.png"))
+    views = read_capture(DataConfig(root=person)).splits["train"]
+    image = ImageLoader(
+        tuple(view for view in views if "c04" in view.name), DataConfig(root=person)
+    )[0]
+    drawn = load_run(made.run_dir).scene.render(image.cameras).rgb[0]
+    truth = image.composite(torch.ones(3))
+    assert image.alpha is not None
+    rows, columns = (
+        slice(int(x.min()), int(x.max()) + 1) for x in image.alpha.nonzero(as_tuple=True)
+    )
+    found = psnr(drawn[rows, columns].clamp(0, 1), truth[rows, columns])
+    assert found > 24.5
+
+
+def test_a_surface_that_no_silhouette_holds_is_one_line(
+    run: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.human.predict.gps.learner._FAINT", 2.0)
+    with pytest.raises(DyngsError, match="no surface is found inside the silhouettes"):
+        predict(run, person_of(folder), tmp_path / "out", ("f000_c03.png", "f000_c05.png"))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,119 @@
+"""Neighbours on a ring of cameras, and views that are none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import View
+from dyngs.human.predict.gps.pairs import Pair, around, fault, lessons, neighbours, well_spread
+
+
+def view_at(
+    degrees: float, height: float = 1.0, frame: int = 0, toward: tuple[float, ...] = (0, 1.0, 0)
+) -> View:
+    """3 m from the vertical through ``toward``, in the azimuth of ``degrees`` from +z to +x, OpenCV
+    axes."""
+    turn = np.radians(degrees)
+    center = np.array([3 * np.sin(turn), height, 3 * np.cos(turn)])
+    forward = np.array(toward) - center
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ center
+    name = f"f{frame}_{degrees:g}"
+    return View(name, Path(f"{name}.png"), pose, np.eye(3), 8, 8, frame=frame)
+
+
+RING = [view_at(x) for x in (90, 0, 45, 315, 135, 180, 225, 270)]
+
+
+def names(views: list[View], pairs: list[Pair]) -> list[tuple[str, str]]:
+    return [(views[pair.left].name, views[pair.right].name) for pair in pairs]
+
+
+def test_two_views_are_a_pair_in_any_order() -> None:
+    """The one that has the other on its right is left: seen from outside, azimuths grow to the
+    right."""
+    for chosen in ([1, 2], [2, 1]):
+        assert names(RING, neighbours("ann", RING, chosen)) == [("f0_0", "f0_45")]
+
+
+def test_a_ring_is_closed() -> None:
+    pairs = neighbours("ann", RING, range(8))
+    assert len(pairs) == 8
+    assert sorted(i for pair in pairs for i in (pair.left, pair.right)) == sorted([*range(8)] * 2)
+    assert all(RING[pair.left].name != RING[pair.right].name for pair in pairs)
+    open_ring = neighbours("ann", RING, [1, 2, 0])
+    assert names(RING, open_ring) == [("f0_0", "f0_45"), ("f0_45", "f0_90")]
+
+
+def test_order_around_the_vertical_starts_anywhere() -> None:
+    degrees = [float(RING[i].name[3:]) for i in around(RING, range(8))]
+    steps = np.diff([*degrees, degrees[0]]) % 360
+    assert len(set(steps.tolist())) == 1
+    assert steps[0] in (45, 315)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "message"),
+    [
+        (view_at(0), view_at(180), "look from directions 180 degrees apart; give neighbours"),
+        (view_at(0), view_at(60), "60 degrees apart"),
+        (view_at(0), view_at(0), "look from the same direction, 0.0 degrees apart"),
+        (view_at(0), view_at(2), "look from the same direction, 2.0 degrees"),
+        (view_at(0), view_at(30, frame=1), "show two moments"),
+        (view_at(0, 0.5), view_at(1, 2.5), "do not stand side by side"),
+    ],
+)
+def test_what_does_not_suit_is_told(one: View, other: View, message: str) -> None:
+    assert message in (fault(one, other) or "")
+    with pytest.raises(DyngsError, match=rf"^ann: {one.name} and {other.name} .*{message}"):
+        neighbours("ann", [one, other], [0, 1])
+
+
+def test_one_view_is_not_enough() -> None:
+    with pytest.raises(
+        DyngsError, match="ann: depth comes from two neighbouring views at least, not one"
+    ):
+        neighbours("ann", RING, [0])
+
+
+def test_a_view_without_a_neighbour_is_told() -> None:
+    with pytest.raises(DyngsError, match="f0_180"):
+        neighbours("ann", RING, [1, 2, 5])
+
+
+def test_views_are_chosen_around_the_ring() -> None:
+    assert len(neighbours("ann", RING, well_spread(RING, 8))) == 8
+    two = well_spread(RING, 2)
+    assert len(neighbours("ann", RING, two)) == 1
+    dense = [view_at(10 * i) for i in range(36)]
+    pair = neighbours("ann", dense, well_spread(dense, 2))[0]
+    turned = (float(dense[pair.right].name[3:]) - float(dense[pair.left].name[3:])) % 360
+    assert turned == 30
+    assert len(neighbours("ann", dense, well_spread(dense, 12))) == 12
+    later = [replace(view, frame=1, name=f"later_{view.name}") for view in dense]
+    assert {dense[i % 36].frame for i in well_spread([*dense[:5], *later], 9)} == {0}
+    assert all(i >= 5 for i in well_spread([*dense[:5], *later], 9)), (
+        "of the moment that most views show"
+    )
+
+
+def test_lessons_have_views_in_between() -> None:
+    dense = [view_at(15 * i) for i in range(24)]
+    found = lessons(dense)
+    assert len(found) == 48, "two and three steps of 15 degrees"
+    for pair, between in found:
+        left, right = (float(dense[i].name[3:]) for i in (pair.left, pair.right))
+        assert (right - left) % 360 == 15 * (len(between) + 1)
+        assert {(float(dense[i].name[3:]) - left) % 360 for i in between} == {
+            15 * (k + 1.0) for k in range(len(between))
+        }
+    assert lessons(RING) == [], "45 degrees apart, so that nothing is between neighbours that suit"

@@ -1,0 +1,96 @@
+"""Gaussians of pixels: where true depth puts them, how large they may be, and gradients through
+everything."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from ray_traced_ball import CENTER, RADIUS, ball, exact_depth, pose_at
+
+from dyngs.human.predict.gps.keys import GpsModel
+from dyngs.human.predict.gps.rectification import RectifiedPair, rectified
+from dyngs.human.predict.gps.surface import LARGEST, GpsNetwork, Surface, gaussians_of, offset_loss
+
+MODEL = GpsModel(person_px=40, widths=(8, 16, 16))
+
+
+@pytest.fixture(scope="module")
+def pair() -> RectifiedPair:
+    return rectified(ball(pose_at(0)), ball(pose_at(30)), 40)
+
+
+def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
+    depth = exact_depth(pair)
+    offsets = pair.focal * pair.baseline / depth - pair.shift
+    raw = torch.zeros(*offsets.shape[:1], 8, *offsets.shape[2:])
+    found = gaussians_of(pair, Surface([offsets], raw))
+    assert len(found) == int(pair.solid.sum())
+    inner = (pair.alpha[pair.solid] > 0.999) & (pair.seen_by_other(offsets)[pair.solid] > 0.999)
+    assert found.opacities[inner].min() > 0.85
+    assert ((found.means - CENTER).norm(dim=1) - RADIUS)[inner].abs().max() < 1e-4
+    assert found.scales.min() > 0
+    size = found.scales[:, 0] * pair.focal / depth[pair.solid]
+    torch.testing.assert_close(size, torch.full_like(size, 0.5), atol=0.02, rtol=0)
+    colour = pair.rgb.permute(0, 2, 3, 1)[pair.solid[:, 0]]
+    torch.testing.assert_close(found.base_rgb, colour, atol=1e-6, rtol=1e-5)
+
+
+def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -> None:
+    """A surface beside that of the ball; where the true one is hidden from the other view nothing
+    is wrong with it."""
+    offsets = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
+    raw = torch.zeros(2, 8, *offsets.shape[2:])
+    right, wrong = (gaussians_of(pair, Surface([offsets + d], raw)).opacities for d in (0.0, 15.0))
+    known = pair.alpha[pair.solid] > 0.999
+    assert right[known].mean() > 0.8
+    beside = pair.seen_by_other(offsets + 15.0)[pair.solid] == 0
+    assert 0.1 < beside.float().mean() < 0.9
+    assert wrong[beside].max() < 1e-3
+
+
+def test_scales_and_depth_are_limited(pair: RectifiedPair) -> None:
+    """Whatever the network says, no Gaussian is wider than the largest, and none lies behind a
+    camera."""
+    shape = pair.alpha.shape
+    wild = Surface([torch.full(shape, -1e4)], torch.full((2, 8, *shape[2:]), 50.0))
+    found = gaussians_of(pair, wild)
+    depth = pair.depth(-0.8 * pair.shift)
+    assert float(found.scales.max()) <= 1.0001 * LARGEST * float(depth) / pair.focal
+    ahead = (found.means - pair.centers[0]) @ pair.rect_from_world[2]
+    assert (ahead > 0).all()
+
+
+def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
+    """Of the depth from its error, and of everything from what the Gaussians are."""
+    network = GpsNetwork(MODEL, torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(network.heads.weight, generator=torch.Generator().manual_seed(1))
+    torch.nn.init.normal_(
+        network.stereo.change.weight, std=0.1, generator=torch.Generator().manual_seed(2)
+    )
+    surface = network(pair, with_gaussians=False)
+    assert surface.raw is None
+    offset_loss(pair, surface.offsets, 0.9).backward()
+    given = {
+        name
+        for name, x in network.named_parameters()
+        if x.grad is not None and float(x.grad.abs().sum()) > 0
+    }
+    assert {name.partition(".")[0] for name in given} == {"encoder", "stereo"}
+    network.zero_grad()
+    found = gaussians_of(pair, network(pair))
+    sum(x.square().mean() for x in found.tensors().values()).backward()
+    assert [
+        name
+        for name, x in network.named_parameters()
+        if x.grad is None or not float(x.grad.abs().sum()) > 0
+    ] == []
+
+
+def test_the_error_of_offsets(pair: RectifiedPair) -> None:
+    """0 for the truth; of the last iteration as it is, of those before less; what is not known does
+    not count."""
+    assert pair.offsets is not None
+    truth = pair.offsets.nan_to_num(0.0)
+    assert offset_loss(pair, [truth], 0.9) == 0
+    wrong = torch.where(pair.offsets.isfinite(), truth + 2, truth + 1e6)
+    torch.testing.assert_close(offset_loss(pair, [wrong, truth + 1], 0.5), torch.tensor(2.0))

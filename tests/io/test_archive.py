@@ -1,0 +1,287 @@
+"""Captures in archives: what is unpacked, what is refused, and that nothing is left elsewhere."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from tiny_captures import edit_json, random_pixels, write_frames, write_image
+
+from dyngs.api.load import read_capture
+from dyngs.api.train import with_capture
+from dyngs.cli import main
+from dyngs.config.io import load_config
+from dyngs.core.errors import DyngsError
+from dyngs.data.read import is_capture
+from dyngs.io import archive
+from dyngs.io.archive import unpacked
+from dyngs.io.temporary import cache_folder
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A nerfstudio capture of four images."""
+    folder = tmp_path / "scene"
+    names = [f"images/{i}.png" for i in range(4)]
+    for i, name in enumerate(names):
+        write_image(folder / name, random_pixels(8, 12, 3, seed=i))
+    write_frames(folder / "transforms.json", names, {"w": 12, "h": 8, "fl_x": 10.0})
+    return folder
+
+
+def packed(path: Path, root: Path, top: str = "", more: dict[str, bytes] | None = None) -> Path:
+    """An archive of the files below ``root``, under the folder ``top``, and of others."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for source in sorted(root.rglob("*")):
+            file.write(source, top + source.relative_to(root).as_posix())
+        for name, content in (more or {}).items():
+            file.writestr(name, content)
+    return path
+
+
+def left() -> list[str]:
+    """All that the cache of captures holds."""
+    folder = cache_folder("captures")
+    return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+
+
+@pytest.mark.parametrize("top", ["", "my scene/", "a/b/"])
+def test_an_archive_is_read_as_its_folder(tmp_path: Path, root: Path, top: str) -> None:
+    junk = {
+        "__MACOSX/._x.png": b"x",
+        "__MACOSX/scene/._transforms.json": b"{",
+        ".DS_Store": b"",
+        f"{top}._a.png": b"",
+    }
+    file = packed(tmp_path / "scene.zip", root, top, junk)
+    views = read_capture(file).splits["train"]
+    expected = read_capture(root).splits["train"]
+    assert is_capture(file)
+    assert [view.name for view in views] == [view.name for view in expected]
+    for view, other in zip(views, expected, strict=True):
+        np.testing.assert_array_equal(view.cam_from_world, other.cam_from_world)
+        assert view.image_path.read_bytes() == other.image_path.read_bytes()
+        assert cache_folder("captures") in view.image_path.parents
+    assert not [path for path in cache_folder("captures").rglob("*") if path.name.startswith("._")]
+
+
+def test_an_archive_is_unpacked_once_and_anew_after_a_change(tmp_path: Path, root: Path) -> None:
+    file = packed(tmp_path / "scene.zip", root)
+    folder = unpacked(file)
+    before = (folder / "transforms.json").stat()
+    assert unpacked(file) == folder
+    assert (folder / "transforms.json").stat() == before
+    edit_json(root / "transforms.json", lambda content: content["frames"].pop())
+    assert unpacked(packed(file, root)) != folder
+    assert len(read_capture(file).splits["train"]) == 3 - 1  # one for testing
+
+
+def test_folders_that_windows_separates_are_folders(tmp_path: Path, root: Path) -> None:
+    file = tmp_path / "scene.zip"
+    with zipfile.ZipFile(file, "w") as out:
+        for source in root.rglob("*.*"):
+            out.writestr(
+                "scene\\" + str(source.relative_to(root)).replace("/", "\\"), source.read_bytes()
+            )
+    assert len(read_capture(file).splits["train"]) == 3
+
+
+def test_training_says_where_it_is_unpacked_and_keeps_the_archive(
+    tmp_path: Path, root: Path
+) -> None:
+    file = packed(tmp_path / "scene.zip", root, "scene/")
+    said: list[str] = []
+    config = with_capture(load_config("static", [f"data.root={file}"]), say=said.append)
+    assert config.data.root == file
+    assert said == [f"{file} is unpacked in {next(cache_folder('captures').iterdir()) / 'scene'}"]
+
+
+def test_a_run_on_an_archive_is_evaluated_without_the_cache(tmp_path: Path, root: Path) -> None:
+    file = packed(tmp_path / "scene.zip", root)
+    words = ["train.steps=2", "init.num_random=50", "init.triangulate=0", "run.threads=1"]
+    assert (
+        main(["train", "static", f"data.root={file}", f"run.dir={tmp_path / 'run'}", *words]) == 0
+    )
+    shutil.rmtree(cache_folder("captures"))
+    assert main(["eval", str(tmp_path / "run")]) == 0
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["num_views"] == 1
+
+
+def test_photos_in_an_archive_are_posed(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[Path] = []
+
+    def pose(images: Path, out: Path, *_: object) -> SimpleNamespace:
+        found.append(images)
+        out.mkdir(parents=True)
+        return SimpleNamespace(summary=lambda: "posed")
+
+    monkeypatch.setattr("dyngs.capture.unposed.estimate_poses", pose)
+    monkeypatch.setattr("dyngs.capture.sfm.estimate_poses", pose)
+    file = packed(tmp_path / "photos.zip", root / "images", "holiday/")
+    config = with_capture(load_config("static", [f"data.root={file}"]), say=lambda _: None)
+    assert cache_folder("poses") in config.data.root.parents
+    assert main(["data", "sfm", str(file), str(tmp_path / "out")]) == 0
+    assert found == [unpacked(file) / "holiday"] * 2
+
+
+def test_inspect_reads_an_archive(
+    tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["data", "inspect", str(packed(tmp_path / "scene.zip", root))]) == 0
+    out = capsys.readouterr().out
+    assert "3 train, 1 test" in out
+    assert "nothing suspicious" in out
+
+
+def test_processes_unpack_one_archive_at_once(tmp_path: Path, root: Path) -> None:
+    file = packed(tmp_path / "scene.zip", root)
+    code = f"from pathlib import Path\nfrom dyngs.io.archive import unpacked\nprint(unpacked(Path({str(file)!r})))"
+    children = [
+        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) for _ in range(3)
+    ]
+    found = {child.communicate()[0] for child in children}
+    assert all(child.returncode == 0 for child in children)
+    assert len(found) == 1
+    assert len(left()) == 1
+
+
+def test_the_slower_process_takes_the_folder_of_the_faster(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = packed(tmp_path / "scene.zip", root)
+    rename = os.rename
+
+    def late(temporary: Path, folder: Path) -> None:
+        folder.mkdir()
+        (folder / "theirs").write_text("")
+        rename(temporary, folder)
+
+    monkeypatch.setattr(os, "rename", late)
+    assert (unpacked(file) / "theirs").is_file()
+    assert len(left()) == 1
+
+
+BAD_NAMES = (
+    "../evil.png",
+    "a/../../evil.png",
+    "/tmp/evil.png",
+    "..\\evil.png",
+    "C:\\evil.png",
+    "images/aux.png",
+)
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, root: Path, name: str) -> None:
+    file = packed(tmp_path / "scene.zip", root, more={name: b"evil"})
+    with pytest.raises(
+        DyngsError, match=r"scene\.zip: holds the file .*, which is no name below its folder"
+    ):
+        unpacked(file)
+    assert left() == []
+    assert not list(tmp_path.rglob("evil*"))
+
+
+def test_links_are_refused(tmp_path: Path, root: Path) -> None:
+    file = packed(tmp_path / "scene.zip", root)
+    link = zipfile.ZipInfo("images/9.png")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(file, "a") as out:
+        out.writestr(link, "/etc/passwd")
+    with pytest.raises(DyngsError, match=r"holds the link 'images/9\.png'"):
+        unpacked(file)
+
+
+def test_bombs_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
+    file = tmp_path / "bomb.zip"
+    with (
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as out,
+        out.open("zeros.png", "w") as member,
+    ):
+        for _ in range(160):
+            member.write(bytes(2**20))
+    with pytest.raises(
+        DyngsError, match=r"asks for 167,772,160 bytes, of which 134,217,728 are read at most.*=2$"
+    ):
+        unpacked(file)
+    assert left() == []
+
+
+def test_too_many_files_are_refused(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archive, "MOST_FILES", 2)
+    with pytest.raises(DyngsError, match="asks for 6 files, of which 2"):  # 5, and a folder
+        unpacked(packed(tmp_path / "scene.zip", root))
+
+
+def test_no_more_is_written_than_an_archive_states(tmp_path: Path) -> None:
+    file = tmp_path / "liar.zip"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as out:
+        out.writestr("zeros.png", bytes(2**22))
+    size = (2**22).to_bytes(4, "little")
+    content = file.read_bytes()
+    assert content.count(size) == 2
+    file.write_bytes(content.replace(size, (1000).to_bytes(4, "little")))
+    with pytest.raises(DyngsError, match=r"liar\.zip: cannot be read"):
+        unpacked(file)
+    assert left() == []
+
+
+def encrypted(content: bytes) -> bytes:
+    """Sets the flag in the local header and in the directory of an archive of one file."""
+    at = content.rindex(b"PK\1\2")
+    return content[:6] + b"\1" + content[7 : at + 8] + b"\1" + content[at + 9 :]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: b"", "cannot be read"),
+        (lambda content: content[:-40], "cannot be read"),
+        (
+            lambda content: b"not a zip at all",
+            "cannot be read .*not a zip file.*; download it again, or unpack it",
+        ),
+        (lambda content: content.replace(b"abcdefgh", b"abXdefgh"), "cannot be read .*CRC"),
+        (encrypted, "is encrypted; unpack it with its password"),
+    ],
+)
+def test_damaged_archives_are_one_line(
+    tmp_path: Path, change: object, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "scene.zip"
+    with zipfile.ZipFile(file, "w") as out:
+        out.writestr("a.txt", "abcdefgh")
+    file.write_bytes(change(file.read_bytes()))  # type: ignore[operator]
+    with pytest.raises(DyngsError, match=rf"scene\.zip: {message}"):
+        read_capture(file)
+    assert left() == []
+    assert main(["data", "inspect", str(file)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_full_disk_leaves_nothing(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = packed(tmp_path / "scene.zip", root)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("shutil.copyfileobj", full)
+    with pytest.raises(DyngsError, match=r"scene\.zip: cannot be read \(No space left on device\)"):
+        unpacked(file)
+    assert left() == []

@@ -1,0 +1,224 @@
+"""The border of a capture: links, absolute paths and ``..`` that leave it, in every reader; and
+sizes of images."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_captures import (
+    edit_json,
+    random_pixels,
+    write_cameras_json,
+    write_colmap,
+    write_folder,
+    write_frames,
+    write_image,
+    write_nerfies,
+    write_poses_bounds,
+    write_video,
+)
+
+from dyngs.capture.inspection.report import inspect_capture
+from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture
+from dyngs.data.read import read_capture
+from dyngs.io.containment import check_size, images_up_to, inside, leaving_links, staying_within
+
+PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"  # noqa: E501
+
+
+def read(root: Path, **options: object) -> Capture:
+    return read_capture(DataConfig(root=root, test_every=0, **options))  # type: ignore[arg-type]
+
+
+def write_nerfstudio(root: Path) -> None:
+    names = [f"images/{i}.png" for i in range(3)]
+    for i, name in enumerate(names):
+        write_image(root / name, random_pixels(8, 12, 3, seed=i))
+        write_image(root / "masks" / f"{i}.png", random_pixels(8, 12, 1, seed=i))
+    write_frames(
+        root / "transforms.json",
+        names,
+        {"w": 12, "h": 8, "fl_x": 10.0, "ply_file_path": "points.ply"},
+    )
+    (root / "points.ply").write_text(PLY)
+    edit_json(
+        root / "transforms.json",
+        lambda content: content["frames"][0].update(mask_path="masks/0.png"),
+    )
+
+
+def write_video_cameras(root: Path) -> None:
+    write_cameras_json(root, ["a", "b"])
+    write_video(root / "a.mp4", 2)
+    write_folder(root / "b", [0, 1])
+
+
+def write_llff(root: Path) -> None:
+    write_poses_bounds(root, 2)
+    for name in ("cam00", "cam01"):
+        write_folder(root / name, [0, 1])
+
+
+def write_points(root: Path) -> None:
+    write_nerfies(root)
+    np.save(root / "points.npy", np.ones((4, 3)))
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "nerfstudio": write_nerfstudio,
+    "videos": write_video_cameras,
+    "llff": write_llff,
+    "nerfies": write_points,
+    "colmap": write_colmap,
+}
+FILES = [
+    *(
+        ("nerfstudio", name)
+        for name in ("images", "images/1.png", "masks/0.png", "points.ply", "transforms.json")
+    ),
+    *(("videos", name) for name in ("a.mp4", "b", "b/frame_0001.png", "cameras.json")),
+    *(("llff", name) for name in ("poses_bounds.npy", "cam00/frame_0000.png", "cam01")),
+    *(
+        ("nerfies", name)
+        for name in ("points.npy", "scene.json", "metadata.json", "rgb/1x/000001.png", "rgb")
+    ),
+    *(("nerfies", f"camera/{i:06d}.json") for i in range(2)),
+    *(
+        ("colmap", name)
+        for name in (
+            "images/left",
+            "images/left/01.jpg",
+            "sparse/0/points3D.bin",
+            "sparse",
+            "images",
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("kind", "name"), FILES)
+def test_no_reader_opens_what_lies_outside(kind: str, name: str, tmp_path: Path) -> None:
+    root = tmp_path / "capture"
+    WRITERS[kind](root)
+    wanted = read(root)
+    (tmp_path / "private").mkdir()
+    shutil.move(root / name, tmp_path / "private" / "own")
+    (root / name).symlink_to("../" * (name.count("/") + 1) + "private/own")
+    with pytest.raises(
+        DyngsError, match=r"private/own.*lies outside the capture.*data\.follow_links=true"
+    ):
+        read(root)
+    followed = read(root, follow_links=True)
+    assert [view.name for view in followed.splits["train"]] == [
+        view.name for view in wanted.splits["train"]
+    ]
+
+
+@pytest.mark.parametrize(
+    "written", ["../own.png", "{tmp}/own.png", "images/../../own.png", "..\\own.png", "../own"]
+)
+@pytest.mark.parametrize("key", ["file_path", "mask_path"])
+def test_paths_that_leave_the_capture(key: str, written: str, tmp_path: Path) -> None:
+    root = tmp_path / "capture"
+    write_nerfstudio(root)
+    write_image(tmp_path / "own.png", random_pixels(8, 12, 3))
+    name = written.format(tmp=tmp_path)
+    edit_json(root / "transforms.json", lambda content: content["frames"][1].update({key: name}))
+    with pytest.raises(DyngsError, match=r"own(\.png)?: lies outside the capture"):
+        read(root)
+    assert len(read(root, follow_links=True).splits["train"]) == 3
+
+
+@pytest.mark.parametrize("written", ["/", "", ".", "./", "images/..", "a\0b"])
+@pytest.mark.parametrize("follow", [False, True])
+def test_paths_that_name_no_file(written: str, follow: bool, tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path)
+    edit_json(
+        tmp_path / "transforms.json", lambda content: content["frames"][1].update(file_path=written)
+    )
+    with pytest.raises(
+        DyngsError, match=r"frame 1 .*(names no file|the key 'file_path' is missing)"
+    ):
+        read(tmp_path, follow_links=follow)
+
+
+@pytest.mark.parametrize("kind", ["nerfstudio", "nerfies", "colmap"])
+def test_a_huge_image_is_refused_when_a_capture_is_read(kind: str, tmp_path: Path) -> None:
+    """Before the training, also where it is held out."""
+    WRITERS[kind](tmp_path)
+    read(tmp_path)
+    with pytest.raises(DyngsError, match=r"megapixels, but data\.max_megapixels is"):
+        read(tmp_path, max_megapixels=1e-5)
+
+
+@pytest.mark.parametrize("written", ["\ud800", "\udce9.png", "x" * 5000])
+def test_names_that_no_file_can_have(written: str, tmp_path: Path) -> None:
+    """As a missing image or in one line."""
+    write_nerfstudio(tmp_path)
+    edit_json(
+        tmp_path / "transforms.json", lambda content: content["frames"][1].update(file_path=written)
+    )
+    report = inspect_capture(tmp_path)
+    assert report.problems
+    assert all("\n" not in line for line in report.problems)
+
+
+def test_a_capture_that_is_a_link_and_links_inside_it_are_fine(tmp_path: Path) -> None:
+    root = tmp_path / "real"
+    write_nerfstudio(root)
+    shutil.move(root / "images" / "1.png", root / "one.png")
+    (root / "images" / "1.png").symlink_to("../one.png")
+    (root / "images" / "2.png").rename(root / "two.png")
+    (root / "images" / "2.png").symlink_to(root / "two.png")
+    (tmp_path / "link").symlink_to("real")
+    assert len(read(tmp_path / "link").splits["train"]) == 3
+    os.chdir(root)
+    assert len(read(Path(".")).splits["train"]) == 3
+    assert leaving_links(tmp_path / "link") == []
+
+
+def test_links_that_leave_are_listed_and_none_is_followed(tmp_path: Path) -> None:
+    root = tmp_path / "capture"
+    (root / "a").mkdir(parents=True)
+    (tmp_path / "outside").mkdir()
+    (root / "a" / "up").symlink_to("../..")
+    (root / "in").symlink_to("a")
+    (root / "gone").symlink_to("/nowhere/at/all")
+    (root / "loop").symlink_to("loop")
+    found = [(path.relative_to(root).as_posix(), place) for path, place in leaving_links(root)]
+    assert found == [("gone", "/nowhere/at/all"), ("a/up", os.path.realpath(tmp_path))]
+
+
+def test_a_folder_whose_name_begins_the_same_is_outside(tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    with staying_within(tmp_path / "capture"):
+        assert inside(tmp_path / "capture" / "a.png") == tmp_path / "capture" / "a.png"
+        with pytest.raises(DyngsError, match="lies outside the capture"):
+            inside(tmp_path / "capture2" / "a.png")
+    assert inside(tmp_path / "capture2" / "a.png"), "without a border"
+
+
+def test_sizes() -> None:
+    check_size(Path("a.png"), 10_000, 10_000)
+    with pytest.raises(
+        DyngsError, match=r"a\.png: 20000x20000 .*are 400 megapixels.*max_megapixels is 150;"
+    ):
+        check_size(Path("a.png"), 20_000, 20_000)
+    with pytest.raises(DyngsError, match=r"of 1000 channels are 250 megapixels"):
+        check_size(Path("a.exr"), 1000, 1000, 1000)
+    with images_up_to(400):
+        check_size(Path("a.png"), 20_000, 20_000)
+
+
+def test_a_folder_of_masks_that_is_a_link_is_not_searched(colmap_root: Path) -> None:
+    """It would be looked through for images, however large."""
+    (colmap_root / "masks").symlink_to("/")
+    with pytest.raises(DyngsError, match=r"masks: leads to /, which lies outside the capture"):
+        read(colmap_root)

@@ -1,0 +1,166 @@
+"""Archives of arrays: what is read, and what is refused before it is allocated."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from measured import cost_of
+
+from dyngs.core.errors import DyngsError
+from dyngs.io import numpy_files
+from dyngs.io.numpy_files import read_arrays, read_npy, read_npz
+
+
+def refusal(path: Path, *names: str) -> str:
+    with pytest.raises(DyngsError) as caught:
+        read_arrays(path, lambda _: names)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_arrays_come_back(tmp_path: Path, save: Callable[..., None]) -> None:
+    arrays = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": np.asfortranarray(np.arange(6).reshape(2, 3)),
+        "c": np.array("ä"),
+        "d": np.zeros((0, 3), ">f4"),
+        "e": np.array([True]),
+        "objects": np.array([{}], object),
+    }
+    save(tmp_path / "x.npz", **arrays)
+    found = read_arrays(tmp_path / "x.npz", lambda names: sorted(set(names) - {"objects"}))
+    assert set(found) == set("abcde")
+    for name, value in found.items():
+        np.testing.assert_array_equal(value, arrays[name])
+        assert value.dtype == arrays[name].dtype
+    assert "'objects' is not an array of numbers (ValueError: it holds Python objects)" in refusal(
+        tmp_path / "x.npz", "objects"
+    )
+
+
+def write_member(path: Path, shape: object, content: bytes = b"", descr: str = "<f8") -> Path:
+    """An archive of one deflated array whose header says ``shape``."""
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    header += b" " * (-(len(header) + 11) % 64) + b"\n"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(
+            "a.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + content
+        )
+    return path
+
+
+def test_a_bomb_is_refused_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The directory says how large it is; with a lower limit, since packing 512 MiB takes
+    seconds."""
+    most = 1 << 26
+    monkeypatch.setattr(numpy_files, "MOST_BYTES", most)
+    with (
+        zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("a.npy", "w") as file,
+    ):
+        for _ in range(most // (1 << 22) + 1):
+            file.write(bytes(1 << 22))
+    assert (tmp_path / "x.npz").stat().st_size < 1e6
+    memory, _ = cost_of(lambda: refusal(tmp_path / "x.npz", "a"))
+    assert memory < 10e6
+    assert "bytes of arrays, of which 67,108,864 are read" in refusal(tmp_path / "x.npz", "a")
+
+
+@pytest.mark.parametrize(
+    ("shape", "problem"),
+    [
+        ("(1000000000,)", "bytes of arrays"),
+        ("(100000000000000000000000000, 100000000000000000)", "over 10^18 bytes of arrays"),
+        ("(3,)", "shorter than its shape"),
+        ("(-3, -3)", "shorter than its shape"),
+        ("(" * 5000, "not an array of numbers"),
+        ("x" * 20000, "not an array of numbers"),
+        ("None", "not an array of numbers"),
+    ],
+)
+def test_headers_that_lie(tmp_path: Path, shape: str, problem: str) -> None:
+    path = write_member(tmp_path / "x.npz", shape, bytes(16))
+    memory, _ = cost_of(lambda: refusal(path, "a"))
+    assert memory < 20e6
+    assert problem in refusal(path, "a")
+
+
+def test_numbers_of_one_byte_count_as_those_of_eight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numpy_files, "MOST_BYTES", 800)
+    write_member(tmp_path / "x.npz", "(101,)", bytes(101), "|u1")
+    assert "asks for 808 bytes of arrays" in refusal(tmp_path / "x.npz", "a")
+    monkeypatch.setenv("DYNGS_LIMITS", "2")
+    assert len(read_arrays(tmp_path / "x.npz", lambda names: names)["a"]) == 101
+
+
+def test_text_that_is_none(tmp_path: Path) -> None:
+    write_member(tmp_path / "x.npz", "()", b"\xff" * 4, "<U1")
+    assert "what is no text" in refusal(tmp_path / "x.npz", "a")
+
+
+def test_other_packing_and_a_lying_directory(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("a.npy", b"")
+    assert "packed in a way that NumPy does not write" in refusal(tmp_path / "x.npz", "a")
+    content = write_member(tmp_path / "y.npz", "(20000000,)").read_bytes()
+    start = content.rindex(b"PK\1\2")
+    content = content[: start + 24] + (160_000_200).to_bytes(4, "little") + content[start + 28 :]
+    (tmp_path / "y.npz").write_bytes(content)
+    assert "cannot be as large as the archive says" in refusal(tmp_path / "y.npz", "a")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "x.npz")
+    assert "is no file" in refusal(tmp_path / "x.npz", "a")
+
+
+def test_npz(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with pytest.raises(
+        DyngsError, match=r"a\.npz: no such file; it should hold the body parameters poses, trans"
+    ):
+        read_npz(path, ("poses", "trans"))
+    np.savez(path, poses=np.zeros(3), gender="neutral")
+    assert set(read_npz(path, ("poses",), ("gender", "scale"))) == {"poses", "gender"}
+    with pytest.raises(DyngsError, match="'trans' is missing"):
+        read_npz(path, ("poses", "trans"))
+    np.savez(path, poses=np.array([{}]))
+    with pytest.raises(
+        DyngsError, match=r"a\.npz: 'poses' is not an array of numbers .*it holds Python objects"
+    ):
+        read_npz(path, ("poses",))
+    np.save(tmp_path / "b.npy", np.zeros(3))
+    for damaged in (b"", b"PK\x03\x04", b"\x80\x04N.", (tmp_path / "b.npy").read_bytes()):
+        path.write_bytes(damaged)
+        with pytest.raises(DyngsError, match=r"a\.npz: cannot be read") as caught:
+            read_npz(path, ("poses",))
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("byte", [0, 34, 39, 40, 92, 255])
+def test_an_array_with_a_damaged_header_is_one_line(tmp_path: Path, byte: int) -> None:
+    """NumPy reads the header as Python text, so nearly any error may come of it."""
+    path = tmp_path / "points.npy"
+    np.save(path, np.zeros((2, 17)))
+    content = path.read_bytes()
+    said = []
+    for place in range(10, 70):
+        path.write_bytes(content[:place] + bytes([byte]) + content[place + 1 :])
+        try:
+            read_npy(path)
+        except DyngsError as error:
+            said.append(str(error))
+    assert len(said) > 50  # some bytes are of no matter
+    assert all("cannot be read" in line and "\n" not in line for line in said)
