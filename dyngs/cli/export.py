@@ -33,7 +33,7 @@ _AXES = ("up", "from_up", "sh_degree")
 _SHOWN = {"surface": "mesh"}  # Names of --format, where these are others
 _FOR_SPLATS = dict.fromkeys(_AXES, "it goes with files of Gaussians")
 _UNFIT: dict[str, dict[str, str]] = {
-    "cameras": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
+    "cameras": dict[str, str].fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
     "html": {
         "times": "the page plays the whole clip",
         **dict.fromkeys(_PARTS, "the page shows the whole scene"),

@@ -4,8 +4,9 @@ matrices and back.
 Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/quaternion.hpp).
 """
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
-# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 

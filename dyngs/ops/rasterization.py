@@ -1,7 +1,8 @@
 """Tile binning and alpha blending of splats."""
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
-# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 

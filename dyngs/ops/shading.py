@@ -4,8 +4,9 @@ In plain torch this takes three times as long as the network itself: some thirty
 narrow arrays.
 """
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
-# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 
