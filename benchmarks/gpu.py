@@ -33,7 +33,7 @@ from dyngs.cli.kernel_bench import Workload, garden_workload, random_workload
 from dyngs.core.camera import Cameras
 from dyngs.export.camera_paths.orbit import frame_orbit_for_points
 from dyngs.io.formats.formats import read_splats
-from dyngs.io.formats.rotation import axis_of
+from dyngs.io.formats.similarity import axis_of
 from dyngs.ops.device import why_no_gpu
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]

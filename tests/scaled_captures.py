@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from dyngs.data.images.maps import read_depth
-from dyngs.io.formats.ply_header import double_ply
+from dyngs.io.formats.ply import double_ply
 
 
 def scaled_capture(

@@ -10,8 +10,7 @@ import numpy as np
 
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import read_splats, write_splats
-from dyngs.io.formats.ply import write_ply
-from dyngs.io.formats.ply_header import header_bytes, read_header
+from dyngs.io.formats.ply import header_bytes, read_header, write_ply
 from dyngs.io.formats.splat_file import SplatFile
 
 FACTORS = (1e-4, 1e-3, 0.05, 1e3)
@@ -40,9 +39,9 @@ def write_far_ply(path: Path, splat: SplatFile, offset: Sequence[float] = FAR) -
     (N, 3)."""
     write_ply(path, splat)
     with path.open("rb") as file:
-        header = read_header(file, path)
-        rows = header.read_element(file, path)
-    names = header.vertex_names
+        header = read_header(file)
+        rows = header.read(file, "vertex")
+    names = rows.dtype.names or ()
     far = np.empty(len(rows), [(name, "<f8") for name in names])
     for name in names:
         far[name] = rows[name]

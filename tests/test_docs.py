@@ -10,6 +10,7 @@ options, and ``key=value`` for keys and values.
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 import shlex
 import sys
@@ -407,3 +408,17 @@ def test_python_examples_run(page: str, code: str, monkeypatch: pytest.MonkeyPat
         dyngs, "load_config", lambda preset, keys: load_config(preset, [*keys, *SHORTER["train"]])
     )
     exec(compile(code, page, "exec"), {})
+
+
+def test_the_table_of_packages_repeats_their_docstrings() -> None:
+    rows = re.findall(
+        r"^\| `dyngs/(\w+)` \| (.+) \|$",
+        (ROOT / "docs/code.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+    packages = {
+        path.parent.name: ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        for path in (ROOT / "dyngs").glob("*/__init__.py")
+    }
+    first_sentences = {k: " ".join(v.split("\n\n")[0].split()) for k, v in packages.items()}
+    assert dict(rows) == first_sentences

@@ -1,2 +1,1 @@
-"""Whole jobs, as commands and Python programs ask for them: train a run, prune one, predict a
-person, load a scene."""
+"""Whole jobs for Python users: load, train, prune, predict; gsplat-compatible `rasterization`."""

@@ -33,7 +33,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import DeformField, DynamicModel, FieldSection, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.io.write import write_text
-from dyngs.models.kind import kind_of, motion_begins_after
+from dyngs.models.kind import HasGaussians, capability, kind_of, motion_begins_after
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME

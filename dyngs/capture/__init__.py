@@ -1,1 +1,1 @@
-"""Preparation of captures: camera poses and sparse points, by COLMAP."""
+"""Preparation of captures: structure from motion, initial points, masks, inspection, videos."""

@@ -1,4 +1,4 @@
-"""The ``dyngs`` command: one module of this package per subcommand.
+"""The `dyngs` command: one module per subcommand, progress, tables, the demo.
 
 Every module offers ``add_parser(commands)``, which adds its command, and a ``run(arguments) ->
 int``. What is heavy (torch, the native core, readers) is imported inside ``run``, so that ``dyngs

@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
@@ -32,7 +32,7 @@ _PARTS = ("static", "dynamic")
 _AXES = ("up", "from_up", "sh_degree")
 _SHOWN = {"surface": "mesh"}  # Names of --format, where these are others
 _FOR_SPLATS = dict.fromkeys(_AXES, "it goes with files of Gaussians")
-_UNFIT: dict[str, dict[str, str]] = {
+_UNFIT: dict[str, dict[Any, str]] = {
     "cameras": dict[str, str].fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
     "html": {
         "times": "the page plays the whole clip",

@@ -1,5 +1,4 @@
-"""The configuration of a run: typed keys (``keys``), YAML files and overrides (``io``), keys in
-words (``schema``)."""
+"""The typed configuration of a run, its YAML files and overrides."""
 
 from dyngs.config.keys.colour import AutoColour, ColourSection, NetworkColour, ShColour
 from dyngs.config.keys.config import BudgetConfig, CameraConfig, Config, PruneConfig, RunConfig

@@ -1,0 +1,1 @@
+"""Cameras, conventions of coordinates, errors, named tensors and image metrics."""

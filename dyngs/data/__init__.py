@@ -1,2 +1,2 @@
-"""Captures: posed images of a scene on disk, their readers, preparation, inspection and loading for
-training."""
+"""Captures as values: `readers/` (one module per layout), images, the image loader, synthetic
+scenes."""

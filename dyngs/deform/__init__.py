@@ -1,1 +1,1 @@
-"""Scenes that move: canonical Gaussians and a deformation field over time."""
+"""Moving scenes: canonical Gaussians and a deformation field over time."""

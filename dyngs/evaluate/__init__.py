@@ -1,1 +1,1 @@
-"""Evaluation of runs on held-out views."""
+"""Metrics of runs over held-out views, regions, point tracks and time."""

@@ -1,1 +1,1 @@
-"""Files for other programs: the standard 3DGS .ply."""
+"""Files for other programs: images, videos, Gaussians, meshes, pages; camera paths; scene edits."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
-from dyngs.io.formats.ply_header import double_ply
+from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.write import atomic_file, write_text
 from dyngs.runs.inputs import inputs_of

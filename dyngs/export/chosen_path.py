@@ -31,7 +31,7 @@ from dyngs.export.images import file_stems
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.io.formats.rotation import AXES
+from dyngs.io.formats.similarity import AXES
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views

@@ -16,7 +16,7 @@ from dyngs.export.camera_paths.path import resize_cameras
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import Written, read_splats
-from dyngs.io.formats.rotation import AXES
+from dyngs.io.formats.similarity import AXES
 from dyngs.io.formats.splat_file import SplatFile, drawing_options, splat_options
 from dyngs.runs.opened import Opened
 

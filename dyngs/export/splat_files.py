@@ -28,8 +28,14 @@ from dyngs.io.formats.formats import (
     turned_file,
     write_splats,
 )
-from dyngs.io.formats.rotation import AXES, axis_of, nearest_axis, turn_between
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import (
+    AXES,
+    UNMOVED,
+    Similarity,
+    axis_of,
+    nearest_axis,
+    turn_between,
+)
 from dyngs.io.formats.sog_levels import write_sog_levels
 from dyngs.io.formats.splat_file import (
     SplatFile,

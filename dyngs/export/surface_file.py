@@ -23,7 +23,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, writing_of
 from dyngs.gaussians import surface as gaussians
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.formats.ply_header import double_ply
+from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file
 from dyngs.models.surface import Surface

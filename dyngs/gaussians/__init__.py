@@ -1,4 +1,5 @@
-"""The set of Gaussians in the parametrisation that is optimised, and edits of its topology."""
+"""Shared by all Gaussian models: values, rendering, initialisation, densification, colour,
+Adam."""
 
 from __future__ import annotations
 

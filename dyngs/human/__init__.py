@@ -1,1 +1,1 @@
-"""People: a body template, its motion, and Gaussians anchored on its skin."""
+"""People: body templates, motion, fits, avatars, detection, and networks that predict people."""

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from dyngs.core.errors import DyngsError, warn
@@ -39,29 +40,17 @@ class InUseError(DyngsError):
     """Another process writes into the folder."""
 
 
+@dataclass(frozen=True)
 class Held:
     """A folder that this process writes into; ``alone``: no other does, which is not known where
     there are no locks."""
 
-    def __init__(self, folder: Path, *, alone: bool) -> None:
-        self._folder, self.alone = folder, alone
-        # there it cannot be renamed
-        self._opened = None if sys.platform == "win32" else os.open(folder, os.O_RDONLY)
+    path: Path
+    alone: bool
 
     def folder(self) -> Path | None:
-        """Return where the folder is by now, also after it was renamed; None: it was removed, or
-        cannot be found."""
-        if self._opened is None or _is_the_same(self._opened, self._folder):
-            return self._folder
-        path = _path_of(self._opened)
-        if path is None or not _is_the_same(self._opened, path):
-            return None
-        self._folder = path
-        return path
-
-    def close(self) -> None:
-        if self._opened is not None:
-            os.close(self._opened)
+        """Return the folder; None: it was removed, or has another name by now."""
+        return self.path if self.path.is_dir() else None
 
 
 @contextmanager
@@ -85,13 +74,11 @@ def writing(folder: Path) -> Iterator[Held]:
         )
     made = _made(folder)
     try:
-        file, locks = _locked(folder / LOCK_NAME)
-        held = Held(folder, alone=locks)
+        file, is_locked = _locked(folder / LOCK_NAME)
         try:
-            yield held
+            yield Held(folder, is_locked)
         finally:
-            _freed((held.folder() or folder) / LOCK_NAME, file)
-            held.close()
+            _freed(folder / LOCK_NAME, file)
     finally:
         for path in made:
             with suppress(OSError):
@@ -146,15 +133,18 @@ def _made(folder: Path) -> list[Path]:
 def _locked(path: Path) -> tuple[int, bool]:
     """Return the lock file ``path``, open, and whether it is locked."""
     folder = path.parent
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     while True:
-        file = _opened(path)
+        try:
+            file = os.open(path, flags, 0o666)
+        except OSError as error:
+            link = "; it is a link, remove it" if path.is_symlink() else ""
+            raise DyngsError(f"cannot write {path}: {error.strerror or error}{link}") from error
+        if not stat.S_ISREG(os.fstat(file).st_mode):
+            os.close(file)
+            raise DyngsError(f"cannot write {path}: not a file; remove it")
         try:
             _lock(file)
-            if not _is_the_same(file, path):  # its last owner removed it after we had opened it
-                os.close(file)
-                continue
-            _sign(file)
-            return file, True
         except OSError as error:
             if error.errno in _WITHOUT_LOCKS:
                 warn(
@@ -168,19 +158,15 @@ def _locked(path: Path) -> tuple[int, bool]:
             raise InUseError(
                 f"{folder}: {_owner(path)}; wait until it has ended, or give another folder"
             ) from None
-
-
-def _opened(path: Path) -> int:
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-    try:
-        file = os.open(path, flags, 0o666)
-    except OSError as error:
-        link = "; it is a link, remove it" if path.is_symlink() else ""
-        raise DyngsError(f"cannot write {path}: {error.strerror or error}{link}") from error
-    if not stat.S_ISREG(os.fstat(file).st_mode):
+        if _is_the_same(file, path):  # its last owner may have removed it after we had opened it
+            break
         os.close(file)
-        raise DyngsError(f"cannot write {path}: not a file; remove it")
-    return file
+    owner = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%F %T")}
+    with suppress(OSError):  # without room on the disk nobody is told
+        os.ftruncate(file, 0)
+        os.lseek(file, 0, os.SEEK_SET)
+        os.write(file, (json.dumps(owner) + "\n").encode())
+    return file, True
 
 
 def _lock(file: int) -> None:
@@ -203,17 +189,6 @@ def _freed(path: Path, file: int) -> None:
             path.unlink()  # fails if somebody has it by now
 
 
-def _path_of(file: int) -> Path | None:
-    """Return where an open file is by now; None where the system does not say."""
-    try:
-        if sys.platform == "darwin":
-            name = fcntl.fcntl(file, fcntl.F_GETPATH, bytes(1024))
-            return Path(os.fsdecode(name.rstrip(b"\0")))
-        return Path(f"/proc/self/fd/{file}").readlink()
-    except OSError:
-        return None
-
-
 def _is_the_same(file: int, path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(file), os.stat(path))
@@ -221,28 +196,11 @@ def _is_the_same(file: int, path: Path) -> bool:
         return False
 
 
-def _sign(file: int) -> None:
-    """Write who has the lock, for the message to others; without room on the disk nobody is
-    told."""
-    owner = {
-        "pid": os.getpid(),
-        "host": platform.node(),
-        "since": time.strftime("%Y-%m-%d %H:%M:%S"),
-    }
-    with suppress(OSError):
-        os.ftruncate(file, 0)
-        os.lseek(file, 0, os.SEEK_SET)
-        os.write(file, (json.dumps(owner) + "\n").encode())
-
-
 def _owner(path: Path) -> str:
     """Return the process that writes there, as far as the lock file says."""
     try:
         with path.open("rb") as file:
             known = json.loads(file.read(4096))
-        pid = int(known["pid"])
-        host = str(known["host"])
-        since = str(known["since"])
+        return "process {pid} on {host} has been writing there since {since}".format(**known)
     except (OSError, ValueError, KeyError, TypeError):
         return "another process is writing there"
-    return f"process {pid} on {host} has been writing there since {since}"

@@ -11,7 +11,7 @@ from typing import IO
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading, reason
+from dyngs.core.errors import DyngsError, reading
 from dyngs.io.containment import inside
 from dyngs.io.fields import entry
 from dyngs.io.limits import require_at_most
@@ -49,8 +49,11 @@ def read_arrays(
                 raise ValueError(f"'{name:.40}' is packed in a way that NumPy does not write")
             if info.file_size > _HIGHEST_RATIO * info.compress_size + _CHUNK:
                 raise ValueError(f"'{name:.40}' cannot be as large as the archive says")
-            with archive.open(info) as stream:
-                found[name] = _array(path, name, info.file_size, stream, total)
+            with (
+                reading(f"{path}: '{name:.40}'", "it must be an array of numbers; export it again"),
+                archive.open(info) as stream,
+            ):
+                found[name] = _array(stream, total, path)
             total += _weight(found[name].shape, found[name].dtype)
         return found
 
@@ -100,41 +103,26 @@ def require_text(raw: bytes | bytearray, dtype: np.dtype) -> None:
         raise ValueError("an array of text in it holds what is no text")
 
 
-def _array(path: Path, name: str, size: int, stream: IO[bytes], before: int) -> np.ndarray:
+def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return shape, whether columns follow each other, and type of the array in ``stream``."""
+    if np.lib.format.read_magic(stream) == (1, 0):
+        return np.lib.format.read_array_header_1_0(stream)
+    return np.lib.format.read_array_header_2_0(stream)
+
+
+def _array(stream: IO[bytes], before: int, path: Path) -> np.ndarray:
     """Read one array; ``before`` is the number of bytes of those read earlier."""
-    try:
-        version = np.lib.format.read_magic(stream)
-        read = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, by_columns, dtype = read(stream)
-        if dtype.kind not in "biufcSU":
-            raise ValueError(
-                "it holds Python objects" if dtype.hasobject else f"it is of type {dtype!s:.40}"
-            )
-        require_at_most(path, before + _weight(shape, dtype), MOST_BYTES, "bytes of arrays")
-        count = math.prod(shape) * dtype.itemsize
-        if min(shape, default=0) < 0 or size - stream.tell() < count:
-            raise ValueError("it is shorter than its shape")
-        raw = bytearray(count)
-        view = memoryview(raw)
-        for start in range(0, count, _CHUNK):
-            part = stream.read(min(_CHUNK, count - start))
-            view[start : start + len(part)] = part
-        stream.read()  # at the end zipfile compares the checksum
-        require_text(raw, dtype)
-        return np.frombuffer(raw, dtype, math.prod(shape)).reshape(
-            shape, order="F" if by_columns else "C"
-        )
-    except DyngsError:
-        raise
-    except Exception as error:
-        # NumPy reads the header as Python text; a damaged one raises nearly anything
-        raise DyngsError(
-            f"{path}: '{name:.40}' is not an array of numbers ({reason(error)}); export it again"
-        ) from error
+    shape, by_columns, dtype = array_header(stream)
+    if dtype.kind not in "biufcSU":
+        kind = "holds Python objects" if dtype.hasobject else f"is of type {dtype!s:.40}"
+        raise ValueError(f"it {kind}")
+    require_at_most(path, before + _weight(shape, dtype), MOST_BYTES, "bytes of arrays")
+    raw = bytearray(stream.read())  # not more than the archive states; a checksum is compared
+    if min(shape, default=0) < 0 or len(raw) < math.prod(shape) * dtype.itemsize:
+        raise ValueError("it is shorter than its shape")
+    require_text(raw[: math.prod(shape) * dtype.itemsize], dtype)
+    flat = np.frombuffer(raw, dtype, math.prod(shape))
+    return flat.reshape(shape, order="F" if by_columns else "C")
 
 
 def _weight(shape: tuple[int, ...], dtype: np.dtype) -> int:

@@ -2,39 +2,66 @@
 chumpy.
 
 Captures of people and body templates are distributed as pickles of Python 2 and 3, of
-``numpy.save`` and of joblib. The interpreter here knows the opcodes for such values (protocols 0 to
-5) and none that could execute anything. Names of classes and functions are only looked up in
-``pickled_arrays``. Time and memory are linear in the size of the file: reads never go beyond its
-end, and containers, keys and nesting are limited.
+``numpy.save`` and of joblib. ``pickletools`` decodes the opcodes; the interpreter here knows those
+for such values and none that could execute anything. A class or function named in a pickle becomes
+a ``_Name``, which is only text. Time and memory are linear in the size of the file.
 """
 
 from __future__ import annotations
 
 import codecs
-import struct
-from collections.abc import Callable
+import io
+import math
+import pickletools
+import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, reading
 from dyngs.io.limits import require_at_most
-from dyngs.io.pickled_arrays import ORDERED, Array, Arrays, Name
+from dyngs.io.numpy_files import array_header, require_text
 
-_MOST_CONTAINERS = 1 << 20
-_MOST_REMEMBERED = 1 << 20
-_MOST_NUMBER_KEYS = 1 << 16
-_LARGEST_KEY = 1 << 31
-"""Limit of keys that are numbers: a file can choose large ones whose hashes collide."""
 _MOST_ENTRIES = 1 << 20
 """Entries, shared ones counted at each occurrence, next to two per byte of the file and those of
-sparse matrices."""
-_DEEPEST = 100
+sparse matrices. It limits containers and memo entries, too."""
+_MOST_SPARSE_ENTRIES = 1 << 24
+"""Entries of all sparse matrices of a file, zeros included; joint regressors of bodies have half a
+million."""
+_DEEPEST = 100  # containers in each other
 _LONGEST_KEY = 4096
-_LONGEST_LINE = 1000
-"""Characters of a number or a name written as text."""
-_MOST_MARKS = 1000
+_LARGEST_KEY = 1 << 31  # a file can choose larger numbers whose hashes collide
+_BYTES_PER_BYTE = 16
+"""Bytes of copies per byte of the file: a reference to an object takes 8, and 2 in a pickle."""
+
+_OPCODES = {opcode.code.encode("latin-1"): opcode for opcode in pickletools.opcodes}
+_LAYOUTS = {
+    "numpy.ndarray": "plain",
+    "joblib.numpy_pickle.NumpyArrayWrapper": "plain",
+    **{f"scipy.sparse.csc_{kind}": "columns" for kind in ("matrix", "array")},
+    **{f"scipy.sparse.csr_{kind}": "rows" for kind in ("matrix", "array")},
+}
+"""Classes of arrays, and how their state holds the numbers."""
+_OTHER_NAMES = {
+    "numpy.dtype",
+    "numpy.core.multiarray._reconstruct",
+    "numpy.core.multiarray.scalar",
+    "numpy.core.numeric._frombuffer",
+    "copyreg._reconstructor",
+    "_codecs.encode",
+    "builtins.bytes",
+    "builtins.object",
+    "collections.OrderedDict",
+}
+_OLD_NAMES = (
+    (r"numpy\._core\.", "numpy.core."),
+    (r"scipy\.sparse\..*\.(cs[cr]_)", r"scipy.sparse.\1"),
+    (r"__builtin__\.", "builtins."),
+    (r"copy_reg\.", "copyreg."),
+)
+"""Patterns of module names to the name used here: modules moved between versions."""
 
 
 def read_pickle(path: Path) -> object:
@@ -43,8 +70,7 @@ def read_pickle(path: Path) -> object:
     Pickles of Python 2 and uncompressed ones of joblib are read, too. Sparse matrices of SciPy and
     arrays of chumpy become plain arrays; neither package is needed. The result never contains
     itself and is at most 100 containers deep. With shared parts counted at each occurrence, it has
-    at most two entries per byte of the file and a million more, next to those of sparse matrices
-    (``dyngs.io.limits``).
+    at most two entries per byte of the file and a million more, next to those of sparse matrices.
 
     Raises:
         DyngsError: the file is missing or damaged, or holds anything else, or asks for too much.
@@ -66,366 +92,383 @@ def read_pickled_array(path: Path) -> object:
 def _unpickled(path: Path, is_array: bool) -> object:
     if not path.is_file():
         raise DyngsError(f"{path}: no such file; restore it")
-    try:
-        with path.open("rb") as file:
-            if is_array:
-                _skip_array_header(file)
-            return Unpickler(path, file, path.stat().st_size).load()
-    except DyngsError:
-        raise
-    except Exception as error:  # a damaged pickle raises nearly anything
-        why = " ".join(str(error).split())[:100] or type(error).__name__
-        raise DyngsError(
-            f"{path}: cannot be read as a pickle ({why}); copy it again, or export it as arrays"
-        ) from error
+    with reading(path, "it must be a pickle; copy it again, or export it as arrays"):
+        content = path.read_bytes()
+        file = io.BytesIO(content)
+        if is_array and array_header(file)[2].kind != "O":
+            raise ValueError("an array of Python objects was expected")
+        return _Unpickler(path, file, len(content)).load()
 
 
-def _skip_array_header(file: BinaryIO) -> None:
-    version = np.lib.format.read_magic(file)
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    if read(file)[2].kind != "O":
-        raise ValueError("an array of Python objects was expected")
+@dataclass(frozen=True)
+class _Name:
+    """A class or function named in a pickle, by its current name."""
+
+    text: str
+
+    @property
+    def layout(self) -> str | None:
+        """How the state of such an object holds an array; None if it is no array."""
+        return "chumpy" if self.text.startswith("chumpy.") else _LAYOUTS.get(self.text)
 
 
-class Unpickler:
-    """State of reading one pickle from the position of ``file``."""
+class _Dtype:
+    """Stands for ``numpy.dtype``: plain numbers, text and objects only."""
 
-    def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
+    def __init__(self, text: object) -> None:
+        if not isinstance(text, str) or not re.fullmatch(r"[<>|=]?[biufcSUO]\d{0,9}", text):
+            raise ValueError("an array in it is of a type that is not read")
+        self.value = np.dtype(text)
+
+
+class _Array(np.ndarray):
+    """An array out of a pickle; ``layout`` is that of the state that will fill it, None once it is
+    filled."""
+
+    layout: str | None = None
+
+
+def _unfilled(layout: str) -> _Array:
+    array = _Array((0,), np.uint8)
+    array.layout = layout
+    return array
+
+
+class _Unpickler:
+    """State of reading one pickle of ``size`` bytes from the position of ``file``."""
+
+    def __init__(self, path: Path, file: io.BytesIO, size: int) -> None:
         self._path, self._file, self._size = path, file, size
-        self._left = size - file.tell()
-        self._arrays = Arrays(path, size, self.read)
+        self._bytes_left = _BYTES_PER_BYTE * size + (1 << 16)
+        self._sparse_entries = 0
         self._stack: list[Any] = []
         self._marks: list[int] = []
-        self._memo: dict[str, Any] = {}
-        self._containers = self._number_keys = 0
+        self._memo: dict[int, Any] = {}
+        self._containers = 0
 
     def load(self) -> object:
         """Return the contents of the pickle: a tree that may share parts but never contains
         itself."""
-        while (code := self.read(1)) != b".":
-            step = _STEPS.get(code)
-            if step is None:
-                raise ValueError(f"its instruction {code!r} is not one of numbers, text and arrays")
-            step(self)
-        found = self.pop()
-        require_tree(self._path, found, 2 * self._size + self._arrays.sparse_entries)
+        while True:
+            code = self._file.read(1)
+            opcode = _OPCODES.get(code)
+            if opcode is None:
+                raise ValueError(
+                    f"its instruction {code!r} is unknown" if code else "it is cut off"
+                )
+            if opcode.name == "STOP":
+                break
+            argument: Any = None
+            if opcode.name == "STRING":
+                raw: Any = pickletools.read_stringnl(self._file, decode=False)
+                argument = codecs.escape_decode(raw)[0].decode("latin-1")  # type: ignore[attr-defined]
+            elif opcode.arg is not None:
+                argument = opcode.arg.reader(self._file)
+            pushed = opcode.stack_after
+            is_value = not opcode.stack_before and pushed not in ([], [pickletools.anyobject])
+            if opcode.arg is not None and is_value:
+                self._stack.append(argument)
+            else:
+                self._step(opcode.name, argument)
+        found = self._pop()
+        self._require_tree(found)
         return found
 
-    def read(self, count: int) -> bytes:
-        """Read the next bytes; raises ValueError at the end of the file."""
-        if not 0 <= count <= self._left:
-            raise ValueError("it is cut off")
-        self._left -= count
-        return self._file.read(count)
+    def _step(self, name: str, argument: Any) -> None:
+        match name:
+            case "NONE" | "NEWTRUE" | "NEWFALSE":
+                self._stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[name])
+            case "EMPTY_LIST":
+                self._push_container([])
+            case "EMPTY_TUPLE":
+                self._push_container(())
+            case "EMPTY_DICT":
+                self._push_container({})
+            case "LIST":
+                self._push_container(self._above_mark())
+            case "TUPLE":
+                self._push_container(tuple(self._above_mark()))
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                items = [self._pop() for _ in range(int(name[-1]))]
+                self._push_container(tuple(items[::-1]))
+            case "DICT":
+                items = self._above_mark()
+                self._push_container({})
+                self._set_items(items)
+            case "APPEND":
+                self._extend([self._pop()])
+            case "APPENDS":
+                self._extend(self._above_mark())
+            case "SETITEM":
+                value = self._pop()
+                self._set_items([self._pop(), value])
+            case "SETITEMS":
+                self._set_items(self._above_mark())
+            case "MARK":
+                self._marks.append(len(self._stack))
+            case "POP_MARK":
+                self._above_mark()
+            case "POP" if self._marks and self._marks[-1] == len(self._stack):
+                self._marks.pop()
+            case "POP":
+                self._pop()
+            case "DUP":
+                self._stack.append(self._top())
+            case "PUT" | "BINPUT" | "LONG_BINPUT" | "MEMOIZE":
+                index = len(self._memo) if argument is None else argument
+                if not 0 <= index < 2 * _LARGEST_KEY:
+                    raise ValueError("it remembers a value under a number that is too large")
+                self._memo[index] = self._top()
+                require_at_most(self._path, len(self._memo), _MOST_ENTRIES, "remembered values")
+            case "GET" | "BINGET" | "LONG_BINGET":
+                self._stack.append(self._memo[argument])
+            case "GLOBAL":
+                self._stack.append(_known_name(*argument.split(" ", 1)))
+            case "STACK_GLOBAL":
+                name = self._pop()
+                self._stack.append(_known_name(self._pop(), name))
+            case "REDUCE" | "NEWOBJ":
+                arguments = self._pop()
+                self._push_container(self._called(self._pop(), arguments))
+            case "BUILD":
+                state = self._pop()
+                self._build(self._top(), state)
+            case "FRAME":
+                pass
+            case "PROTO" if argument <= 5:
+                pass
+            case _:
+                raise ValueError(f"its instruction {name} is not one of numbers, text and arrays")
 
-    def number(self, layout: str) -> Any:
-        """Read the next number; ``layout`` as in ``struct``."""
-        return struct.unpack(layout, self.read(struct.calcsize(layout)))[0]
-
-    def line(self, most: int | None = None) -> bytes:
-        """Read the rest of this line of text."""
-        found = self._file.readline(-1 if most is None else most)
-        self._left -= len(found)
-        if not found.endswith(b"\n"):
-            raise ValueError("it is cut off, or a line of it too long")
-        return found[:-1]
-
-    def word(self) -> str:
-        """Read a line that is a number or a name."""
-        return self.line(_LONGEST_LINE).decode("utf-8")
-
-    def push(self, value: object) -> None:
-        self._stack.append(value)
-
-    def pop(self) -> Any:
-        """Pop the topmost value, which must lie above the last mark."""
-        self._require(1)
-        return self._stack.pop()
-
-    def top(self) -> Any:
-        self._require(1)
+    def _top(self) -> Any:
+        if len(self._stack) <= (self._marks[-1] if self._marks else 0):
+            raise ValueError("it takes from an empty stack")
         return self._stack[-1]
 
-    def mark(self) -> None:
-        if len(self._marks) >= _MOST_MARKS:
-            raise ValueError("it is nested too deeply")
-        self._marks.append(len(self._stack))
+    def _pop(self) -> Any:
+        """Pop the topmost value, which must lie above the last mark."""
+        self._top()
+        return self._stack.pop()
 
-    def above_mark(self) -> list[Any]:
+    def _above_mark(self) -> list[Any]:
         """Pop all values above the last mark."""
         start = self._marks.pop()
         items = self._stack[start:]
         del self._stack[start:]
         return items
 
-    def pop_or_unmark(self) -> None:
-        """Pop the topmost value, or the mark that lies there."""
-        if self._marks and self._marks[-1] == len(self._stack):
-            self._marks.pop()
-        else:
-            self.pop()
-
-    def _require(self, count: int) -> None:
-        if len(self._stack) - (self._marks[-1] if self._marks else 0) < count:
-            raise ValueError("it takes from an empty stack")
-
-    def remember(self, index: int) -> None:
-        """Store the topmost value in the memo under a number."""
-        require_at_most(self._path, len(self._memo) + 1, _MOST_REMEMBERED, "remembered values")
-        self._memo[str(index)] = self.top()  # text: a file can choose numbers whose hashes collide
-
-    def recall(self, index: int) -> None:
-        """Push the memo's value of that number."""
-        self.push(self._memo[str(index)])
-
-    def push_container(self, value: Any) -> None:
+    def _push_container(self, value: Any) -> None:
         self._containers += 1
-        require_at_most(self._path, self._containers, _MOST_CONTAINERS, "containers")
-        self.push(value)
+        require_at_most(self._path, self._containers, _MOST_ENTRIES, "containers")
+        self._stack.append(value)
 
-    def push_tuple(self, count: int) -> None:
-        """Replace the topmost values by a tuple of them."""
-        self._require(count)
-        items = tuple(self._stack[-count:])
-        del self._stack[-count:]
-        self.push_container(items)
-
-    def extend(self, items: list[Any]) -> None:
-        """Append to the list on top."""
-        target = self.top()
+    def _extend(self, items: list[Any]) -> None:
+        target = self._top()
         if type(target) is not list:
             raise ValueError("it appends to what is no list")
         target += items
 
-    def set_items(self, items: list[Any]) -> None:
+    def _set_items(self, items: list[Any]) -> None:
         """Put keys and values in turn into the dictionary on top."""
-        target = self.top()
+        target = self._top()
         if type(target) is not dict or len(items) % 2:
             raise ValueError("it sets items of what is no dictionary")
-        target.update(zip(self.checked_keys(items[::2]), items[1::2], strict=True))
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            target[_checked_key(key)] = value
 
-    def checked_keys(self, keys: list[Any]) -> list[Any]:
-        """Return the keys if all can be hashed quickly; raises ValueError otherwise."""
-        for key in keys:
-            if not isinstance(key, (str, bytes)):
-                self._number_keys += 1
-            if not _is_key(key):
-                raise ValueError(f"a key in it is a {type(key).__name__}, or too long")
-        require_at_most(self._path, self._number_keys, _MOST_NUMBER_KEYS, "keys that are no text")
-        return keys
+    def _called(self, name: object, arguments: object) -> object:
+        """Return the object that a call stands for."""
+        if not isinstance(name, _Name) or not isinstance(arguments, tuple):
+            raise ValueError("it calls what is no function")
+        if name.layout is not None:
+            return _unfilled(name.layout)
+        match name.text, arguments:
+            case "numpy.dtype", (text, *_):
+                return _Dtype(text)
+            case (
+                "numpy.core.multiarray._reconstruct" | "copyreg._reconstructor",
+                (_Name(layout=str() as layout), *_),
+            ):
+                return _unfilled(layout)
+            case "numpy.core.multiarray.scalar", (dtype, raw):
+                return self._from_bytes(raw, dtype, (), "C")[()]
+            case "numpy.core.numeric._frombuffer", (raw, dtype, shape, order):
+                return self._from_bytes(raw, dtype, shape, order)
+            case "numpy.core.numeric._frombuffer", (raw, dtype, shape, order, axes):
+                return self._from_bytes(raw, dtype, shape, order).transpose(axes)
+            case "_codecs.encode", (str() as text, "latin1" | "latin-1"):
+                self._charge(len(text))
+                return text.encode("latin-1")
+            case "builtins.bytes", ():
+                return b""
+            case "collections.OrderedDict", ():
+                return {}
+            case "collections.OrderedDict", (list() as pairs,):
+                return {_checked_key(key): value for key, value in pairs}
+        raise ValueError(
+            f"it makes a {name.text!r:.40}, but only numbers, text and arrays are read"
+        )
 
-    def call(self, name: object, arguments: object) -> None:
-        """Push the object that a call stands for."""
-        if not isinstance(name, Name) or name.text != ORDERED:
-            self.push_container(self._arrays.called(name, arguments))
+    def _build(self, target: object, state: Any) -> None:
+        """Set the state of ``target``, made by ``_called``."""
+        if isinstance(target, _Dtype):
+            _, order, *structure = state[:5]
+            if any(part is not None for part in structure):
+                raise ValueError("arrays with named fields are not read")
+            if order in ("<", ">"):
+                target.value = target.value.newbyteorder(order)
             return
-        (items,) = arguments if arguments else ((),)  # type: ignore[misc]
-        if not isinstance(items, (list, tuple)):
-            raise ValueError("a container in it is made of what is no list")
-        pairs = [(key, value) for key, value in items]
-        keys = self.checked_keys([key for key, _ in pairs])
-        self.push_container(dict(zip(keys, (value for _, value in pairs), strict=True)))
+        if not isinstance(target, _Array) or target.layout is None:
+            raise ValueError("it sets the state of what has none")
+        layout = target.layout
+        target.layout = None
+        if layout == "plain":
+            self._fill(target, *(self._following(state) if isinstance(state, dict) else state)[1:])
+        elif layout == "chumpy":  # empty where it has no numbers
+            if isinstance(state["x"], np.ndarray):
+                self._become(target, _numbers(state["x"]))
+        else:
+            height, width = state["_shape"] if layout == "columns" else reversed(state["_shape"])
+            dense = self._dense(state, height, width)
+            self._become(target, dense if layout == "columns" else np.ascontiguousarray(dense.T))
 
-    def call_top(self) -> None:
-        """REDUCE and NEWOBJ: the arguments are on top, the callee below."""
-        arguments = self.pop()
-        self.call(self.pop(), arguments)
+    def _charge(self, count: int) -> None:
+        """Count bytes that are copied; raises ValueError: too many for the size of the file."""
+        self._bytes_left -= count
+        if self._bytes_left < 0:
+            raise ValueError("it makes many large arrays out of the same bytes")
 
-    def name(self) -> None:
-        """GLOBAL."""
-        self.push(self._arrays.named(self.word(), self.word()))
+    def _fill(self, target: _Array, shape: Any, dtype: object, fortran: object, raw: Any) -> None:
+        if not isinstance(dtype, _Dtype):
+            raise ValueError("an array in it has no proper type and shape")
+        count = _count(shape)
+        is_list = dtype.value.kind == "O"
+        raw = raw.encode("latin-1") if isinstance(raw, str) else raw  # bytes of Python 2
+        wanted = count if is_list else count * dtype.value.itemsize
+        if not isinstance(raw, list if is_list else (bytes, bytearray)) or len(raw) != wanted:
+            raise ValueError("an array in it is shorter or longer than its shape")
+        self._charge(8 * count if is_list else wanted)
+        if is_list:
+            # NumPy frees arrays of objects in each other by recursion.
+            inner = [item for item in raw if isinstance(item, _Array)]
+            if any(item.layout is not None or item.dtype.kind == "O" for item in inner):
+                raise ValueError("arrays in it lie too deep in each other")
+        else:
+            raw = bytes(raw)
+            require_text(raw, dtype.value)
+        target.__setstate__((1, tuple(shape), dtype.value, bool(fortran), raw))  # type: ignore[arg-type]
 
-    def name_of_top(self) -> None:
-        """STACK_GLOBAL."""
-        name = self.pop()
-        self.push(self._arrays.named(self.pop(), name))
+    def _become(self, target: _Array, array: np.ndarray) -> None:
+        """Copy the numbers of another array."""
+        self._charge(array.nbytes)
+        target.__setstate__((1, array.shape, array.dtype, False, array.tobytes()))  # type: ignore[arg-type]
 
-    def build(self) -> None:
-        """BUILD: the state is on top, its object below."""
-        state = self.pop()
-        self._arrays.build(self.top(), state)
+    def _following(self, state: dict[str, Any]) -> tuple[Any, ...]:
+        """Return the state of an array whose bytes joblib wrote into the file after this entry."""
+        shape = state["shape"]
+        dtype = state["dtype"]
+        if not isinstance(dtype, _Dtype) or dtype.value.kind == "O":
+            raise ValueError("an array in it does not hold numbers")
+        if state.get("numpy_array_alignment_bytes") is not None:
+            self._file.read(self._file.read(1)[0])
+        raw = self._file.read(min(_count(shape) * dtype.value.itemsize, self._size))
+        return 1, shape, dtype, state["order"] == "F", raw
 
-    def check_protocol(self) -> None:
-        """PROTO."""
-        if (protocol := self.read(1)[0]) > 5:
-            raise ValueError(f"it is of protocol {protocol}, not 0 to 5")
+    def _dense(self, state: dict[str, Any], height: Any, width: Any) -> np.ndarray:
+        """Return the dense (height, width) array of a matrix of compressed columns."""
+        data, row, pointers = (_numbers(state[name]) for name in ("data", "indices", "indptr"))
+        entries = _count((height, width))
+        self._sparse_entries += entries
+        require_at_most(
+            self._path, self._sparse_entries, _MOST_SPARSE_ENTRIES, "entries of sparse matrices"
+        )
+        counts = np.diff(pointers.astype(np.int64))
+        fits = data.ndim == row.ndim == pointers.ndim == 1 and len(pointers) == width + 1
+        if (
+            not fits
+            or not len(data) == len(row) == counts.sum()
+            or row.dtype.kind not in "iu"
+            or counts.min(initial=0) < 0
+            or ((row < 0) | (row >= height)).any()
+        ):
+            raise ValueError("a sparse matrix in it is damaged")
+        self._bytes_left += 8 * entries  # which are counted above
+        dense = np.zeros((height, width))
+        np.add.at(dense, (row, np.repeat(np.arange(width), counts)), data)
+        return dense
 
+    def _from_bytes(self, raw: object, dtype: object, shape: object, order: object) -> np.ndarray:
+        if not isinstance(dtype, _Dtype) or dtype.value.kind == "O":
+            raise ValueError("an array in it does not hold numbers")
+        array = _Array((0,), np.uint8)
+        self._fill(array, shape, dtype, order == "F", raw)
+        return array
 
-def require_tree(where: Path, found: object, more: int = 0) -> None:
-    """Check that walking through the contents of a file ends soon; ``more`` than the usual number
-    of entries may be.
+    def _require_tree(self, found: object) -> None:
+        """Check that walking through the contents ends soon.
 
-    Raises:
-        DyngsError: it has too many entries, shared ones counted at each occurrence.
-        ValueError: it contains itself, or is nested too deeply.
-    """
-    weights: dict[int, int] = {}
-    path: list[tuple[object, list[Any]]] = [(None, [found])]
-    open_ids: set[int] = set()
-    while path:
-        owner, waiting = path[-1]
-        if waiting:
-            value = waiting.pop()
-            if id(value) in weights:
-                continue
-            inside = _items(value)
-            if inside is None:
-                continue
-            if id(value) in open_ids or len(path) > _DEEPEST:
-                raise ValueError(
-                    "it contains itself" if id(value) in open_ids else "it is nested too deeply"
-                )
-            open_ids.add(id(value))
-            path.append((value, list(inside)))
-            continue
-        path.pop()
-        if path:
-            open_ids.discard(id(owner))
-            weights[id(owner)] = 1 + sum(_weight(part, weights) for part in _items(owner) or ())
-            require_at_most(
-                where,
-                max(weights[id(owner)] - more, 0),
-                _MOST_ENTRIES,
-                "entries (shared ones counted again)",
-            )
+        Raises:
+            DyngsError: it has too many entries, shared ones counted at each occurrence.
+            ValueError: it contains itself, or is nested too deeply.
+        """
+        most = _MOST_ENTRIES + 2 * self._size + self._sparse_entries
+        weights: dict[int, int | None] = {}
 
+        def weight(value: Any, depth: int) -> int:
+            if isinstance(value, np.ndarray) and value.dtype.kind != "O":
+                return 1 + value.size
+            if not isinstance(value, (dict, list, tuple, np.ndarray)):
+                return 1
+            if id(value) not in weights:
+                if depth > _DEEPEST:
+                    raise ValueError("it is nested too deeply")
+                weights[id(value)] = None
+                parts = value.ravel(order="K").tolist() if isinstance(value, np.ndarray) else value
+                total = 1 + sum(weight(part, depth + 1) for part in parts)
+                if isinstance(value, dict):
+                    total += sum(weight(part, depth + 1) for part in value.values())
+                require_at_most(self._path, total, most, "entries (shared ones counted again)")
+                weights[id(value)] = total
+            known = weights[id(value)]
+            if known is None:
+                raise ValueError("it contains itself")
+            return known
 
-def _items(value: Any) -> list[Any] | None:
-    if isinstance(value, dict):
-        return [*value.keys(), *value.values()]
-    if isinstance(value, (list, tuple)):
-        return list(value)
-    return (
-        value.ravel(order="K").tolist()
-        if isinstance(value, Array) and value.dtype.kind == "O"
-        else None
-    )
-
-
-def _weight(part: object, weights: dict[int, int]) -> int:
-    if isinstance(part, np.ndarray) and part.dtype.kind != "O":
-        return 1 + part.size
-    return weights.get(id(part), 1)
-
-
-def _is_key(key: object) -> bool:
-    if isinstance(key, (str, bytes)):
-        return len(key) <= _LONGEST_KEY
-    return key is None or (isinstance(key, (int, np.integer)) and abs(int(key)) < _LARGEST_KEY)
-
-
-# --- values
-# -----------------------------------------------------------------------------------------------------------
-
-
-def _integer(text: str) -> int | bool:
-    return {"00": False, "01": True}[text] if text in ("00", "01") else int(text)
-
-
-def _old_text(raw: bytes) -> str:
-    """Decode a quoted string of Python 2."""
-    if len(raw) < 2 or raw[:1] != raw[-1:] or raw[:1] not in b"'\"":
-        raise ValueError("a text in it has no quotes")
-    return codecs.escape_decode(raw[1:-1])[0].decode("latin-1")  # type: ignore[attr-defined]
-
-
-def _text(raw: bytes) -> str:
-    return raw.decode("utf-8", "surrogatepass")
-
-
-def _little(raw: bytes) -> int:
-    if len(raw) > 255:
-        raise ValueError("a number in it has too many digits")
-    return int.from_bytes(raw, "little", signed=True)
-
-
-def _sized(layout: str, become: Callable[[bytes], object] = bytes) -> Callable[[Unpickler], None]:
-    """Return a step that pushes bytes that follow their length."""
-    return lambda unpickler: unpickler.push(become(unpickler.read(unpickler.number(layout))))
+        weight(found, 0)
 
 
-def _number(layout: str) -> Callable[[Unpickler], None]:
-    return lambda unpickler: unpickler.push(unpickler.number(layout))
+def _known_name(module: object, name: object) -> _Name:
+    """Return the name ``module.name``; raises ValueError for unknown ones."""
+    if not isinstance(module, str) or not isinstance(name, str):
+        raise ValueError("a class in it has no proper name")
+    key = f"{module[:200]}.{name[:200]}"
+    for old, new in _OLD_NAMES:
+        key = re.sub(rf"\A{old}", new, key)
+    found = _Name(key)
+    if found.layout is None and key not in _OTHER_NAMES:
+        raise ValueError(f"it holds {key!r:.80}, but only numbers, text and arrays are read")
+    return found
 
 
-def _word(become: Callable[[str], object]) -> Callable[[Unpickler], None]:
-    return lambda unpickler: unpickler.push(become(unpickler.word()))
+def _checked_key(key: object) -> Any:
+    """Return a key that can be hashed quickly; raises ValueError for others."""
+    is_short = isinstance(key, (str, bytes)) and len(key) <= _LONGEST_KEY
+    is_small = isinstance(key, (int, np.integer)) and abs(int(key)) < _LARGEST_KEY
+    if not (is_short or is_small or key is None):
+        raise ValueError(f"a key in it is a {type(key).__name__}, or too long")
+    return key
 
 
-def _container(become: Callable[[list[Any]], object]) -> Callable[[Unpickler], None]:
-    return lambda unpickler: unpickler.push_container(become(unpickler.above_mark()))
+def _count(shape: Any) -> int:
+    """Return the number of entries of an array of that shape."""
+    if not isinstance(shape, (tuple, list)) or len(shape) > 32:
+        raise ValueError("an array in it has no proper type and shape")
+    if not all(isinstance(n, (int, np.integer)) and 0 <= n < 1 << 48 for n in shape):
+        raise ValueError("an array in it has no proper type and shape")
+    return math.prod(int(n) for n in shape)
 
 
-def _set_pairs(unpickler: Unpickler) -> None:
-    """DICT: push a dictionary of the values above the mark."""
-    items = unpickler.above_mark()
-    unpickler.push_container({})
-    unpickler.set_items(items)
-
-
-def _set_item(unpickler: Unpickler) -> None:
-    value = unpickler.pop()
-    unpickler.set_items([unpickler.pop(), value])
-
-
-_STEPS: dict[bytes, Callable[[Unpickler], object]] = {
-    b"N": lambda m: m.push(None),
-    b"\x88": lambda m: m.push(True),
-    b"\x89": lambda m: m.push(False),
-    b"K": _number("<B"),
-    b"M": _number("<H"),
-    b"J": _number("<i"),
-    b"G": _number(">d"),
-    b"\x8a": _sized("<B", _little),
-    b"\x8b": _sized("<i", _little),
-    b"I": _word(_integer),
-    b"L": _word(lambda text: int(text.removesuffix("L"))),
-    b"F": _word(float),
-    b"S": lambda m: m.push(_old_text(m.line())),
-    b"U": _sized("<B", lambda raw: raw.decode("latin-1")),
-    b"T": _sized("<i", lambda raw: raw.decode("latin-1")),
-    b"V": lambda m: m.push(m.line().decode("raw-unicode-escape")),
-    b"\x8c": _sized("<B", _text),
-    b"X": _sized("<I", _text),
-    b"\x8d": _sized("<Q", _text),
-    b"C": _sized("<B"),
-    b"B": _sized("<I"),
-    b"\x8e": _sized("<Q"),
-    b"\x96": _sized("<Q", bytearray),
-    b"]": lambda m: m.push_container([]),
-    b"}": lambda m: m.push_container({}),
-    b")": lambda m: m.push(()),
-    b"(": Unpickler.mark,
-    b"0": Unpickler.pop_or_unmark,
-    b"1": Unpickler.above_mark,
-    b"2": lambda m: m.push(m.top()),
-    b"t": _container(tuple),
-    b"\x85": lambda m: m.push_tuple(1),
-    b"\x86": lambda m: m.push_tuple(2),
-    b"\x87": lambda m: m.push_tuple(3),
-    b"l": _container(list),
-    b"d": _set_pairs,
-    b"a": lambda m: m.extend([m.pop()]),
-    b"e": lambda m: m.extend(m.above_mark()),
-    b"s": _set_item,
-    b"u": lambda m: m.set_items(m.above_mark()),
-    b"p": lambda m: m.remember(int(m.word())),
-    b"q": lambda m: m.remember(m.number("<B")),
-    b"r": lambda m: m.remember(m.number("<I")),
-    b"\x94": lambda m: m.remember(len(m._memo)),
-    b"g": lambda m: m.recall(int(m.word())),
-    b"h": lambda m: m.recall(m.number("<B")),
-    b"j": lambda m: m.recall(m.number("<I")),
-    b"c": Unpickler.name,
-    b"\x93": Unpickler.name_of_top,
-    b"R": Unpickler.call_top,
-    b"\x81": Unpickler.call_top,
-    b"b": Unpickler.build,
-    b"\x80": Unpickler.check_protocol,
-    b"\x95": lambda m: m.read(8),
-}
-"""The action of each opcode."""
+def _numbers(array: object) -> np.ndarray:
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise ValueError("an array in it does not hold numbers")
+    return array

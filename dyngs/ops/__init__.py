@@ -1,1 +1,2 @@
-"""Differentiable torch ops on the compiled core; the only package that imports it."""
+"""Native kernels behind typed, differentiable torch ops; the only package that imports the compiled
+core."""

@@ -1,1 +1,1 @@
-"""Run folders: checkpoints, logs, the lock."""
+"""Run folders: checkpoints, logs, the lock, and how a run is opened."""

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.core.errors import DyngsError, require_regular
-from dyngs.io.formats.rotation import AXES
-from dyngs.io.formats.similarity import UNMOVED, Similarity, similarity_of
+from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, similarity_of
 from dyngs.io.write import write_text
 
 FRAME_NAME = "frame.json"

@@ -19,8 +19,7 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.export.camera_paths.aim import up_direction
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
-from dyngs.io.formats.rotation import AXES, inverse
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
 from dyngs.io.formats.splat_file import Nonfinite, drawing_options
 from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
@@ -167,7 +166,7 @@ class Opened(LoadedRun):
         less their offset."""
         if self.edited is not None:
             return self.edited.similarity
-        return Similarity(inverse(self.turned), self.info.world_scale)
+        return Similarity(Similarity(self.turned).inverse().turn, self.info.world_scale)
 
     @property
     def world(self) -> Similarity:

@@ -1,1 +1,1 @@
-"""The static model: how Gaussians start, are optimised, multiply and are filtered."""
+"""3D Gaussian splatting of static scenes, with the filters of Mip-Splatting."""

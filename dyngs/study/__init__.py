@@ -1,2 +1,1 @@
-"""What studies of several runs share: training them in turn or on several machines, stored results,
-speeds, tables."""
+"""Studies of several runs: `dyngs compare` and `dyngs tradeoff`."""

@@ -1,1 +1,1 @@
-"""Training and evaluation: the loop, its schedules, checkpoints, logs and metrics."""
+"""The plan of a run, the trainer, the loop and its events, corrections of images, priors."""

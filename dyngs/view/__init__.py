@@ -1,1 +1,1 @@
-"""The viewer: a local page that shows scenes, drawn by dyngs and streamed as images."""
+"""The viewer: a local page that shows scenes and training."""

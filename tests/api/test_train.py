@@ -389,24 +389,6 @@ def test_a_run_is_never_overwritten(
     assert _final_bytes(tmp_path / "run") == before
 
 
-@pytest.mark.skipif(
-    not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is"
-)
-def test_a_folder_that_is_renamed_gets_its_run(capture: Path, tmp_path: Path) -> None:
-    still = tmp_path / "still"
-    moved = tmp_path / "moved"
-    train(_config(capture, still, steps=12))
-
-    def rename(event: Event) -> None:
-        if isinstance(event, StepDone) and event.step == 5:
-            (tmp_path / "run").rename(moved)
-
-    assert train(_config(capture, tmp_path / "run", steps=12), listeners=[rename]) == moved
-    assert not (tmp_path / "run").exists()
-    assert _final_bytes(moved) == _final_bytes(still)
-    assert [line["step"] for line in _log(moved)] == [line["step"] for line in _log(still)]
-
-
 @pytest.mark.parametrize("is_replaced", [False, True])
 def test_a_folder_that_is_removed_loses_nothing_but_its_log(
     capture: Path, tmp_path: Path, is_replaced: bool

@@ -12,7 +12,7 @@ from splat_scenes import cloud
 from dyngs.export.redrawn import Redrawn, capture_cameras, compare_run, compare_splats
 from dyngs.export.splat_files import Writing, write_run_splats
 from dyngs.io.formats.formats import read_splats, upright, write_splats
-from dyngs.io.formats.rotation import AXES, turn_between
+from dyngs.io.formats.similarity import AXES, turn_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.opened import open_run
 

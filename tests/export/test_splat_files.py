@@ -45,8 +45,7 @@ from dyngs.export.splat_files import (
 )
 from dyngs.gaussians.rendering import render
 from dyngs.io.formats.formats import read_splats
-from dyngs.io.formats.rotation import AXES, turn_between
-from dyngs.io.formats.similarity import Similarity
+from dyngs.io.formats.similarity import AXES, Similarity, turn_between
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
 from dyngs.static.scene import StaticScene
 

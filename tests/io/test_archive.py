@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import errno
-import json
-import os
-import shutil
 import stat
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tiny_captures import edit_json, random_pixels, write_frames, write_image
 
 from dyngs.api.load import read_capture
-from dyngs.api.train import with_capture
 from dyngs.cli import main
-from dyngs.config.io import load_config
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import is_capture
 from dyngs.io import archive
@@ -84,93 +75,6 @@ def test_an_archive_is_unpacked_once_and_anew_after_a_change(tmp_path: Path, roo
     edit_json(root / "transforms.json", lambda content: content["frames"].pop())
     assert unpacked(packed(file, root)) != folder
     assert len(read_capture(file).splits["train"]) == 3 - 1  # one for testing
-
-
-def test_folders_that_windows_separates_are_folders(tmp_path: Path, root: Path) -> None:
-    file = tmp_path / "scene.zip"
-    with zipfile.ZipFile(file, "w") as out:
-        for source in root.rglob("*.*"):
-            out.writestr(
-                "scene\\" + str(source.relative_to(root)).replace("/", "\\"), source.read_bytes()
-            )
-    assert len(read_capture(file).splits["train"]) == 3
-
-
-def test_training_says_where_it_is_unpacked_and_keeps_the_archive(
-    tmp_path: Path, root: Path
-) -> None:
-    file = packed(tmp_path / "scene.zip", root, "scene/")
-    said: list[str] = []
-    config = with_capture(load_config("static", [f"data.root={file}"]), say=said.append)
-    assert config.data.root == file
-    assert said == [f"{file} is unpacked in {next(cache_folder('captures').iterdir()) / 'scene'}"]
-
-
-def test_a_run_on_an_archive_is_evaluated_without_the_cache(tmp_path: Path, root: Path) -> None:
-    file = packed(tmp_path / "scene.zip", root)
-    words = ["train.steps=2", "init.num_random=50", "init.triangulate=0", "run.threads=1"]
-    assert (
-        main(["train", "static", f"data.root={file}", f"run.dir={tmp_path / 'run'}", *words]) == 0
-    )
-    shutil.rmtree(cache_folder("captures"))
-    assert main(["eval", str(tmp_path / "run")]) == 0
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["num_views"] == 1
-
-
-def test_photos_in_an_archive_are_posed(
-    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found: list[Path] = []
-
-    def pose(images: Path, out: Path, *_: object) -> SimpleNamespace:
-        found.append(images)
-        out.mkdir(parents=True)
-        return SimpleNamespace(summary=lambda: "posed")
-
-    monkeypatch.setattr("dyngs.capture.unposed.estimate_poses", pose)
-    monkeypatch.setattr("dyngs.capture.sfm.estimate_poses", pose)
-    file = packed(tmp_path / "photos.zip", root / "images", "holiday/")
-    config = with_capture(load_config("static", [f"data.root={file}"]), say=lambda _: None)
-    assert cache_folder("poses") in config.data.root.parents
-    assert main(["data", "sfm", str(file), str(tmp_path / "out")]) == 0
-    assert found == [unpacked(file) / "holiday"] * 2
-
-
-def test_inspect_reads_an_archive(
-    tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["data", "inspect", str(packed(tmp_path / "scene.zip", root))]) == 0
-    out = capsys.readouterr().out
-    assert "3 train, 1 test" in out
-    assert "nothing suspicious" in out
-
-
-def test_processes_unpack_one_archive_at_once(tmp_path: Path, root: Path) -> None:
-    file = packed(tmp_path / "scene.zip", root)
-    code = f"from pathlib import Path\nfrom dyngs.io.archive import unpacked\nprint(unpacked(Path({str(file)!r})))"
-    children = [
-        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) for _ in range(3)
-    ]
-    found = {child.communicate()[0] for child in children}
-    assert all(child.returncode == 0 for child in children)
-    assert len(found) == 1
-    assert len(left()) == 1
-
-
-def test_the_slower_process_takes_the_folder_of_the_faster(
-    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = packed(tmp_path / "scene.zip", root)
-    rename = os.rename
-
-    def late(temporary: Path, folder: Path) -> None:
-        folder.mkdir()
-        (folder / "theirs").write_text("")
-        rename(temporary, folder)
-
-    monkeypatch.setattr(os, "rename", late)
-    assert (unpacked(file) / "theirs").is_file()
-    assert len(left()) == 1
 
 
 BAD_NAMES = (
@@ -271,17 +175,3 @@ def test_damaged_archives_are_one_line(
     assert left() == []
     assert main(["data", "inspect", str(file)]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
-
-
-def test_a_full_disk_leaves_nothing(
-    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = packed(tmp_path / "scene.zip", root)
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("shutil.copyfileobj", full)
-    with pytest.raises(DyngsError, match=r"scene\.zip: cannot be read \(No space left on device\)"):
-        unpacked(file)
-    assert left() == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import site
 import subprocess
 import sys
 from pathlib import Path
@@ -63,37 +62,6 @@ def test_nothing_of_the_current_folder_runs(
     assert "FileNotFoundError" in done.stderr  # it has imported numpy and looked for its file
     assert "missing.usdc" in done.stderr
     assert not (folder / "ran").exists()
-
-
-def test_dyngs_is_found_in_a_checkout_that_is_the_current_folder(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(ROOT)
-    done = run(python_command("dyngs.io.formats.usd_child", "missing.usdc", "out.npz"), ROOT)
-    assert "FileNotFoundError" in done.stderr
-
-
-def test_packages_of_the_parent_are_found_in_its_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """PYTHONPATH comes first, packages of ``pip install --user`` and what their .pth files add are
-    there."""
-    chosen, user, added = (
-        tmp_path / name for name in ("chosen", "user", "added with 'quotes' \udcff")
-    )
-    for folder in (chosen, user, added):
-        folder.mkdir()
-        (folder / "probe.py").write_text(f"print({folder.name[0]!r})\n")
-    (added / "only_added.py").write_text("import probe, sys; print(sys.argv[1:])\n")
-    (user / "editable.pth").write_text(f"import sys; sys.path.append({str(added)!a})\n")
-    monkeypatch.setattr(site, "ENABLE_USER_SITE", True)
-    monkeypatch.setattr(site, "getusersitepackages", lambda: str(user))
-    assert (
-        run(python_command("only_added", "a b", "\udcff"), tmp_path).stdout
-        == f"u\n{['a b', chr(0xDCFF)]!r}\n"
-    )
-    monkeypatch.setattr(sys, "path", [str(chosen), *sys.path])
-    assert run(python_command("probe"), tmp_path).stdout == "c\n"
 
 
 def test_no_other_place_starts_python() -> None:

@@ -10,11 +10,7 @@ import pytest
 from measured import cost_of
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.fields import first_few, numbers_of, open_text, read_json_object
-
-
-def test_some() -> None:
-    assert (first_few([1, 2]), first_few(range(7))) == ("1, 2", "0, 1, 2, 3, 4 and 2 more")
+from dyngs.io.fields import numbers_of, open_text, read_json_object
 
 
 def test_numbers_in_another_shape() -> None:
@@ -44,12 +40,6 @@ def test_other_encodings(tmp_path: Path, encoding: str) -> None:
     path.write_bytes("# né\r\n1 2\r\n".encode(encoding))
     with open_text(path) as file:
         assert file.read() == "# né\n1 2\n"
-
-
-def test_an_object_with_a_byte_order_mark(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    path.write_bytes(b'\xef\xbb\xbf{"a": [1, 2]}')
-    assert read_json_object(path) == {"a": [1, 2]}
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -51,13 +50,6 @@ def test_a_file_is_read_up_to_its_limit(tmp_path: Path, monkeypatch: pytest.Monk
         read_limited(file, 4)
     monkeypatch.setenv(VARIABLE, "2")
     assert read_limited(file, 4) == b"12345"
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes of POSIX")
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.json")
-    with pytest.raises(DyngsError, match="pipe"):
-        read_limited(tmp_path / "a.json")
 
 
 READERS: dict[str, Callable[[Path], object]] = {

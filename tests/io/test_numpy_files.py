@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ from measured import cost_of
 
 from dyngs.core.errors import DyngsError
 from dyngs.io import numpy_files
-from dyngs.io.numpy_files import read_arrays, read_npy, read_npz
+from dyngs.io.numpy_files import read_arrays, read_npz
 
 
 def refusal(path: Path, *names: str) -> str:
@@ -40,7 +39,7 @@ def test_arrays_come_back(tmp_path: Path, save: Callable[..., None]) -> None:
     for name, value in found.items():
         np.testing.assert_array_equal(value, arrays[name])
         assert value.dtype == arrays[name].dtype
-    assert "'objects' is not an array of numbers (ValueError: it holds Python objects)" in refusal(
+    assert "'objects': cannot be read (ValueError: it holds Python objects)" in refusal(
         tmp_path / "x.npz", "objects"
     )
 
@@ -82,9 +81,9 @@ def test_a_bomb_is_refused_before_it_is_unpacked(
         ("(100000000000000000000000000, 100000000000000000)", "over 10^18 bytes of arrays"),
         ("(3,)", "shorter than its shape"),
         ("(-3, -3)", "shorter than its shape"),
-        ("(" * 5000, "not an array of numbers"),
-        ("x" * 20000, "not an array of numbers"),
-        ("None", "not an array of numbers"),
+        ("(" * 5000, "must be an array of numbers"),
+        ("x" * 20000, "must be an array of numbers"),
+        ("None", "must be an array of numbers"),
     ],
 )
 def test_headers_that_lie(tmp_path: Path, shape: str, problem: str) -> None:
@@ -92,21 +91,6 @@ def test_headers_that_lie(tmp_path: Path, shape: str, problem: str) -> None:
     memory, _ = cost_of(lambda: refusal(path, "a"))
     assert memory < 20e6
     assert problem in refusal(path, "a")
-
-
-def test_numbers_of_one_byte_count_as_those_of_eight(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(numpy_files, "MOST_BYTES", 800)
-    write_member(tmp_path / "x.npz", "(101,)", bytes(101), "|u1")
-    assert "asks for 808 bytes of arrays" in refusal(tmp_path / "x.npz", "a")
-    monkeypatch.setenv("DYNGS_LIMITS", "2")
-    assert len(read_arrays(tmp_path / "x.npz", lambda names: names)["a"]) == 101
-
-
-def test_text_that_is_none(tmp_path: Path) -> None:
-    write_member(tmp_path / "x.npz", "()", b"\xff" * 4, "<U1")
-    assert "what is no text" in refusal(tmp_path / "x.npz", "a")
 
 
 def test_other_packing_and_a_lying_directory(tmp_path: Path) -> None:
@@ -118,12 +102,6 @@ def test_other_packing_and_a_lying_directory(tmp_path: Path) -> None:
     content = content[: start + 24] + (160_000_200).to_bytes(4, "little") + content[start + 28 :]
     (tmp_path / "y.npz").write_bytes(content)
     assert "cannot be as large as the archive says" in refusal(tmp_path / "y.npz", "a")
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "x.npz")
-    assert "is no file" in refusal(tmp_path / "x.npz", "a")
 
 
 def test_npz(tmp_path: Path) -> None:
@@ -138,7 +116,7 @@ def test_npz(tmp_path: Path) -> None:
         read_npz(path, ("poses", "trans"))
     np.savez(path, poses=np.array([{}]))
     with pytest.raises(
-        DyngsError, match=r"a\.npz: 'poses' is not an array of numbers .*it holds Python objects"
+        DyngsError, match=r"a\.npz: 'poses': cannot be read .*it holds Python objects"
     ):
         read_npz(path, ("poses",))
     np.save(tmp_path / "b.npy", np.zeros(3))
@@ -147,20 +125,3 @@ def test_npz(tmp_path: Path) -> None:
         with pytest.raises(DyngsError, match=r"a\.npz: cannot be read") as caught:
             read_npz(path, ("poses",))
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("byte", [0, 34, 39, 40, 92, 255])
-def test_an_array_with_a_damaged_header_is_one_line(tmp_path: Path, byte: int) -> None:
-    """NumPy reads the header as Python text, so nearly any error may come of it."""
-    path = tmp_path / "points.npy"
-    np.save(path, np.zeros((2, 17)))
-    content = path.read_bytes()
-    said = []
-    for place in range(10, 70):
-        path.write_bytes(content[:place] + bytes([byte]) + content[place + 1 :])
-        try:
-            read_npy(path)
-        except DyngsError as error:
-            said.append(str(error))
-    assert len(said) > 50  # some bytes are of no matter
-    assert all("cannot be read" in line and "\n" not in line for line in said)

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io import outputs
 from dyngs.io.outputs import SOURCES_NAME, Inputs, new_folder, note_sources, require_new_folder
 
 
@@ -46,26 +45,6 @@ def test_a_file_that_is_read_is_no_output_by_any_name(tmp_path: Path, as_folder:
                 inputs.require_output(out)
             assert "\n" not in str(caught.value), name
         inputs.require_output(tmp_path / f"other{number}" / "new.jpg")
-
-
-def test_other_case_on_a_file_system_that_ignores_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where the system numbers files, equal numbers tell; where it does not, the names, whatever
-    their case."""
-    (tmp_path / "Walk.MP4").write_text("a video")
-    real = os.stat
-
-    def ignoring_case(path: Path, **options: object) -> os.stat_result:
-        values = list(
-            real(tmp_path / "Walk.MP4" if str(path).lower() == str(tmp_path / "walk.mp4") else path)
-        )
-        return os.stat_result([values[0], 0, *values[2:]])
-
-    monkeypatch.setattr(outputs.os, "stat", ignoring_case)
-    monkeypatch.setattr(outputs.os.path, "lexists", lambda _: True)
-    with pytest.raises(DyngsError, match="is the file that is read"):
-        Inputs([tmp_path / "Walk.MP4"]).require_output(tmp_path / "walk.mp4")
 
 
 def test_folders_around_and_within_a_capture(tmp_path: Path) -> None:
@@ -127,18 +106,6 @@ def test_a_folder_with_a_link_to_an_input(tmp_path: Path) -> None:
     os.link(root / "images" / "1.jpg", out / "0000.jpg")
     with pytest.raises(DyngsError, match=r"holds 0000.jpg, a link to .*1\.jpg"):
         Inputs([root]).require_output(out)
-
-
-def test_files_elsewhere_are_only_looked_for_if_there_is_something_to_replace(
-    tmp_path: Path,
-) -> None:
-    calls: list[int] = []
-    (tmp_path / "far.png").write_text("far")
-    inputs = Inputs([None, tmp_path / "gone"], lambda: calls.append(1) or (tmp_path / "far.png",))
-    inputs.require_output(tmp_path / "new.png")
-    assert calls == []
-    with pytest.raises(DyngsError, match="is the file that is read"):
-        inputs.require_output(tmp_path / "far.png")
 
 
 def test_a_made_capture_stands_for_the_video_it_is_made_of(tmp_path: Path) -> None:

@@ -84,13 +84,3 @@ def test_nobody_can_plant_a_link_at_a_temporary_name(
             write_text(tmp_path / "run.json", "theirs")
         monkeypatch.undo()
     assert precious.read_text() == "mine"
-
-
-@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
-def test_files_have_the_permissions_that_the_umask_leaves(tmp_path: Path) -> None:
-    before = os.umask(0o027)
-    try:
-        write_text(tmp_path / "a.txt", "a")
-    finally:
-        os.umask(before)
-    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o640

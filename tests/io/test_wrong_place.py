@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.cli import main
 from dyngs.io.wrong_place import command_for
 
 
@@ -53,40 +52,3 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_command_for_a_path(path: str, command: str | None) -> None:
     found = command_for(Path(path))
     assert found is None if command is None else command in (found or "")
-
-
-@pytest.mark.parametrize(
-    ("words", "command"),
-    [
-        ("eval photos", "dyngs train static data.root=photos"),
-        ("eval clip.mp4", "dyngs train static data.root=clip.mp4"),
-        ("eval static", "dyngs train static data.root=FOLDER"),
-        ("render photos", "dyngs train static data.root=photos"),
-        ("render clip.mp4 --out images", "dyngs train static data.root=clip.mp4"),
-        ("export rig", "dyngs train dynamic data.root=rig"),
-        ("view rig", "dyngs train dynamic data.root=rig"),
-        ("view clip.mp4", "dyngs train static data.root=clip.mp4"),
-        ("train photos", "dyngs train static data.root=photos"),
-        ("train clip.mp4", "dyngs train static data.root=clip.mp4"),
-        ("train run", "dyngs train --resume run"),
-        ("train static photos", "data.root=photos"),
-        ("train static data.root=run", "dyngs eval"),
-        ("train static data.root=rig", "dyngs train dynamic data.root="),
-        ("train static data.root=single", "data.root="),
-        ("train human data.root=photos", "install MediaPipe"),
-        ("train mcmc data.root=photos", "'static_mcmc'"),
-        ("train statc data.root=photos", "'static'"),
-        ("train 4dgs data.root=photos", "'dynamic'"),
-        ("data inspect photos", "dyngs train static data.root=photos"),
-        ("inspect photos", "dyngs data inspect"),
-        ("sfm photos out", "dyngs data sfm"),
-    ],
-)
-@pytest.mark.usefixtures("workplace")
-def test_wrong_starts_name_the_right_command(
-    words: str, command: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words.split()) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert command in error

@@ -1,2 +1,1 @@
-"""Trained models in one small file: quantised by how much the image may change, and
-entropy-coded."""
+"""The quantised scene file `scene.dyngs`."""

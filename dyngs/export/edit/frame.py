@@ -12,8 +12,7 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError, printable, require_regular
 from dyngs.data.scene_space import MAX_DISTANCE
-from dyngs.io.formats.rotation import AXES, turn_between
-from dyngs.io.formats.similarity import Similarity, fitted
+from dyngs.io.formats.similarity import AXES, Similarity, turn_between, turn_of
 from dyngs.io.formats.splat_file import geo_comment
 from dyngs.io.limits import require_at_most
 
@@ -124,6 +123,35 @@ def scale_of(text: str) -> float | Distance:
             f"--scale: {printable(repr(text), 60)}: give a factor, or 'x,y,z x,y,z LENGTH'"
         )
     return number(text, "--scale")
+
+
+_STRAIGHT = 1e-4  # second singular value of points, over the first, below which they lie on a line
+
+
+def fitted(points: np.ndarray, wanted: np.ndarray) -> Similarity:
+    """Return the similarity that brings points nearest to where they are wanted, least squares
+    (Umeyama 1991).
+
+    ``points``, ``wanted``: (P, 3) float64. Raises DyngsError: fewer than three, or on a line: they
+    leave the rotation about it open.
+    """
+    if len(points) < 3:
+        raise DyngsError(
+            f"{len(points)} control points do not determine a similarity; give three or more"
+        )
+    middles = points.mean(axis=0), wanted.mean(axis=0)
+    here = points - middles[0]
+    there = wanted - middles[1]
+    for rows, where in ((here, "the scene"), (there, "the world")):
+        spread = np.linalg.svd(rows, compute_uv=False)
+        if not spread[1] > _STRAIGHT * spread[0]:
+            raise DyngsError(f"the control points lie on one line in {where}; give one beside it")
+    left, spread, right = np.linalg.svd(there.T @ here)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    scale = float((spread * signs).sum() / np.square(here).sum())
+    found = Similarity(turn_of((left * signs) @ right), scale)
+    x, y, z = (middles[1] - found.points(middles[0])).tolist()
+    return replace(found, shift=(x, y, z))
 
 
 @dataclass(frozen=True)

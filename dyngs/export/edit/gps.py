@@ -11,8 +11,7 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
-from dyngs.export.edit.frame import GeoFrame
-from dyngs.io.formats.similarity import fitted
+from dyngs.export.edit.frame import GeoFrame, fitted
 from dyngs.runs.opened import Opened
 
 FEWEST = 4

@@ -39,8 +39,7 @@ from dyngs.io.formats.formats import (
     undone_file,
     write_splats,
 )
-from dyngs.io.formats.rotation import axis_of
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
 from dyngs.io.formats.splat_file import SplatFile, drawing_options
 from dyngs.runs.frame import RunFrame
 from dyngs.runs.inputs import inputs_of

@@ -24,7 +24,7 @@ from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangle
 from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.scene import avatar_of
-from dyngs.io.formats.rotation import AXES
+from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras

@@ -1,1 +1,1 @@
-"""Pose maths: rotations, linear blend skinning."""
+"""Body templates, their texture atlas, and skinning."""

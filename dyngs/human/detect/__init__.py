@@ -1,2 +1,1 @@
-"""A person found in a clip: detectors of other programs, one person followed, silhouettes and key
-points."""
+"""Detection of people and key points in images."""

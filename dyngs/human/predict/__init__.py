@@ -1,0 +1,1 @@
+"""Networks that predict people from a few views."""

@@ -14,8 +14,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading, require_regular
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.edit_note import note_path, read_note, write_note
-from dyngs.io.formats.rotation import AXES, axis_of, product, turn_between
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, axis_of, turn_between
 from dyngs.io.formats.splat_file import (
     GEO_OFFSET,
     Nonfinite,
@@ -294,7 +293,8 @@ def turned_file(
     points up."""
     if splat.edited == UNMOVED:
         gaussians = Similarity(turn).gaussians(splat.gaussians)
-        return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
+        turned = Similarity(turn).after(Similarity(splat.turned)).turn
+        return replace(splat, gaussians=gaussians, up=up, turned=turned)
     return moved_file(splat, Similarity(turn), up)
 
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms
 from dyngs.data.images.colour_space import srgb_decoded
 from dyngs.gaussians import Gaussians
-from dyngs.io.formats.rotation import joined, placed
+from dyngs.io.formats.similarity import joined, similarity_of_matrix
 from dyngs.io.formats.splat_file import (
     MOST_GAUSSIANS,
     SplatFile,
@@ -61,14 +61,13 @@ def read_gltf(path: Path) -> SplatFile:
         compressed = _compressed(file, primitive)
         if compressed is not None:
             mode = compressed.mode
-        own = placed(
-            _gaussians(file, primitive) if compressed is None else compressed.gaussians, world
-        )
-        if own is None:
+        place = similarity_of_matrix(world)
+        if place is None:
             raise file.error(
                 "a node distorts or mirrors its Gaussians; apply its transform before exporting"
             )
-        found.append(own)
+        own = _gaussians(file, primitive) if compressed is None else compressed.gaussians
+        found.append(place.gaussians(own.replace(means=own.means.double())))
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
     return described(

@@ -1,5 +1,5 @@
 """Similarities: one rotation, one scale and one shift for all that a scene consists of; exact, with
-an inverse."""
+an inverse. And the names of axes."""
 
 from __future__ import annotations
 
@@ -8,18 +8,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from dyngs.core.camera import Cameras
+from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.io.formats.rotation import inverse, product, turned
-from dyngs.ops.quaternions import quats_of, rotation_matrices
+from dyngs.ops.harmonics import harmonics_basis
+from dyngs.ops.quaternions import quat_product, rotation_matrices
 
-_STRAIGHT = 1e-4  # second singular value of points, over the first, below which they lie on a line
+AXES: dict[str, tuple[float, float, float]] = {
+    f"{sign}{name}": (value * (i == 0), value * (i == 1), value * (i == 2))
+    for sign, value in (("", 1.0), ("-", -1.0))
+    for i, name in enumerate("xyz")
+}
+"""Unit vectors by the names that ``--up`` takes: x, y, z, -x, -y, -z."""
+
+_ALONG_AXIS = 0.866  # a direction within 30 degrees of an axis is taken for the axis
+_DIRECTIONS = 200
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 _FAR = 10.0  # distance from the origin over the spread, up to which points are not far away
 _FARTHEST = 1e30  # coordinates beyond this are mistakes
 _COARSE = 0.05  # largest rounding of coordinates to float32, relative to the detail of a scene
+
+Quaternion = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -32,7 +45,7 @@ class Similarity:
         shift: (3,) in units of the result.
     """
 
-    turn: tuple[float, float, float, float] = _NO_TURN
+    turn: Quaternion = _NO_TURN
     scale: float = 1.0
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -48,17 +61,20 @@ class Similarity:
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3) go, float64."""
-        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + np.array(
-            self.shift
-        )
+        turned = np.asarray(points, np.float64) @ self.rotation.T
+        return self.scale * turned + np.array(self.shift)
 
     def after(self, first: Similarity) -> Similarity:
         """Return ``first`` followed by this one."""
+        turns = torch.tensor([self.turn, first.turn], dtype=torch.float64, device="cpu")
+        both = quat_product(turns[0], turns[1])
+        a, b, c, d = (both / both.norm()).tolist()
         x, y, z = self.points(np.array(first.shift)).tolist()
-        return Similarity(product(self.turn, first.turn), self.scale * first.scale, (x, y, z))
+        return Similarity((a, b, c, d), self.scale * first.scale, (x, y, z))
 
     def inverse(self) -> Similarity:
-        back = Similarity(inverse(self.turn), 1 / self.scale)
+        w, x, y, z = self.turn
+        back = Similarity((w, -x, -y, -z), 1 / self.scale)
         x, y, z = (-back.points(np.array(self.shift))).tolist()
         return replace(back, shift=(x, y, z))
 
@@ -67,10 +83,26 @@ class Similarity:
 
         A 3D filter must be fused already, as in ``GaussianScene.at``.
         """
-        shift = (
-            torch.tensor(self.shift, dtype=torch.float64, device="cpu") if any(self.shift) else None
+        if self == UNMOVED:
+            return gaussians
+        means = gaussians.means.double()
+        quats = gaussians.quats
+        sh = gaussians.sh
+        if self.turn != _NO_TURN:
+            turn = torch.tensor(self.turn, dtype=torch.float64, device="cpu")
+            matrix = rotation_matrices(turn)
+            means = means @ matrix.T
+            quats = quat_product(turn, quats.double()).to(quats.dtype)
+            sh = turned_harmonics(sh, matrix)
+        means = self.scale * means
+        if any(self.shift):
+            means = means + torch.tensor(self.shift, dtype=torch.float64, device="cpu")
+        return gaussians.replace(
+            means=means.to(gaussians.means.dtype),
+            quats=quats,
+            log_scales=gaussians.log_scales + float(np.log(self.scale)),
+            sh=sh,
         )
-        return turned(gaussians, self.turn, self.scale, shift)
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras that see the moved scene as ``cameras`` see the scene: depths are
@@ -99,30 +131,24 @@ def similarity_of(numbers: Sequence[float]) -> Similarity:
     return Similarity((a, b, c, d), scale, (x, y, z))
 
 
-def fitted(points: np.ndarray, wanted: np.ndarray) -> Similarity:
-    """Return the similarity that brings points nearest to where they are wanted, least squares
-    (Umeyama 1991).
+def similarity_of_matrix(world: np.ndarray) -> Similarity | None:
+    """Return the similarity of an affine matrix (4, 4), None where that distorts or mirrors."""
+    linear = world[:3, :3]
+    if not np.isfinite(world).all():
+        return None
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not 1e-9 < scale < 1e9 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > 1e-3:
+        return None
+    if abs(scale - 1) < 1e-7:
+        scale = 1.0
+    x, y, z = world[:3, 3].tolist()
+    return Similarity(turn_of(linear / scale), scale, (x, y, z))
 
-    ``points``, ``wanted``: (P, 3) float64. Raises DyngsError: fewer than three, or on a line: they
-    leave the rotation about it open.
-    """
-    if len(points) < 3:
-        raise DyngsError(
-            f"{len(points)} control points do not determine a similarity; give three or more"
-        )
-    middles = points.mean(axis=0), wanted.mean(axis=0)
-    here = points - middles[0]
-    there = wanted - middles[1]
-    for rows, where in ((here, "the scene"), (there, "the world")):
-        spread = np.linalg.svd(rows, compute_uv=False)
-        if not spread[1] > _STRAIGHT * spread[0]:
-            raise DyngsError(f"the control points lie on one line in {where}; give one beside it")
-    left, spread, right = np.linalg.svd(there.T @ here)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    w, x, y, z = quats_of(torch.from_numpy((left * signs) @ right)).tolist()
-    found = Similarity((w, x, y, z), float((spread * signs).sum() / np.square(here).sum()))
-    x, y, z = (middles[1] - found.points(middles[0])).tolist()
-    return replace(found, shift=(x, y, z))
+
+def turn_of(rotation: np.ndarray) -> Quaternion:
+    """Return the quaternion wxyz of a rotation (3, 3)."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True).tolist()
+    return w, x, y, z
 
 
 def far_offset(points: np.ndarray, detail: float) -> np.ndarray:
@@ -143,3 +169,82 @@ def far_offset(points: np.ndarray, detail: float) -> np.ndarray:
     # Multiples of a power of two: subtracting them from float32 and adding them again is exact.
     step = 2.0 ** np.ceil(np.log2(max(spread, detail, distance * 2**-40)))
     return step * np.round(middle / step)
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """Return the Gaussians of all parts, with harmonics of the least degree among them."""
+    terms = num_sh_terms(min(part.sh_degree for part in parts))
+    return Gaussians.joined([part.replace(sh=part.sh[:, :terms]) for part in parts])
+
+
+def mirrored(gaussians: Gaussians) -> Gaussians:
+    """Return the mirror image of Gaussians, x becoming -x."""
+    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=gaussians.means.dtype, device="cpu")
+    turn = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=gaussians.quats.dtype, device="cpu")
+    # Of degree l and order m, a harmonic with a cosine of m times the azimuth changes its sign for
+    # odd m, one with a sine for even m.
+    signs = [
+        (-1.0) ** order if order >= 0 else -((-1.0) ** order)
+        for degree in range(gaussians.sh_degree + 1)
+        for order in range(-degree, degree + 1)
+    ]
+    sh = gaussians.sh * torch.tensor(signs, dtype=gaussians.sh.dtype, device="cpu")[:, None]
+    return gaussians.replace(means=gaussians.means * flip, quats=gaussians.quats * turn, sh=sh)
+
+
+def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
+    """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
+
+    A rotation mixes the harmonics of one degree only among themselves; how, is solved for from
+    their values in many directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation,
+    float64.
+    """
+    degree = round(sh.shape[1] ** 0.5) - 1
+    if degree == 0:
+        return sh
+    generator = torch.Generator(device="cpu").manual_seed(0)
+    directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, device="cpu", generator=generator)
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    here = harmonics_basis(directions, degree)
+    before = harmonics_basis(directions @ matrix, degree)
+    parts = [sh[:, :1]]
+    for d in range(1, degree + 1):
+        rows = slice(num_sh_terms(d - 1), num_sh_terms(d))
+        mixing = torch.linalg.lstsq(here[:, rows], before[:, rows]).solution
+        mixing = torch.where(mixing.abs() < 1e-9, torch.zeros_like(mixing), mixing)
+        parts.append(torch.einsum("kl,nlc->nkc", mixing.to(sh.dtype), sh[:, rows]))
+    return torch.cat(parts, dim=1).contiguous()
+
+
+def turn_between(start: Sequence[float], end: Sequence[float]) -> Quaternion:
+    """Return the smallest rotation, a quaternion wxyz, from one direction to another; about x where
+    they are opposite.
+
+    Opposite directions along x are turned about z.
+    """
+    a, b = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (start, end))
+    real = 1 + float(a @ b)
+    axis = np.cross(a, b)
+    if real < 1e-9:
+        about = np.array([1.0, 0, 0]) if abs(a[0]) < 0.9 else np.array([0, 0, 1.0])
+        real = 0.0
+        axis = about - a * float(about @ a)
+    quat = np.array([real, *axis])
+    w, x, y, z = (quat / np.linalg.norm(quat)).tolist()
+    return w, x, y, z
+
+
+def axis_of(text: str) -> tuple[float, float, float]:
+    """Return the unit vector of an axis name such as "-y". Raises DyngsError: no such axis."""
+    if text not in AXES:
+        raise DyngsError(f"no axis {text!r:.20}; use one of {', '.join(AXES)}")
+    return AXES[text]
+
+
+def nearest_axis(direction: tuple[float, ...]) -> str | None:
+    """Return the name of the axis within 30 degrees of a direction, None if there is none."""
+    length = float(np.linalg.norm(direction))
+    for name, axis in AXES.items():
+        if length > 0 and float(np.dot(direction, axis)) / length >= _ALONG_AXIS:
+            return name
+    return None

@@ -18,8 +18,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.io.formats.packing import logit
-from dyngs.io.formats.rotation import AXES, inverse
-from dyngs.io.formats.similarity import UNMOVED, Similarity, far_offset, similarity_of
+from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, far_offset, similarity_of
 from dyngs.io.limits import require_at_most
 from dyngs.models.renderable import near_plane
 from dyngs.ops.checks import finite_rows
@@ -105,7 +104,7 @@ def move_to_origin(splat: SplatFile) -> SplatFile:
     near = replace(splat, gaussians=gaussians, file_offset=(x, y, z), notes=(*splat.notes, note))
     if splat.edited != UNMOVED:
         return replace(near, edited=Similarity(shift=(-x, -y, -z)).after(splat.edited))
-    x, y, z = (Similarity(inverse(splat.turned)).points(offset) + splat.world_offset).tolist()
+    x, y, z = (Similarity(splat.turned).inverse().points(offset) + splat.world_offset).tolist()
     return replace(near, world_offset=(x, y, z))
 
 

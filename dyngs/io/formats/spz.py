@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import SYSTEM_OF_UP
 from dyngs.io.formats.packing import largest_and_others, logit, with_largest
-from dyngs.io.formats.rotation import mirrored, turned
+from dyngs.io.formats.similarity import Similarity, mirrored, turn_of
 from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
 from dyngs.io.limits import require_at_most
 
@@ -264,9 +263,10 @@ def _from_system(path: Path, splat: SplatFile, number: int) -> SplatFile:
     if np.linalg.det(axes) < 0:
         gaussians = mirrored(gaussians)
         axes[:, 0] *= -1
-    x, y, z, w = Rotation.from_matrix(axes).as_quat(canonical=True).tolist()
     note = "it states other axes than right, up and back: turned to those"
-    return replace(splat, gaussians=turned(gaussians, (w, x, y, z)), notes=(*splat.notes, note))
+    return replace(
+        splat, gaussians=Similarity(turn_of(axes)).gaussians(gaussians), notes=(*splat.notes, note)
+    )
 
 
 def _zstandard(path: Path) -> Any:

@@ -22,7 +22,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.io.child import python_command
 from dyngs.io.formats import usd_child
-from dyngs.io.formats.rotation import joined, placed
+from dyngs.io.formats.similarity import joined, similarity_of_matrix
 from dyngs.io.formats.splat_file import SplatFile, described, from_linear, header_comments
 from dyngs.io.limits import require_at_most
 
@@ -140,9 +140,9 @@ def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     found = from_linear(
         means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3)
     )
-    moved = placed(found, arrays["world"])
-    if moved is None:
+    place = similarity_of_matrix(arrays["world"])
+    if place is None:
         raise DyngsError(
             f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting"
         )
-    return moved
+    return place.gaussians(found.replace(means=found.means.double()))

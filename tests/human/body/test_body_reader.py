@@ -440,7 +440,7 @@ def test_files_that_are_no_body_files(tmp_path: Path) -> None:
     assert "is a folder" in refusal(tmp_path)
     (tmp_path / "model.fbx").touch()
     assert "must end in .npz or .pkl" in refusal(tmp_path / "model.fbx")
-    for name, words in (("empty.npz", "damaged"), ("empty.pkl", "cannot be read as a pickle")):
+    for name, words in (("empty.npz", "damaged"), ("empty.pkl", "cannot be read")):
         (tmp_path / name).touch()
         assert words in refusal(tmp_path / name)
     assert "not hold a dictionary" in refusal(write_pickle(tmp_path / "list.pkl", [1, 2]))
@@ -468,7 +468,7 @@ def test_a_damaged_array_inside_a_sound_archive(old: bytes, new: bytes, tmp_path
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in parts.items():
             archive.writestr(name, content)
-    assert "'weights' is not an array of numbers" in refusal(path)
+    assert "'weights': cannot be read" in refusal(path)
 
 
 # --- files that want to run code
@@ -500,9 +500,7 @@ def test_arrays_of_objects_are_refused_where_needed_and_left_alone_elsewhere(
     mark = tmp_path / "ran"
     evil = np.array([Evil(os.system, f"touch {mark}")], dtype=object)
     wrong = write_npz(tmp_path / "model.npz", model("smpl") | {"weights": evil})
-    assert "'weights' is not an array of numbers (ValueError: it holds Python objects)" in refusal(
-        wrong
-    )
+    assert "'weights': cannot be read (ValueError: it holds Python objects)" in refusal(wrong)
     read_body(write_npz(tmp_path / "model.npz", model("smpl") | {"part2num": evil}))
     assert not mark.exists()
     objects = np.array([1, 2], dtype=object)

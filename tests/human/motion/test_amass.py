@@ -453,7 +453,7 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"poses": np.zeros((4, 165), complex)}, "'poses' must hold numbers"),
         (
             {"poses": np.array([{}], object)},
-            "'poses' is not an array of numbers .*it holds Python objects",
+            "'poses': cannot be read .*it holds Python objects",
         ),
         ({"trans": None}, "the key 'trans' is missing"),
         ({"trans": NAN}, "'trans' holds NaN"),

@@ -3,18 +3,29 @@ numbers."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from splat_scenes import AROUND, cloud
+from splat_scenes import AROUND, cloud, seen
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
+from dyngs.export.edit.frame import fitted
 from dyngs.gaussians.filters import filtered
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.io.formats.similarity import Similarity, far_offset, fitted
+from dyngs.io.formats.similarity import (
+    AXES,
+    Similarity,
+    axis_of,
+    far_offset,
+    mirrored,
+    nearest_axis,
+    turn_between,
+)
+from dyngs.ops.quaternions import rotate
 
 _LENGTH = (0.3**2 + 0.7**2 + 0.2**2 + 0.6**2) ** 0.5
 ODD = Similarity(
@@ -128,3 +139,43 @@ def test_points_far_from_the_origin_come_near_it_in_any_unit(factor: float) -> N
     np.testing.assert_array_equal(
         (far.astype(np.float32) - offset).astype(np.float32) + offset, far.astype(np.float32)
     )
+
+
+@pytest.mark.parametrize("start", AXES)
+@pytest.mark.parametrize("end", AXES)
+def test_the_turn_between_axes(start: str, end: str) -> None:
+    turn = turn_between(axis_of(start), axis_of(end))
+    quat = torch.tensor(turn, dtype=torch.float64)
+    wanted = torch.tensor(axis_of(end), dtype=torch.float64)
+    torch.testing.assert_close(
+        rotate(quat, torch.tensor(axis_of(start), dtype=torch.float64)), wanted
+    )
+
+
+def test_the_turns_that_people_know() -> None:
+    # OpenCV to OpenGL: y and z change sign
+    assert turn_between(AXES["-y"], AXES["y"]) == (0.0, 1.0, 0.0, 0.0)
+    half = math.sqrt(0.5)
+    # Blender to glTF
+    assert turn_between(AXES["z"], AXES["y"]) == pytest.approx((half, -half, 0, 0))
+
+
+def test_names_of_axes() -> None:
+    assert nearest_axis((0.1, -0.9, 0.2)) == "-y"
+    assert nearest_axis((1.0, 1.0, 1.0)) is None
+    assert nearest_axis((0.0, 0.0, 0.0)) is None
+    with pytest.raises(DyngsError, match="no axis 'up'"):
+        axis_of("up")
+
+
+@pytest.mark.parametrize("degree", [0, 2, 4])
+def test_a_mirrored_scene_is_seen_in_a_mirror(degree: int) -> None:
+    """A camera on the plane of the mirror sees the image flipped."""
+    scene = cloud(150, degree)
+    camera = AROUND.select(0)
+    pose = torch.eye(4)[None].clone()
+    pose[0, 2, 3] = 4.0
+    ahead = replace(camera, cam_from_world=pose)
+    got = seen(mirrored(scene), ahead)
+    torch.testing.assert_close(got, seen(scene, ahead).flip(2), rtol=0, atol=3e-5)
+    assert float((seen(scene, ahead) - got).abs().max()) > 0.1
