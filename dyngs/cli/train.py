@@ -127,8 +127,6 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     scene = run.scene
     if capability(run.config.model, Moves) is None:
         return ["motion:  none, so this is a static model, like those of configs/static.yaml"]
-    if not scene.times:
-        return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_static:
         return ["motion:  nothing moves, so this became a static model"]
     return [

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dyngs.data.capture import Capture
+from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
 from dyngs.deform.keys import DynamicModel
+from dyngs.deform.kind import DYNAMIC
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.still_error import (
@@ -30,7 +31,6 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
-from dyngs.static.training import start as start_static
 
 MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
@@ -39,22 +39,14 @@ STEPS_PER_SHOT = 50
 SECONDS_PER_SHOT = 3.0  # Of train.minutes for each, where that is given, likewise
 
 
-def refusal(capture: Capture) -> str | None:
-    """Return why nothing can move in a capture; None: it has images of two times or more."""
-    if len({view.time for view in capture.splits["train"]}) > 1:
-        return None
-    return (
-        "the images have no times, so nothing can move; train configs/static.yaml, or add a time to each image "
-        "(docs/formats.md), or give data.times=order if their names are in the order of time"
-    )
-
-
 def start(run: RunStart) -> GaussianModel:
-    """Return the model of a moving scene before its first step: a static one where there are no
+    """Return the model of a moving scene before its first step. Raises DyngsError: there are no
     times to move in."""
     model = run.config.model
-    if not isinstance(model, DynamicModel) or len(set(training_times(run.capture))) < 2:
-        return start_static(run)
+    assert isinstance(model, DynamicModel)
+    problem = DYNAMIC.refusal(run.capture)
+    if problem is not None:
+        raise DyngsError(f"{run.config.data.root}: {problem}")
     gaussians = first_gaussians(run)
     colours = colours_of(run, gaussians, sees_time=True)
     schedule = deform_schedule(model, rates_of(run.config))

@@ -13,6 +13,7 @@ from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of
 from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
+from dyngs.human.avatar.kind import HUMAN
 from dyngs.human.avatar.observations import Subject, in_colours_of
 from dyngs.human.avatar.outlines import outline_loss
 from dyngs.human.avatar.pose_refit import PoseRefit
@@ -27,13 +28,6 @@ from dyngs.models.kind import RunStart
 from dyngs.models.views import evaluation_background, training_cameras
 
 FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
-
-
-def refusal(capture: Capture) -> str | None:
-    """Return why a capture is of no person; None: it has body parameters."""
-    if capture.body is not None:
-        return None
-    return "has no body parameters, which model.kind=human needs; see docs/human.md"
 
 
 def start(run: RunStart) -> GaussianModel:
@@ -79,7 +73,7 @@ def human_start(
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     sh_degree = config.stored_sh_degree
-    problem = refusal(capture)
+    problem = HUMAN.refusal(capture)
     if problem is not None or capture.body is None:
         raise DyngsError(f"{capture.root}: {problem}")
     if sh_degree > 1:
