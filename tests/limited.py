@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.api.budget.run import LimitedRun
+
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message
 from dyngs.training.loop import Loop

@@ -9,13 +9,14 @@ from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.core.camera import Cameras
 from dyngs.core.state import State, part_of, tensors_of
+from dyngs.deform.fields import OPEN, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.windows import OPEN, WindowedField
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
@@ -28,7 +29,6 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
-from dyngs.static.scene import StaticScene
 
 KINDS = ("static", *FIELDS, "windowed", "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])

@@ -31,10 +31,10 @@ from dyngs.data.synthetic.captures import (
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.training import DynamicTraining
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
 from dyngs.models.views import training_times
 from dyngs.static.keys import StaticModel
-from dyngs.static.scene import StaticScene
 from dyngs.training.losses import SilhouetteLoss
 from dyngs.training.new_trainer import assemble, with_points
 

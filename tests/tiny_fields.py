@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig, DefaultStrategy, RandomInit, RunConfig, TrainConfig
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.deform.control_nodes import Nodes, follow
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
 from dyngs.deform.fields import new_field
 from dyngs.deform.keys import (
@@ -20,7 +21,6 @@ from dyngs.deform.keys import (
     HexplaneField,
     MlpField,
 )
-from dyngs.deform.nodes import Nodes, follow
 from dyngs.gaussians import Gaussians
 from dyngs.ops.quaternions import identity_quat
 

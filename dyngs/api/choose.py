@@ -1,12 +1,9 @@
-"""Decide before a run which settings pay, by short trainings scored on held-out training views.
+"""Pilot runs: short trainings before a run that resolve its ``auto`` settings.
 
-A setting is taken if the mean gain over these views, pair by pair, is above twice its standard
-error, motion above three times. The simpler side wins a tie, and wherever nothing could be
-compared. The winner is trained in full, on all training views. Settings that the user has requested
-are never compared.
-
-- Motion: one static model is trained for a while, and then twice as long, with motion and without.
-- Other settings: small runs of the same images, steps and cap on Gaussians differ in one setting.
+Two trainings of the same images, steps and cap on Gaussians differ in one setting. It is taken if
+its mean gain on held-out training views, pair by pair, exceeds twice its standard error; motion
+three times. The simpler side wins a tie, and wherever nothing could be compared. The winner is
+trained in full, on all training views. Settings that the user requested are never compared.
 """
 
 from __future__ import annotations
@@ -19,90 +16,105 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 
-from dyngs.api.budget.time import refitted
-from dyngs.api.from_scene import first_of
-from dyngs.api.pair_scores import PairScore, after_colour_fit, after_pose_fit, explained, plain
-from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
+import torch
+from torch import Tensor
+
+from dyngs.api.first_scene import first_of
+from dyngs.config import BudgetConfig, Config, PruneConfig
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.metrics import psnr
 from dyngs.core.section import Section
 from dyngs.data.capture import Capture, View
-from dyngs.data.loader import ImageLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.keys import DeformField, DynamicModel, FieldSection, FreeField
+from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
+from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.io.write import write_text
-from dyngs.models.kind import HasGaussians, capability, kind_of, motion_begins_after
+from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
+from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
-from dyngs.models.views import evaluation_background
+from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.static.keys import StaticModel
+from dyngs.training.corrections.camera_refinement import fitted_to_image
 from dyngs.training.loop import Interrupts
 from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
 
-# Of small runs: longest side of the images, px, and most Gaussians
-SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
-# Most steps of a small run; with fewer than the latter it says nothing
-STEPS, FEWEST_STEPS = 2000, 1000
-SPENT = 0.1  # Most of a run's work that small runs may take
-# Work of a step next to its images, and of a Gaussian in it, in pixels
-STEP_COST, GAUSSIAN_COST = 20_000, 2
-FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
-"""With fewer views nothing is compared; with fewer than the second, small runs are made twice, each
-without a fourth of the views; otherwise about so many are held out."""
-TRIAL_STEPS, TRIAL_SIDE, TRIAL_GAUSSIANS, TRIAL_RANDOM = 600, 96, 5000, 1000
-"""Of the trial of motion: steps of each model, of which the first third is shared; longest side of
-the images, px; most Gaussians; most random ones that motion begins with. In 300 steps the motion of
-a turning head is not found yet."""
-TRIAL_COST = 1.4
-"""Work of the trial, in steps of a moving scene, for each of its steps: a step with motion costs
-two without."""
-TRIAL_SPENT = 0.25  # Most of a run's work, or of its ``train.minutes``, that the trial may take
-FEWEST_MOVING = 1500
-"""Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static
-model of it, in 3,000 it gains."""
-LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
-ERRORS, ERRORS_OF_MOTION = 2.0, 3.0
-"""Standard errors that a gain must exceed. The preset ``static`` learns faster than a model at rest
-of the trial, so motion needs more: on photos of a cup that stands still it gained 1.13 dB (0.56),
-and ended 1.3 dB below ``static``. On captures that move the gain was 3.5 errors or more."""
-FREE_VIEWS, MANY_VIEWS = 3.0, 6.0
-"""Views of each time by fixed cameras, in the mean, from which free primitives may be used for what
-moves, and from which they are the first choice: before four cameras a cloth loses 0.9 dB by them,
-before eight a room gains 4.7."""
-EARLY = {"resolution_grows_from": 0.3, "resolution_full_at": 0.5}
-"""Fractions of a run with free primitives at which its images grow."""
-MIN_DIFFERING = 0.001
-"""Fraction of the pixels of fixed cameras that differ from their median from which something
-moves."""
-LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
-"""Of the look at fixed cameras: longest side of the images, px; most cameras, and images of
-each."""
+PairScore = Callable[[GaussianTrainer, GaussianTrainer, int], tuple[float, float]]
+"""Returns the PSNR, dB, of a training view by two models that were not trained on it."""
 
 
 @dataclass(frozen=True)
-class OpenSetting:
-    """A setting that small runs decide about."""
+class _Size:
+    """Size of pilot runs.
 
-    text: str
-    applied: Callable[[Config], Config | None]
-    score: PairScore = plain
+    Attributes:
+        side: longest side of the images, px.
+        gaussians: most of them.
+        steps, fewest_steps: most steps, and fewest with which they say something.
+        spent: most of the work of the run that they may take together.
+    """
+
+    side: int
+    gaussians: int
+    steps: int
+    fewest_steps: int
+    spent: float
+
+
+SETTINGS = _Size(side=128, gaussians=15_000, steps=2000, fewest_steps=1000, spent=0.1)
+MOTION = _Size(side=96, gaussians=5000, steps=600, fewest_steps=600, spent=0.25)
+"""In 300 steps the motion of a turning head is not found yet."""
+MOTION_RANDOM = 1000  # Most random Gaussians that motion begins with in a pilot run
+FEWEST_MOVING = 1500
+"""Steps from which motion is followed in time: in 500 a moving scene loses up to 0.6 dB to a static
+model of it, in 3,000 it gains."""
+STEP_COST, GAUSSIAN_COST = 20_000, 2
+"""Work of a step next to its images, and of a Gaussian in it, in pixels."""
+FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
+"""With fewer views nothing is compared; with fewer than the second, pilot runs are made twice, each
+without a fourth of the views; otherwise about so many are held out."""
+LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
+ERRORS, ERRORS_OF_MOTION = 2.0, 3.0
+"""Standard errors that a gain must exceed. The preset ``static`` learns faster than the static model
+of a pilot run, so motion needs more: on photos of a cup that stands still it gained 1.13 dB (0.56),
+and ended 1.3 dB below ``static``. On captures that move the gain was 3.5 errors or more."""
+FILTERED_VIEWS, FREE_VIEWS = 3.0, 6.0
+"""Views of each time by fixed cameras, in the mean, from which Gaussians are filtered in space (a
+room gains 2.1 dB on other cameras), and from which free primitives move (before eight cameras it
+gains 4.7, before four a cloth loses 0.9)."""
+EARLY = {"resolution_grows_from": 0.3, "resolution_full_at": 0.5}
+"""Fractions of a run with free primitives at which its images grow: nothing is followed through a
+clip, so that small ones save less than they lose."""
+MIN_DIFFERING = 0.001
+"""Fraction of the pixels of fixed cameras that differ from their median from which something
+moves."""
+LOOK_CAMERAS, LOOK_TIMES = 8, 24  # Fixed cameras, and images of each, in which that is looked for
+EXPLAINED = 0.8
+"""Fraction of the pixels of a view that count where people may walk through it: those where the
+smaller of two models' errors is smallest."""
+SQUARES = 8  # The halves of an image are the two colours of a chess board of so many squares a side
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What small runs said about a setting."""
+    """Result of pilot runs about a setting.
+
+    Attributes:
+        without, gain, error: mean PSNR without it, mean gain by it and its standard error, dB.
+        taken: whether the setting is used.
+    """
 
     setting: str
     views: int
-    # without, gain: mean PSNR without it, and mean gain by it, dB
     without: float
     gain: float
-    error: float  # standard error of the gain, dB
+    error: float
     steps: int
     seconds: float
-    taken: bool  # whether the setting is used
+    taken: bool
 
     def __str__(self) -> str:
         return (
@@ -112,186 +124,47 @@ class Choice:
 
 
 def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
-    """Resolve every setting that is left open, by short trainings, and print what they found.
+    """Resolve every setting that is left open by pilot runs.
 
-    Returns the resolved config, the figures, and the capture with the points that the scene begins
+    Returns the resolved config, the results, and the capture with the points that the scene begins
     with.
 
     Raises:
         DyngsError: images that cannot be read, or a capture that this kind of model cannot be
             trained on.
-        KeyboardInterrupt: during short trainings; nothing has been written.
+        KeyboardInterrupt: during pilot runs; nothing has been written.
     """
     problem = kind_of(config.model).refusal(capture)
     if problem is not None:
         raise DyngsError(f"{config.data.root}: {problem}")
-    settings = _settings(config)
     model = config.model
     if not isinstance(model, DynamicModel) or not model.choose:
-        return _compared(_without_auto(config), settings, capture)
+        return _with_settings(config, capture)
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
-        return choose(as_static(config), capture)
-    views = _views_at_once(capture)
-    moving = _with(_without_auto(config), "model", choose=False)
-    if moves and views >= FREE_VIEWS:
-        moving = _bounded(moving)
-        if not model.deform.model_fields_set:
-            moving, other = _what_moves(moving, model.deform, views >= MANY_VIEWS)
-            settings.insert(0, other)
-    choice = _trial_of_motion(moving, capture)
+        return _with_settings(as_static(config), capture)
+    moving = _with(config, "model", choose=False)
+    views = capture.splits["train"]
+    at_once = len(views) / len({view.time for view in views})
+    if moves and at_once >= FILTERED_VIEWS:
+        moving = _before_fixed_cameras(moving, model, at_once)
+    choice = _motion(_resolved(moving), capture)
     if choice is None:
-        print(
+        show(
             "model.kind=dynamic not taken: too short a run, or too few views, to compare it with a static model; "
-            "training a static scene (model.choose=false trains a moving one)",
-            flush=True,
+            "training a static scene (model.choose=false trains a moving one)"
         )
-        return choose(as_static(config), capture)
-    if not choice.taken:
-        still, choices, capture = choose(as_static(config), capture)
-        return still, [choice, *choices], capture
-    if moving.model.filter_3d and not model.filter_3d:
-        print(
-            f"fixed cameras, {views:.0f} at a time: nothing is drawn thinner than they show (model.filter_3d)",
-            flush=True,
-        )
-    best, choices, capture = _compared(moving, settings, capture)
+        return _with_settings(as_static(config), capture)
+    show(f"  {choice}")
+    best, choices, capture = _with_settings(moving if choice.taken else as_static(config), capture)
     return best, [choice, *choices], capture
 
 
-def _trial_of_motion(config: Config, capture: Capture) -> Choice | None:
-    """Compare ``config`` with the same model at rest; None where the run is too short, or has too
-    few views.
-
-    Both begin as one static model, and train on the same views in the same order. That compares
-    motion alone: at the rates of the preset ``static``, a still model would win by its faster
-    learning.
-    """
-    views = capture.splits["train"]
-    folds = _held_out(views)
-    small = _trial_config(config)
-    work = len(folds) * TRIAL_COST * TRIAL_STEPS * _work_of_step(small, views[0])
-    affordable = work / (TRIAL_SPENT * _work_of_step(config, views[0]))
-    if not folds or config.train.steps < max(affordable, FEWEST_MOVING):
-        return None
-    capture = with_points(capture, config, quiet=True)
-    given = 60 * (config.train.minutes or math.inf)
-    begun = time.monotonic()
-    pairs = list[tuple[float, float]]()
-    for held_out in folds:
-        both = _with_and_without_motion(small, capture, held_out, begun + TRIAL_SPENT * given)
-        if both is None:
-            return None
-        pairs += [plain(*both, index) for index in sorted(held_out)]
-    seconds = max(time.monotonic() - begun, 1e-6)
-    steps_that_fit = (given - seconds) / seconds * work / _work_of_step(config, views[0])
-    if steps_that_fit < FEWEST_MOVING:
-        return None
-    choice = _choice("model.kind=dynamic", pairs, TRIAL_STEPS, seconds, ERRORS_OF_MOTION)
-    steps = counted(TRIAL_STEPS, "step")
-    print(f"trial of {steps}, compared on training views that are held out:", flush=True)
-    print(f"  {choice}", flush=True)
-    return choice
-
-
-def _with_and_without_motion(
-    config: Config, capture: Capture, held_out: frozenset[int], deadline: float
-) -> tuple[GaussianTrainer, GaussianTrainer] | None:
-    """Return trainers without and with motion after the trial ``config``; None where it takes too
-    long."""
-    moving = assemble(config, capture, held_out=held_out)
-    begins = motion_begins_after(config.model, config.train.steps) or 1
-    if not _trained(moving, begins - 1, deadline):
-        return None
-    still = refitted(moving, _with(config, "model", motion_from=1.0))
-    # In the last step of its schedule the model at rest would begin to move.
-    both = still, moving
-    return (
-        both
-        if all(_trained(trainer, config.train.steps - 1, deadline) for trainer in both)
-        else None
-    )
-
-
-def _compared(
-    config: Config, settings: Sequence[OpenSetting], capture: Capture
-) -> tuple[Config, list[Choice], Capture]:
-    """Return ``config`` with the settings that win small runs, all figures, and the prepared
-    capture."""
-    settings = [x for x in settings if x.applied(config) is not None]
-    capture = with_points(capture, config)
-    plan = _Plan.of(config, capture, len(settings)) if settings else None
-    if plan is None or len(plan.folds) * plan.runs < 2:
-        if settings:
-            keys = ", ".join(x.text for x in settings)
-            print(
-                f"{keys} not taken: too short a run, or too few views, to compare held-out PSNR",
-                flush=True,
-            )
-        return config, [], capture
-    found, choices = _decided(config, settings[: plan.runs - 1], plan, capture)
-    return found, choices, capture
-
-
-def _decided(
-    config: Config, settings: Sequence[OpenSetting], plan: _Plan, capture: Capture
-) -> tuple[Config, list[Choice]]:
-    """Return ``config`` with the settings that win, each tried on top of those before it, and all
-    figures."""
-    print(
-        f"small runs of {counted(plan.steps, 'step')}, compared on training views that are held out:",
-        flush=True,
-    )
-    runs = plan.trained(config, capture)
-    found = list[Choice]()
-    for setting in settings:
-        changed = setting.applied(config)
-        begun = time.monotonic()
-        if changed is None:
-            continue
-        others = plan.trained(changed, capture)
-        pairs = [
-            setting.score(one, other, index)
-            for one, other in zip(runs, others, strict=True)
-            for index in sorted(one.held_out)
-        ]
-        found.append(_choice(setting.text, pairs, plan.steps, time.monotonic() - begun))
-        print(f"  {found[-1]}", flush=True)
-        if found[-1].taken:
-            config, runs = changed, others
-    return config, found
-
-
-def _choice(
-    text: str,
-    pairs: Sequence[tuple[float, float]],
-    steps: int,
-    seconds: float,
-    errors: float = ERRORS,
-) -> Choice:
-    gains = [after - before for before, after in pairs]
-    gain = fmean(gains)
-    error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
-    without = fmean(before for before, _ in pairs)
-    return Choice(
-        text,
-        len(pairs),
-        without,
-        gain,
-        error,
-        steps,
-        seconds,
-        gain > max(errors * error, LEAST_GAIN),
-    )
-
-
 def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
-    """Write what small runs said into a run folder; nothing where there were none."""
-    if not choices:
-        return
-    write_text(
-        folder / CHOICES_NAME, json.dumps([asdict(choice) for choice in choices], indent=2) + "\n"
-    )
+    """Write the results of pilot runs into a run folder; nothing where there were none."""
+    if choices:
+        text = json.dumps([asdict(choice) for choice in choices], indent=2)
+        write_text(folder / CHOICES_NAME, text + "\n")
 
 
 def as_static(config: Config) -> Config:
@@ -311,11 +184,8 @@ def _requested(given: Section, usual: Section) -> Section:
     """Return ``usual`` with what was requested in ``given``; of another kind of init or strategy,
     that."""
     keys = given.model_fields_set
-    if (
-        not isinstance(given, DynamicModel)
-        and type(given) is not type(usual)
-        and (not keys or "kind" in keys)
-    ):
+    is_other_kind = type(given) is not type(usual) and (not keys or "kind" in keys)
+    if is_other_kind and not isinstance(given, DynamicModel):
         usual = type(given)()
     known = type(usual).model_fields
     return usual.model_copy(
@@ -323,115 +193,205 @@ def _requested(given: Section, usual: Section) -> Section:
     )
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Small runs that keep within their part of a run's work."""
+def _before_fixed_cameras(config: Config, requested: DynamicModel, views: float) -> Config:
+    """Return the config for a scene before fixed cameras, ``views`` of each time, where nothing
+    else was requested.
 
-    # sets of the training views held out; small runs are made once for each
-    folds: Sequence[frozenset[int]]
-    steps: int
-    runs: int  # number of configurations that can be tried
-    # longest side of the images that the run itself begins with, px; small runs begin with no less
-    first_side: float
-
-    @staticmethod
-    def of(config: Config, capture: Capture, num_settings: int) -> _Plan:
-        """Return the plan for a run of ``config`` in which so many settings are open; later ones
-        may be left out."""
-        folds = _held_out(capture.splits["train"])
-        view = capture.splits["train"][0]
-        first = _longest_side(config, view) / config.train.initial_downscale
-        if config.train.minutes is not None:
-            return _Plan(folds, 0, 0, first)
-        small = _small(config, 1000, first)
-        spent = (
-            SPENT * config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
-        )
-        for runs in range(1 + num_settings, 1, -1):
-            steps = min(STEPS, int(spent / max(runs * len(folds), 1)))
-            if steps >= FEWEST_STEPS:
-                return _Plan(folds, steps, runs, first)
-        return _Plan(folds, 0, 0, first)
-
-    def trained(self, config: Config, capture: Capture) -> list[GaussianTrainer]:
-        """Return the trainers of ``config`` after a small run for each fold."""
-        return [
-            _small_run(_small(config, self.steps, self.first_side), capture, held_out)
-            for held_out in self.folds
-        ]
+    What is thinner than few cameras show fits these alone. Pilot runs cannot tell: a camera whose
+    image is held out is trained on at other times.
+    """
+    if "filter_3d" not in requested.model_fields_set:
+        config = _with(config, "model", filter_3d=True)
+    if views >= FREE_VIEWS and not requested.deform.model_fields_set:
+        early = {k: x for k, x in EARLY.items() if k not in config.train.model_fields_set}
+        config = _with(_with(config, "model", deform=FreeField()), "train", **early)
+    return config
 
 
-def _small_run(config: Config, capture: Capture, held_out: frozenset[int]) -> GaussianTrainer:
+def _motion(config: Config, capture: Capture) -> Choice | None:
+    """Compare ``config`` with the same model at rest; None where the run is too short, or has too
+    few views.
+
+    Both begin as the same static model, and train on the same views in the same order: at the rates
+    of the preset ``static``, a model at rest would win by its faster learning.
+    """
+    views = capture.splits["train"]
+    folds = _held_out(views)
+    small = _small(config, MOTION, MOTION.steps, math.inf)
+    small = _with(small, "init", num_random=min(config.init.num_random, MOTION.gaussians))
+    made_of = capability(config.model, HasGaussians)
+    assert made_of is not None
+    small = small.model_copy(update={"model": made_of.adding(config.model, MOTION_RANDOM)})
+    step = _work_of_step(config, views[0])
+    # a step with motion costs two without
+    work = len(folds) * 1.4 * MOTION.steps * _work_of_step(small, views[0])
+    if not folds or config.train.steps < max(work / (MOTION.spent * step), FEWEST_MOVING):
+        return None
+    given = 60 * (config.train.minutes or math.inf)
+    begun = time.monotonic()
+    capture = with_points(capture, config, quiet=True)
+    show(f"pilot runs of {counted(MOTION.steps, 'step')}, compared on held-out training views:")
+    choice = _compared(
+        "model.kind=dynamic",
+        [_with(small, "model", motion_from=1.0), small],
+        capture,
+        folds,
+        plain,
+        errors=ERRORS_OF_MOTION,
+        deadline=begun + MOTION.spent * given,
+    )
+    seconds = max(time.monotonic() - begun, 1e-6)
+    if (given - seconds) / seconds * work / step < FEWEST_MOVING:
+        return None
+    return choice
+
+
+def _with_settings(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
+    """Return ``config`` with the settings that win pilot runs, each tried on top of those before it,
+    all results, and the prepared capture."""
+    open_settings = _open_settings(config)
+    config = _resolved(config)
+    capture = with_points(capture, config)
+    views = capture.splits["train"]
+    folds = _held_out(views)
+    steps, first_side = _affordable(config, views[0], len(open_settings), len(folds))
+    choices = list[Choice]()
+    if not open_settings:
+        return config, choices, capture
+    if not folds or steps < SETTINGS.fewest_steps:
+        keys = ", ".join(f"{section}.{key}" for section, key, _ in open_settings)
+        show(f"{keys}=auto: not taken, too short a run, or too few views, to compare")
+        return config, choices, capture
+    show(f"pilot runs of {counted(steps, 'step')}, compared on held-out training views:")
+    for section, key, score in open_settings:
+        changed = _with(config, section, **{key: "always"})
+        both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
+        choice = _compared(f"{section}.{key}=always", both, capture, folds, score)
+        if choice is None:
+            continue
+        show(f"  {choice}")
+        choices.append(choice)
+        config = changed if choice.taken else config
+    return config, choices, capture
+
+
+def _open_settings(config: Config) -> list[tuple[str, str, PairScore]]:
+    """Return section, key and score of the settings that are ``auto``, by what they were worth in
+    the past, the most first."""
+    found: list[tuple[str, str, PairScore]] = [
+        ("camera", "refine", after_pose_fit),
+        ("train", "exposure", after_colour_fit),
+    ]
+    kind = kind_of(config.model)
+    if not isinstance(kind, Moves):
+        found.append(("train", "robust", explained))
+    found = [x for x in found if f"{x[0]}.{x[1]}" in kind.uses]
+    return [x for x in found if getattr(getattr(config, x[0]), x[1]) == "auto"]
+
+
+def _resolved(config: Config) -> Config:
+    """Return ``config`` without what is open."""
+    for section, key in (("camera", "refine"), ("train", "exposure"), ("train", "robust")):
+        if getattr(getattr(config, section), key) == "auto":
+            config = _with(config, section, **{key: "never"})
+    return config
+
+
+def _compared(
+    text: str,
+    both: Sequence[Config],
+    capture: Capture,
+    folds: Sequence[frozenset[int]],
+    score: PairScore,
+    *,
+    errors: float = ERRORS,
+    deadline: float = math.inf,
+) -> Choice | None:
+    """Train both configs without each fold of the training views, and compare them on it; None
+    where that takes until ``deadline``."""
+    begun = time.monotonic()
+    pairs = list[tuple[float, float]]()
+    for held_out in folds:
+        trainers = [_trained(config, capture, held_out, deadline) for config in both]
+        one, other = trainers
+        if one is None or other is None:
+            return None
+        pairs += [score(one, other, index) for index in sorted(held_out)]
+    gains = [after - before for before, after in pairs]
+    gain = fmean(gains)
+    error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
+    return Choice(
+        setting=text,
+        views=len(pairs),
+        without=fmean(before for before, _ in pairs),
+        gain=gain,
+        error=error,
+        steps=both[0].train.steps,
+        seconds=time.monotonic() - begun,
+        taken=gain > max(errors * error, LEAST_GAIN),
+    )
+
+
+def _trained(
+    config: Config, capture: Capture, held_out: frozenset[int], deadline: float
+) -> GaussianTrainer | None:
+    """Return the trainer of a pilot run; None where that takes until ``deadline``.
+
+    Its last step is left out: in it, a model at rest would begin to move.
+    """
     trainer = assemble(config, capture, held_out=held_out, first=first_of(config, capture))
-    _trained(trainer, config.train.steps)
-    return trainer
-
-
-def _trained(trainer: GaussianTrainer, steps: int, deadline: float = math.inf) -> bool:
-    """Train up to ``steps``, and return True; False where that takes until ``deadline``."""
+    last = config.train.steps - 1
     with Interrupts() as interrupts:
-        while trainer.done < steps and time.monotonic() < deadline:
+        while trainer.done < last and time.monotonic() < deadline:
             if interrupts.requested:
                 raise KeyboardInterrupt(
                     "stopped before training began: nothing is written, give the command again"
                 )
             trainer.step()
     trainer.images.rest()
-    return trainer.done >= steps
+    return trainer if trainer.done >= last else None
+
+
+def _affordable(config: Config, view: View, settings: int, folds: int) -> tuple[int, float]:
+    """Return the steps of each pilot run within its part of the work, 0 where a time is given, and
+    the longest side of the images that the run itself begins with."""
+    first_side = max(view_size(view, config.data)) / config.train.initial_downscale
+    if config.train.minutes is not None:
+        return 0, first_side
+    small = _small(config, SETTINGS, 1000, first_side)
+    work = config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
+    runs = max(2 * settings * folds, 1)
+    return min(SETTINGS.steps, int(SETTINGS.spent * work / runs)), first_side
 
 
 def _work_of_step(config: Config, view: View) -> float:
     width, height = view_size(view, config.data)
     times = range(0, config.train.steps, max(1, config.train.steps // 50))
     drawn = fmean(image_divisor(config.train, step) ** -2 for step in times)
-    return (
-        STEP_COST
-        + width * height * drawn
-        + GAUSSIAN_COST * min(config.strategy.growth_limit, width * height)
-    )
+    gaussians = min(config.strategy.growth_limit, width * height)
+    return STEP_COST + width * height * drawn + GAUSSIAN_COST * gaussians
 
 
-def _longest_side(config: Config, view: View) -> int:
-    return max(view_size(view, config.data))
-
-
-def _trial_config(config: Config) -> Config:
-    small = _small(config, TRIAL_STEPS, math.inf, TRIAL_SIDE, TRIAL_GAUSSIANS)
-    small = _with(small, "init", num_random=min(config.init.num_random, TRIAL_GAUSSIANS))
-    made_of = capability(config.model, HasGaussians)
-    if made_of is None:
-        return small
-    return small.model_copy(update={"model": made_of.adding(config.model, TRIAL_RANDOM)})
-
-
-def _small(
-    config: Config,
-    steps: int,
-    first_side: float,
-    side: int = SMALL_SIDE,
-    most_gaussians: int = SMALL_GAUSSIANS,
-) -> Config:
+def _small(config: Config, size: _Size, steps: int, first_side: float) -> Config:
     """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits.
 
     They begin with no smaller images than the run itself, ``first_side`` px: in smaller ones motion
     is lost that it follows.
     """
-    side = min(config.data.longest_side or side, side)
-    divisors = (
-        n for n in (16, 8, 4, 2) if n <= config.train.initial_downscale and side / n >= first_side
-    )
-    first = next(divisors, 1)
+    side = min(config.data.longest_side or size.side, size.side)
+    most = config.train.initial_downscale
+    divisors = (n for n in (16, 8, 4, 2) if n <= most and side / n >= first_side)
     length = {
         "steps": steps,
         "minutes": None,
         "save_every": 0,
         "eval_every": 0,
-        "initial_downscale": first,
+        "initial_downscale": next(divisors, 1),
     }
     return config.model_copy(
         update={
             "data": config.data.model_copy(update={"longest_side": side}),
-            "strategy": config.strategy.limited(most_gaussians),
+            "strategy": config.strategy.limited(size.gaussians),
             "train": config.train.model_copy(update=length),
             "budget": BudgetConfig(),
             "prune": PruneConfig(),
@@ -440,7 +400,7 @@ def _small(
 
 
 def _held_out(views: Sequence[View]) -> list[frozenset[int]]:
-    """Return the sets of views that small runs hold out, in order of time; none where views are too
+    """Return the sets of views that pilot runs hold out, in order of time; none where views are too
     few."""
     order = sorted(range(len(views)), key=lambda i: (views[i].time or 0.0, views[i].name))
     if len(order) < FEWEST_VIEWS:
@@ -452,123 +412,17 @@ def _held_out(views: Sequence[View]) -> list[frozenset[int]]:
     return [frozenset(order[every // 2 :: every])]
 
 
-def _settings(config: Config) -> list[OpenSetting]:
-    """Return what is open in ``config``, by what it was worth in the past, the most first."""
-    model = config.model
-    found = list[OpenSetting]()
-    if not isinstance(model, (StaticModel, DynamicModel)):
-        return found
-    if config.camera.refine == "auto":
-        found.append(
-            OpenSetting(
-                "camera.refine=always",
-                lambda c: _with(c, "camera", refine="always"),
-                after_pose_fit,
-            )
-        )
-    if config.train.exposure == "auto":
-        found.append(
-            OpenSetting(
-                "train.exposure=always",
-                lambda c: _with(c, "train", exposure="always"),
-                after_colour_fit,
-            )
-        )
-    if config.train.robust == "auto":
-        found.append(OpenSetting("train.robust=always", _robust, explained))
-    if isinstance(model, DynamicModel) and model.choose:
-        if config.colour == ShColour() and not config.colour.model_fields_set:
-            found.append(OpenSetting("colour.kind=network", _network))
-        if "move_opacities" not in model.deform.model_fields_set:
-            found.append(OpenSetting("model.deform.move_opacities=true", _moving_opacities))
-    return found
-
-
-def _without_auto(config: Config) -> Config:
-    if not isinstance(config.model, (StaticModel, DynamicModel)):
-        return config
-    for section, name in (("camera", "refine"), ("train", "exposure"), ("train", "robust")):
-        if getattr(getattr(config, section), name) == "auto":
-            config = _with(config, section, **{name: "never"})
-    return config
-
-
-def _robust(config: Config) -> Config | None:
-    return (
-        _with(config, "train", robust="always") if isinstance(config.model, StaticModel) else None
-    )
-
-
-def _views_at_once(capture: Capture) -> float:
-    """Return the mean number of training views of a time."""
-    views = capture.splits["train"]
-    return len(views) / len({view.time for view in views})
-
-
-def _what_moves(given: Config, field: DeformField, free: bool) -> tuple[Config, OpenSetting]:
-    """Return ``given`` with free primitives or, if not ``free``, with ``field``, and the setting of
-    the other one.
-
-    Images of free primitives grow early where nothing else was requested: nothing is followed
-    through a clip, so that small ones save less than they lose.
-    """
-    early = {name: x for name, x in EARLY.items() if name not in given.train.model_fields_set}
-    usual = {name: getattr(given.train, name) for name in EARLY}
-
-    def primitives(config: Config) -> Config:
-        return _with(_with(config, "model", deform=FreeField()), "train", **early)
-
-    def nodes(config: Config) -> Config:
-        return _with(_with(config, "model", deform=field), "train", **usual)
-
-    first, other, kind = (primitives, nodes, field.kind) if free else (nodes, primitives, "free")
-    return first(given), OpenSetting(f"model.deform.kind={kind}", other)
-
-
-def _bounded(config: Config) -> Config:
-    """Return the configuration for fixed cameras, with the filter in space unless that was
-    requested.
-
-    What is thinner than few cameras show fits these alone. Before eight, against 3DGS's wider
-    filter in the image, a room has -1.4 dB on other cameras without the filter in space and +0.7
-    with it, a die +0.9 and +2.2. Small runs cannot tell: a camera whose image is held out is
-    trained on at other times.
-    """
-    return (
-        config
-        if "filter_3d" in config.model.model_fields_set
-        else _with(config, "model", filter_3d=True)
-    )
-
-
-def _network(config: Config) -> Config | None:
-    return (
-        config.model_copy(update={"colour": NetworkColour()})
-        if isinstance(config.model, DynamicModel)
-        else None
-    )
-
-
-def _moving_opacities(config: Config) -> Config | None:
-    match config.model:
-        case DynamicModel(deform=FieldSection() as field):
-            return _with(config, "model", deform=field.model_copy(update={"move_opacities": True}))
-        case _:
-            return None
-
-
 def _with(config: Config, section: str, **values: object) -> Config:
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 
 def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
-    """Return whether anything moves, where all cameras are fixed, and say so; None: they do not
-    tell."""
+    """Return whether anything moves before fixed cameras; None where the cameras are not fixed."""
     views = capture.splits["train"]
     cameras = cameras_in_place(views)
     if sum(map(len, cameras)) <= 0.9 * len(views):
         return None
-    side = min(config.data.longest_side or LOOK_SIDE, LOOK_SIDE)
+    side = min(config.data.longest_side or MOTION.side, MOTION.side)
     loader = ImageLoader(views, config.data.model_copy(update={"longest_side": side}))
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     used = [cameras[i] for i in evenly_spaced(len(cameras), LOOK_CAMERAS)]
@@ -578,9 +432,121 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
     ]
     fraction = differing_fraction(images)
     moves = fraction > MIN_DIFFERING
-    said = "something moves" if moves else "nothing moves, trained as a static scene"
-    print(
-        f"{said}: {fraction:.2%} of the pixels of fixed cameras differ from their median",
-        flush=True,
-    )
+    found = "something moves" if moves else "nothing moves, trained as a static scene"
+    show(f"{found}: {fraction:.2%} of the pixels of fixed cameras differ from their median")
     return moves
+
+
+def plain(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
+    """Return the PSNR of the view; where either has exposures, after an affine colour fitted to
+    it."""
+    truth, mask, first, second = _both(one, other, index)
+    return psnr(first, truth, mask), psnr(second, truth, mask)
+
+
+def explained(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
+    """Return the PSNR over the pixels that at least one of the two explains best, the same ones for
+    both.
+
+    Held-out views show people who walk through, too, whom no model can predict.
+    """
+    truth, mask, first, second = _both(one, other, index)
+    counts = explained_pixels(first, second, truth, mask)
+    return psnr(first, truth, counts), psnr(second, truth, counts)
+
+
+def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
+    """Return (H, W) the pixels, of those that ``mask`` keeps, where the smaller error of two images
+    is smallest.
+
+    Neither image is favoured: exchanged, they give the same.
+    """
+    error = torch.minimum((one - truth).square().mean(-1), (other - truth).square().mean(-1))
+    weight = torch.ones_like(error) if mask is None else mask
+    known = error[weight > 0]
+    if not known.numel():
+        return weight
+    rank = max(1, round(EXPLAINED * known.numel()))
+    return weight * (error <= known.sort().values[rank - 1])
+
+
+def after_pose_fit(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
+    """Return the PSNR of the right half of the view from the pose in which its left half fits each
+    model best.
+
+    Held-out views have no refined cameras.
+    """
+
+    def score(trainer: GaussianTrainer) -> float:
+        image = trainer.images[index]
+        background = background_colour(trainer.background)
+        left = torch.zeros_like(image.rgb_premultiplied[..., 0])
+        left[:, : left.shape[1] // 2] = 1
+        right = 1 - left if image.mask is None else (1 - left) * image.mask
+        options = trainer.model.options
+        fitted = fitted_to_image(
+            trainer.model.scene, image, background, trainer.extent, options=options, weights=left
+        )
+        return psnr(_rendered(trainer, fitted).rgb[0], image.composite(background), right)
+
+    return score(one), score(other)
+
+
+def after_colour_fit(
+    one: GaussianTrainer, other: GaussianTrainer, index: int
+) -> tuple[float, float]:
+    """Return the mean PSNR of the view as it is, and with each half recoloured by a fit on the
+    other half.
+
+    Held-out views have no exposures of their own. Where exposure goes with the viewpoint, as in a
+    slow walk, colours that depend on the viewpoint explain it: then the scene in one exposure is
+    farther from images as they are.
+    """
+
+    def score(trainer: GaussianTrainer) -> float:
+        image = trainer.images[index]
+        background = background_colour(trainer.background)
+        rendering = _rendered(trainer, image)
+        truth = image.composite(background)
+        rgb = rendering.rgb[0]
+        fitted = rgb.clone()
+        light = _chess_board(*rgb.shape[:2])
+        for half in (light, ~light):
+            affine = fitted_affine([(image, rendering)], background, half.float())
+            fitted[~half] = recoloured(affine, image, rendering, background)[~half]
+        return fmean((psnr(rgb, truth, image.mask), psnr(fitted, truth, image.mask)))
+
+    return score(one), score(other)
+
+
+def _chess_board(height: int, width: int) -> Tensor:
+    rows, columns = (torch.arange(size, device="cpu") * SQUARES // size for size in (height, width))
+    return (rows[:, None] + columns) % 2 == 0
+
+
+@torch.no_grad()
+def _rendered(trainer: GaussianTrainer, image: Image) -> Rendering:
+    background = background_colour(trainer.background)
+    return trainer.model.scene.render(
+        image.cameras, image.time, options=trainer.model.options, background=background
+    )
+
+
+def _both(
+    one: GaussianTrainer, other: GaussianTrainer, index: int
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Return the view (H, W, 3), its mask, and the view as both scenes show it.
+
+    Where either has exposures, after an affine colour that is fitted to the view.
+    """
+    image = one.images[index]
+    background = background_colour(one.background)
+    shown = []
+    for trainer in (one, other):
+        rendering = _rendered(trainer, image)
+        rgb = rendering.rgb[0]
+        if "always" in (one.config.train.exposure, other.config.train.exposure):
+            affine = fitted_affine([(image, rendering)], background)
+            rgb = recoloured(affine, image, rendering, background)
+        shown.append(rgb)
+    return image.composite(background), image.mask, shown[0], shown[1]

@@ -46,28 +46,25 @@ class Leader:
     loop."""
 
     def __init__(self, processes: Processes, config: Config, threads: int) -> None:
-        self.processes, self._trainer, self._is_stale = processes, None, True
-        self._config = config.model_copy(
-            update={"run": config.run.model_copy(update={"threads": threads})}
-        )
+        self.processes = processes
+        self._has_built = False
+        self._is_stale = True
+        run = config.run.model_copy(update={"threads": threads})
+        self._config = config.model_copy(update={"run": run})
 
     def __call__(self, event: Event) -> None:
-        match event:
-            case TopologyChanged():
-                self._is_stale = True
+        if isinstance(event, TopologyChanged):
+            self._is_stale = True
 
     def before_step(self, trainer: Trainable) -> None:
         """Let the others begin the step that ``trainer`` is about to do."""
         if self.processes.size == 1 or not isinstance(trainer, Trainer):
             return
-        if trainer is not self._trainer:
-            _tell(
-                self.processes,
-                Order.BUILD,
-                json.dumps(self._config.model_dump(mode="json")).encode(),
-            )
-            self._trainer, self._is_stale = trainer, True
-            trainer.processes = self.processes
+        if not self._has_built:
+            config = json.dumps(self._config.model_dump(mode="json"))
+            _tell(self.processes, Order.BUILD, config.encode())
+            self._has_built = True
+            trainer.join(self.processes)
         if self._is_stale:
             _tell(self.processes, Order.RESTORE, _packed(trainer.checkpoint()))
             self._is_stale = False
@@ -119,7 +116,7 @@ def _follow_run(
         trainer = build(config, restored=True)
         if not isinstance(trainer, Trainer):
             raise DyngsError("a network is trained by one process; start it without torchrun")
-        trainer.processes = processes
+        trainer.join(processes)
         while True:
             order, payload = _heard(processes)
             if interrupts.requested:

@@ -9,37 +9,37 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from itertools import count as counted_from
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from torch import Tensor
-
-from dyngs.api.budget.cost import CostMeter
-from dyngs.api.budget.count import count_limit
-from dyngs.api.budget.run import LimitedRun
+from dyngs.api.budget.count import CountLimit
 from dyngs.api.budget.size import has_file, write_within
-from dyngs.api.budget.time import Deadline, fit_to_time
-from dyngs.api.choose import Choice, choose, write_choices
+from dyngs.api.budget.time import TimeLimit, fit_minutes
+from dyngs.api.choose import write_choices
 from dyngs.api.following import Leader
-from dyngs.api.from_scene import first_of, settled
-from dyngs.capture.unposed import with_poses
-from dyngs.compress.prune.floaters import FloaterRemoval
-from dyngs.compress.prune.stage import PruneStage
+from dyngs.api.stages import (
+    continue_scene,
+    extend_run,
+    find_first_gaussians,
+    find_poses,
+    planned,
+    read_same_capture,
+    run_pilots,
+    set_limits,
+    share_views,
+)
+from dyngs.compress.floaters import remove_floaters
+from dyngs.compress.stage import prune_stage
 from dyngs.config import Config
-from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, as_word, counted, show, warn
-from dyngs.data.capture import Capture
-from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
+from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
-from dyngs.gaussians.start import FirstGaussians
 from dyngs.io.lock import Held, writing
-from dyngs.models.checkpoint import read_capture_of
-from dyngs.models.kind import HasBody, HasGaussians, Moves, Predicts, capability, kind_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
-from dyngs.ops.native import kernel_threads
-from dyngs.runs.capture_record import changed_files, named, write_record
+from dyngs.ops.native import kernel_threads, num_cores
+from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
-    SCENE_FILE,
     Checkpoint,
     checkpoint_paths,
     last_good,
@@ -51,8 +51,6 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import (
-    ASKED_NAME,
-    EXPORT_FOLDER,
     asked_for,
     begin,
     default_folder,
@@ -65,35 +63,30 @@ from dyngs.runs.folder import (
 )
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.log import RunLog
-from dyngs.runs.progress import Progress
 from dyngs.training.clock import SaveTimer, Stopwatch
-from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
-from dyngs.training.extend import told, with_length
-from dyngs.training.limits import require_possible, shared
-from dyngs.training.loop import Interrupts, Loop
+from dyngs.training.events import (
+    Evaluated,
+    Event,
+    Listener,
+    Message,
+    Saved,
+    StepDone,
+    TotalChanged,
+)
+from dyngs.training.limits import require_possible
+from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
 from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.new_trainer import build
+from dyngs.training.plan import RunPlan
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
-_COUNT, _TIME = "budget.count", "budget.time"  # Names of the limits' states in a checkpoint
+_COUNT = "budget.count"  # Name of the limit's state in a checkpoint
 
 
 @contextmanager
 def _no_progress() -> Iterator[ReportProgress]:
     yield report_nothing
-
-
-class Limit(Protocol):
-    """A listener whose state belongs into checkpoints."""
-
-    def __call__(self, event: Event) -> None: ...
-
-    def state(self) -> dict[str, Tensor]: ...
-
-    def restore(self, stored: dict[str, Tensor]) -> None: ...
-
-    def reached(self) -> str: ...
 
 
 def train(
@@ -136,215 +129,199 @@ def train(
     """
     folder = resume_from or config.run.dir or default_folder(config.run.name)
     processes = processes or Processes()
-    config = shared(config, processes)
-    require_possible(config)
-    device_for(config.run.device)
-    if resume_from is None and not (folder / RESOLVED_NAME).is_file():
-        inputs_of(config).require_output(folder)
-    if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
+    plan = planned(RunPlan(config, config), [share_views(processes)])
+    require_possible(plan.resolved)
+    device = device_for(config.run.device)
+    if resume_from is None:
+        if not (folder / RESOLVED_NAME).is_file():
+            inputs_of(config).require_output(folder)
+        with progress() as report:
+            plan = planned(plan, [find_poses(report), continue_scene])
+    elif not folder.is_dir() or _is_done_and_read_only(config, folder):
         latest_checkpoint(folder)
         return folder
-    if resume_from is None:
-        with progress() as report:
-            config = settled(with_capture(config, report=report))
     keep_freed_memory()
-    bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
+    bytewise = deterministic(device, config.run.deterministic)
     with writing(folder) as held, kernel_threads(_num_threads(config, processes)), bytewise:
         tidy(folder, sole_writer=held.alone)
-        if resume_from is not None:
+        resumed = None
+        if resume_from is None:
+            plan = replace(plan, requested=plan.resolved)
+            if is_done(folder, plan.resolved) and not _is_export_pending(plan.resolved, folder):
+                show(_about_finished(plan.resolved, folder))
+                return folder
+            require_startable(folder, plan.resolved)
+        else:
             note_root(folder, config.data)
-        if resume_from is None and is_done(folder, config) and not _owes_file(config, folder):
-            print(_told_again(config, folder), flush=True)
-            return folder
-        resumed = _start_of_run(config, folder, resuming=resume_from is not None)
-        if resume_from is not None:
-            config = _with_new_length(config, folder, resumed)
-        if (
-            resumed is not None
-            and resumed.info.step >= config.total_steps
-            and not _owes_file(config, folder)
-        ):
-            print(
-                f"{folder}: all {counted(config.total_steps, 'step')} are done; train.steps=N goes on to more",
-                flush=True,
-            )
-            return folder
-        asked = asked_for(folder) if resume_from is not None else config
+            resumed = _newest(folder)
+            plan = replace(plan, requested=asked_for(folder))
+            plan = planned(plan, [extend_run(folder, resumed)])
         if resumed is not None:
-            resumed.require_settings(config)
+            total = plan.resolved.total_steps
+            if resumed.info.step >= total and not _is_export_pending(plan.resolved, folder):
+                show(
+                    f"{folder}: run already finished ({counted(total, 'step')}). Use train.steps=N to train longer"
+                )
+                return folder
+            resumed.require_settings(plan.resolved)
         watch = Stopwatch()
-        config, choices, capture = _chosen(config, resumed)
-        if resumed is not None:
-            _warn_of_changed_files(folder, config, capture)
-        run = _Run(
-            config,
-            folder,
-            resumed,
-            asked,
-            capture=capture,
-            held=held,
-            processes=processes,
-            watch=watch,
-        )
-        write_choices(run.folder, choices)
-        lines = run.run(listeners)
-        folder = run.folder
-        note_asked(folder, asked)
-        for line in lines:
-            show(line)
-    return folder
+        images = None
+        if resumed is None:
+            plan = planned(plan, [run_pilots, find_first_gaussians, set_limits])
+            require_room(plan.resolved)
+            if plan.limits.seconds is not None:
+                plan, images = _fit_minutes(plan, watch)
+        else:
+            plan = planned(plan, [read_same_capture(folder, resumed), set_limits])
+            watch.pause(-seconds_at(folder, resumed.info.step))
+        trainer = _built(plan, resumed, images)
+        run = _Run(plan, trainer, folder, resumed, held=held, processes=processes, watch=watch)
+        run.run(listeners)
+    return run.folder
 
 
-def _chosen(
-    config: Config, resumed: Checkpoint | None
-) -> tuple[Config, list[Choice], Capture | None]:
-    """Return the configuration with all decided, what was said, and the capture, which nothing
-    reads again."""
-    if capability(config.model, Predicts) is not None:
-        return config, [], None  # it has several captures
+def _built(
+    plan: RunPlan, resumed: Checkpoint | None = None, images: ImageLoader | None = None
+) -> Trainable:
+    """Return the trainer of a plan, before its first step or where it was ``resumed``."""
+    trainer = build(
+        plan.resolved,
+        plan.capture,
+        restored=resumed is not None,
+        first=plan.first,
+        uncapped=plan.uncapped,
+        images=images,
+    )
     if resumed is not None:
-        return config, [], read_capture_of(config.data, resumed.info)
-    return choose(config, require_images(read_capture(config.data)))
+        trainer.restore(resumed)
+    return trainer
 
 
-def _told_again(config: Config, folder: Path) -> str:
+def _fit_minutes(plan: RunPlan, watch: Stopwatch) -> tuple[RunPlan, ImageLoader]:
+
+    def build_trainer(plan: RunPlan) -> Trainer[Any]:
+        trainer = _built(plan)
+        assert isinstance(trainer, Trainer)
+        return trainer
+
+    plan, message, images = fit_minutes(plan, lambda: watch.seconds, build_trainer)
+    if message:
+        show(message)
+    return plan, images
+
+
+def _about_finished(config: Config, folder: Path) -> str:
+    again = as_word(folder)
     longer = (
         ""
         if config.prune.is_wanted
-        else f", go on with `dyngs train --resume {as_word(folder)} train.steps=N`"
+        else f", go on with `dyngs train --resume {again} train.steps=N`"
     )
     return (
         f"{folder} holds just this run, finished, and training again would end with the same bytes: nothing is done; "
-        f"look at it with `dyngs eval {as_word(folder)}`{longer}, or give another run.dir"
+        f"look at it with `dyngs eval {again}`{longer}, or give another run.dir"
     )
 
 
 class _Run:
-    """A run from the reading of its capture to its last line.
+    """The loop of a run with its folder: checkpoints, log, evaluations and limits.
 
     Args:
-        resumed: what it goes on from; None: it begins.
-        asked: the configuration that was asked for, from which this one was chosen.
-        held: the lock of the folder, which knows where that is if it is renamed.
-        watch: seconds since the capture was read, which include those of short trainings before the
-            run.
+        held: the lock of the folder, which finds that if it is renamed.
+        watch: seconds since the capture was read, those of pilot runs included.
     """
 
     def __init__(
         self,
-        config: Config,
+        plan: RunPlan,
+        trainer: Trainable,
         folder: Path,
         resumed: Checkpoint | None,
-        asked: Config,
         *,
-        capture: Capture | None,
         held: Held,
         processes: Processes,
         watch: Stopwatch,
     ) -> None:
-        if resumed is None:
-            require_room(config)
-        first = None if resumed is not None or capture is None else first_of(config, capture)
-        trainer = build(config, capture, restored=resumed is not None, first=first)
-        self._held, self._capture = held, capture
-        self.folder, self.limits = folder, dict[str, Limit]()
-        self.loop = Loop(trainer, config.total_steps, watch, lambda: last_good(self.folder))
+        config = plan.resolved
+        self._plan = plan
+        self._held = held
+        self._processes = processes
+        self.folder = held.folder() or folder
+        self._count = None
+        self._time = None
+        editors: list[Editor] = []
+        if isinstance(trainer, Trainer):
+            editors = [remove_floaters]
+            limits = plan.limits
+            if limits.seconds is not None:
+                steps = plan.uncapped.train.steps if plan.uncapped else config.train.steps
+                self._time = TimeLimit(limits.seconds, steps, corrects=resumed is None)
+                editors.append(self._time)
+            if limits.gaussians is not None:
+                self._count = CountLimit(limits.gaussians, limits.seconds)
+                editors.append(self._count)
+                if resumed is not None:
+                    self._count.restore(resumed.part(_COUNT))
+            if trainer.num_gaussians:
+                _show_memory(trainer, processes.local_size)
         self._leader = Leader(processes, config, _num_threads(config, processes))
-        self.loop.before_step = self._leader.before_step
-        if resumed is not None:
-            trainer.restore(resumed)
-            watch.pause(-seconds_at(folder, resumed.info.step))
-        self.limited = (
-            LimitedRun(folder, config, self.loop, trainer) if isinstance(trainer, Trainer) else None
+        self.loop = Loop(
+            trainer,
+            config.total_steps,
+            watch,
+            lambda: last_good(self.folder),
+            stages=[prune_stage] if isinstance(trainer, Trainer) else [],
+            limits=editors,
+            before_step=self._leader.before_step,
         )
-        self._config = config
-        self._saved = self.loop.trainer.done
+        self._saved = trainer.done
         self._save_timer = SaveTimer(config.train.save_minutes, watch.seconds)
-        has_gaussians = capability(config.model, HasGaussians) is not None
-        self._gaussians = self.limited if has_gaussians else None
-        if self._gaussians is not None:
-            _tell_memory(self._gaussians.trainer, processes.local_size)
-        self._meter: CostMeter | None = None
-        if self.limited is not None:
-            self._set_limits(self.limited, resumed, first)
-        self._follow(held.folder() or folder)
         if resumed is None:
-            begin(self.folder, self.config)
-            note_asked(self.folder, asked)
-            write_record(self.folder, config.data, capture)
+            begin(self.folder, config)
+            note_asked(self.folder, plan.requested)
+            write_record(self.folder, config.data, plan.capture)
+            write_choices(self.folder, plan.choices)
 
     @property
     def config(self) -> Config:
-        """The configuration as saved; limits may change the number of steps."""
-        return self._config if self.limited is None else self.limited.config
+        """The config as saved; a limit on the time may change the number of steps."""
+        return self.loop.trainer.config
 
-    def run(self, listeners: Sequence[Listener]) -> list[str]:
-        """Step until the end, or until interrupted, and keep the limits; return a line for each
-        limit."""
+    def run(self, listeners: Sequence[Listener]) -> None:
+        """Step until the end, or until interrupted, and report the limits."""
         options = self.config.train
         loop = self.loop
-        done = self.loop.trainer.done
+        done = loop.trainer.done
         with (
             RunLog(
                 self.folder, done, every=options.log_every, tensorboard=options.tensorboard
             ) as log,
-            Progress(loop.total, done, options.log_every, config=lambda: self.config) as progress,
             Interrupts() as interrupts,
         ):
-            measures = [] if self._meter is None else [self._meter]
-            gaussians = self._gaussians
-            if gaussians is not None:
-                loop.subscribe(FloaterRemoval(loop, lambda: gaussians.trainer))
-            loop.subscribe(
-                self._leader,
-                *measures,
-                *self.limits.values(),
-                log,
-                progress,
-                *listeners,
-                self._save_and_evaluate,
-            )
-            if gaussians is not None:
-                loop.subscribe(PruneStage(loop, lambda: gaussians.trainer))
+            loop.subscribe(self._leader, log, *listeners, self._save_and_evaluate)
             try:
-                loop.run(lambda: interrupts.requested or self._leader.processes.is_stop_requested())
+                loop.run(lambda: interrupts.requested or self._processes.is_stop_requested())
             finally:
                 if isinstance(loop.trainer, Trainer):
                     loop.trainer.images.rest()
             if loop.trainer.done < loop.total:
-                self._follow(self._held.folder() or self.folder)
+                self.folder = self._held.folder() or self.folder
                 if loop.trainer.done > self._saved:
                     self._save()
                 raise KeyboardInterrupt(
                     f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {as_word(self.folder)}"
                 )
-        return list(self._reached())
-
-    def _set_limits(
-        self, run: LimitedRun, resumed: Checkpoint | None, first: FirstGaussians | None
-    ) -> None:
-        minutes = run.config.train.minutes
-        if minutes is not None:
-            run.given = 60 * minutes
-            wanted = run.config.train.steps
-            refit_seconds = 0.0
-            if resumed is None:
-                refit_seconds = fit_to_time(run, first, show)
-                self.loop.total = run.config.total_steps
-            self.limits[_TIME] = Deadline(
-                run, wanted, fits=resumed is None, refit_seconds=refit_seconds, save=self._save
-            )
-            self._meter = (
-                CostMeter(run, wanted) if resumed is None and self._gaussians is not None else None
-            )
-        count = count_limit(run)
-        if count is not None:
-            self.limits[_COUNT] = count
-            if resumed is not None:
-                count.restore(resumed.part(_COUNT))
+            for line in self._reached():
+                loop.emit(Message(line))
+        note_asked(self.folder, self._plan.requested)
 
     def _save_and_evaluate(self, event: Event) -> None:
         match event:
+            case TotalChanged() if self.loop.trainer.done < event.total:
+                self._save()  # a resumed run goes on from here with the new schedules
+                write_config(self.config, self.folder)
+            case TotalChanged():
+                write_config(self.config, self.folder)
             case StepDone():
                 options = self.config.train
                 step = event.step
@@ -359,78 +336,50 @@ class _Run:
     def _save(self) -> None:
         begin = self.loop.watch.seconds
         checkpoint = self.loop.trainer.checkpoint()
-        for part, limit in self.limits.items():
-            kept = {f"{part}.{name}": x for name, x in limit.state().items()}
+        if self._count is not None:
+            kept = {f"{_COUNT}.{name}": x for name, x in self._count.state().items()}
             checkpoint = replace(checkpoint, tensors=checkpoint.tensors | kept)
         found = self._held.folder()
-        self._follow(found or _free(self.folder))
+        self.folder = found or _free(self.folder)
         if found is None:
             write_config(self.config, self.folder)
         path = save_checkpoint(self.folder, checkpoint, self.loop.watch.seconds)
-        if found is None:
-            done = self.loop.trainer.done
-            again = f"dyngs train --resume {as_word(self.folder)}"
-            raise DyngsError(
-                f"the folder of the run was removed, or moved to another disk; the checkpoint after step {done} is in "
-                f"{self.folder}; go on with `{again}`"
-            )
         self._saved = self.loop.trainer.done
+        if found is None:
+            raise DyngsError(
+                f"the folder of the run was removed, or moved to another disk; the checkpoint after step {self._saved} "
+                f"is in {self.folder}; go on with `dyngs train --resume {as_word(self.folder)}`"
+            )
         self._save_timer.saved(begin, self.loop.watch.seconds)
-        self.loop.tell(Saved(self._saved, path))
-
-    def _follow(self, folder: Path) -> None:
-        """Go on in ``folder``, which that of the run is called by now."""
-        self.folder = folder
-        if self.limited is not None:
-            self.limited.folder = folder
+        self.loop.emit(Saved(self._saved, path))
 
     def _evaluate(self, step: int) -> None:
         start = time.perf_counter()
-        report = evaluate_run(self.folder, "test", capture=self._capture)
+        report = evaluate_run(self.folder, "test", capture=self._plan.capture)
         seconds = time.perf_counter() - start
         self.loop.watch.pause(seconds)
-        self.loop.tell(Evaluated(step, "test", report.psnr, report.ssim, seconds))
-
-    def _how_to_go_on(self, steps: int) -> str:
-        """Return what to do after a preview for a run of all ``steps``."""
-        try:
-            with_length(self.config, self.loop.trainer.done, steps)
-        except DyngsError:  # motion began too early for so many
-            return "for that train anew without train.minutes"
-        longer = f"`dyngs train --resume {as_word(self.folder)} train.steps={steps}`"
-        return f"this run goes on to that with {longer}, or train anew without train.minutes"
+        self.loop.emit(Evaluated(step, "test", report.psnr, report.ssim, seconds))
 
     def _reached(self) -> Iterator[str]:
-        """Yield a line for each limit; what is still owed is done before its line."""
-        for part in (_COUNT, _TIME):
-            if part in self.limits:
-                yield self.limits[part].reached()
-        cost = (
-            None
-            if self._meter is None or self._meter.steps <= self.loop.trainer.done
-            else self._meter.found()
-        )
-        if cost is not None:
-            yield f"{cost}; {self._how_to_go_on(cost.steps)}"
-        if self.limited is not None and self.config.budget.max_mb is not None:
-            yield str(write_within(self.limited.trainer, self.folder, self.config.budget.max_mb))
+        """Yield a line for each limit; a file that is pending is written before its line."""
+        trainer = self.loop.trainer
+        if self._count is not None:
+            yield self._count.reached(self.config, trainer.num_gaussians)
+        if self._time is not None:
+            yield self._time.reached(self.loop)
+            cost = self._time.cost_of_all(self.loop)
+            if cost is not None:
+                steps = self._time.most_steps
+                resume = f"dyngs train --resume {as_word(self.folder)} train.steps={steps}"
+                yield f"{cost}; this run goes on to that with `{resume}`"
+        if isinstance(trainer, Trainer) and self._plan.limits.megabytes is not None:
+            yield str(write_within(trainer, self.folder, self._plan.limits.megabytes))
 
 
-def _warn_of_changed_files(folder: Path, config: Config, capture: Capture | None) -> None:
-    """Print which files of the capture have changed since the run began. Raises DyngsError: it is
-    another capture."""
-    changed = changed_files(folder, config.data, capture)
-    if changed:
-        views = counted(len(changed), "training view")
-        line = f"files of {views} have changed since the run began: {named(changed)}"
-        warn(line)
-
-
-def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
-    """Print how much memory a run will take, and a warning where that is likely to be more than is
-    there."""
+def _show_memory(trainer: Trainer[Any], processes: int) -> None:
+    """Show how much memory a run will take, and warn where that is likely to be too much."""
     for forecast in memory_forecasts(trainer, processes):
-        print(forecast, flush=True)
+        show(str(forecast))
         forecast.require_possible()
         warning = forecast.warning()
         if warning is not None:
@@ -451,21 +400,19 @@ def _is_done_and_read_only(config: Config, folder: Path) -> bool:
     """Return whether nothing is to be done in the run folder, and nothing can be."""
     paths = checkpoint_paths(folder)
     is_done = (
-        bool(paths) and step_of(paths[-1]) >= config.total_steps and not _owes_file(config, folder)
+        bool(paths)
+        and step_of(paths[-1]) >= config.total_steps
+        and not _is_export_pending(config, folder)
     )
     return is_done and not os.access(folder, os.W_OK)
 
 
-def _owes_file(config: Config, folder: Path) -> bool:
+def _is_export_pending(config: Config, folder: Path) -> bool:
     return config.budget.max_mb is not None and not has_file(folder)
 
 
-def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint | None:
-    """Return the checkpoint to go on from; None for a run that begins, or that was stopped before
-    its first."""
-    if not resuming:
-        require_startable(folder, config)
-        return None
+def _newest(folder: Path) -> Checkpoint | None:
+    """Return the checkpoint to go on from; None for a run that was stopped before its first."""
     if was_only_begun(folder):
         return None
     checkpoint = latest_checkpoint(folder)
@@ -473,65 +420,6 @@ def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint
     return checkpoint
 
 
-def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -> Config:
-    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another
-    number of steps."""
-    stored = load_resolved(folder)
-    steps = config.train.steps
-    was = stored.train.steps
-    if steps == was:
-        return config
-    if resumed is None:
-        raise DyngsError(
-            f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give another run.dir, and "
-            "begin with so many steps"
-        )
-    require_folder(stored.data.root)
-    done = resumed.info.step
-    longer = with_length(stored, done, steps)
-    print(told(stored, longer, done), flush=True)
-    if stored.budget.max_mb is not None:
-        # otherwise a run that is stopped now would take it for its own
-        (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
-    save_config(longer, folder / RESOLVED_NAME)
-    (folder / ASKED_NAME).unlink(missing_ok=True)  # what was asked for now is what is there
-    return with_length(
-        config.model_copy(update={"train": config.train.model_copy(update={"steps": was})}),
-        done,
-        steps,
-    )
-
-
 def _num_threads(config: Config, processes: Processes) -> int:
     """Return the number of threads of the kernels in each process."""
     return config.run.threads or max(1, num_cores() // processes.local_size)
-
-
-def num_cores() -> int:
-    """Return the number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on Linux
-        return os.cpu_count() or 1
-
-
-def with_capture(
-    config: Config, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
-) -> Config:
-    """Return the configuration with a capture that can be trained on; what is found for it is kept
-    for other runs."""
-    data = config.data
-    root = data.root
-    folder = capture_folder(root)
-    if folder != root:
-        say(f"{root} is unpacked in {folder}")
-        data = data.model_copy(update={"root": folder})
-    kind = kind_of(config.model)
-    if isinstance(kind, HasBody):
-        data = kind.find_body(data, config.model, say, report)
-    elif not isinstance(kind, Predicts):  # whose folder holds a capture per person
-        moves = isinstance(kind, Moves)
-        data = with_poses(data, needs_times=moves, say=say, report=report)
-    if data.root == folder:  # the archive outlives the cache
-        data = data.model_copy(update={"root": root})
-    return config.model_copy(update={"data": data})

@@ -29,8 +29,11 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     from dyngs.cli.demo_run import DemoOptions, result_table, run_demo
+    from dyngs.cli.training_progress import TrainingProgress
 
-    result = run_demo(arguments.out, DemoOptions(steps=arguments.steps, threads=arguments.threads))
+    options = DemoOptions(steps=arguments.steps, threads=arguments.threads)
+    with TrainingProgress() as progress:
+        result = run_demo(arguments.out, options, [progress])
     Console().print(result_table(result))
     print(f"truth, render, error  {result.images / 'sheet.png'}")
     print(f"test views            {result.images}")

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.cli.progress_bar import ProgressBar
+from dyngs.cli.output import ProgressBar, print_lines
 from dyngs.cli.view import add_serving_arguments
-from dyngs.core.errors import DyngsError, as_word, counted, show
+from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.config import Config
+    from dyngs.training.events import Listener
     from dyngs.training.processes import Processes
     from dyngs.view.training import TrainingView
 
@@ -81,10 +82,11 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
     if arguments.port is not None and not arguments.view:
         raise DyngsError("--port goes with --view")
     from dyngs.api.train import train
-    from dyngs.models.kind import Predicts, capability
+    from dyngs.cli.training_progress import TrainingProgress
 
     with ExitStack() as stack:
-        listeners = [stack.enter_context(_view(arguments, config))] if arguments.view else []
+        listeners: list[Listener] = [stack.enter_context(TrainingProgress())]
+        listeners += [stack.enter_context(_view(arguments, config))] if arguments.view else []
         folder = train(
             config,
             resume_from=arguments.resume,
@@ -96,6 +98,8 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
         print(line)
     word = as_word(folder)
     print(f"trained: {folder}")
+    from dyngs.models.kind import Predicts, capability
+
     if capability(config.model, Predicts) is not None:
         print(f"next:    dyngs predict {word} CAPTURE --out RUN")
     else:
@@ -113,7 +117,7 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.server import Serving
     from dyngs.view.training import TrainingView
 
-    return TrainingView(config, Serving(arguments.host, arguments.port), show)
+    return TrainingView(config, Serving(arguments.host, arguments.port), print_lines)
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:

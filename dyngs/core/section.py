@@ -42,6 +42,25 @@ class ModelSection(Section):
         kind: Any = None
         """Name of the kind."""
 
+    @property
+    def added_for_motion(self) -> int:
+        """Number of Gaussians that are added when motion begins."""
+        return 0
+
+    @property
+    def moving_bytes(self) -> int:
+        """Bytes of memory of a Gaussian in training next to its own values, where it moves."""
+        return 0
+
+    def size_key(self, count: int) -> tuple[str, float, float]:
+        """Return the key that limits the number of Gaussians, its value at ``count`` of them, and
+        the power of the number with which that goes."""
+        return "strategy.max_gaussians", count, 1.0
+
+    def moves_after(self, steps: int) -> int | None:
+        """Return the last step without motion in a run of ``steps``; None: nothing moves."""
+        return None
+
 
 class SceneModel(ModelSection):
     """Keys that all models of Gaussians share: how these are coloured and drawn."""

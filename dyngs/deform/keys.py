@@ -106,6 +106,11 @@ class FreeField(Section):
 DeformField = HexplaneField | MlpField | ControlNodesField | FreeField
 
 
+MIN_STATIC_STEPS = 1000
+"""Steps that a static model needs to show where it fails; short runs spend at most a third on
+it."""
+
+
 class DynamicModel(SceneModel):
     """Canonical Gaussians and a deformation field over time (docs/dynamic.md)."""
 
@@ -166,3 +171,12 @@ class DynamicModel(SceneModel):
         if not isinstance(self.deform, FreeField):
             return self.num_random_moving
         return 2 * self.num_random_moving + COPIES_OF_MOVING
+
+    def moves_after(self, steps: int) -> int:
+        shortest = min(MIN_STATIC_STEPS, steps // 3)
+        return min(max(1, round(self.motion_from * steps), shortest), steps)
+
+    @property
+    def moving_bytes(self) -> int:
+        # features from space-time grids, or neurons of a network, of each Gaussian
+        return 200 if isinstance(self.deform, (ControlNodesField, FreeField)) else 2000

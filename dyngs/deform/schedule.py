@@ -8,9 +8,6 @@ from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians.schedule import Rates
 from dyngs.models.schedule import Length
 
-MIN_COARSE_STEPS = 1000
-"""Steps that a static model needs to show where it fails; short runs spend at most a third on
-it."""
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all
 times."""
@@ -24,7 +21,7 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     nothing.
     """
     steps = rates.steps
-    fine = min(max(1, round(model.motion_from * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
+    fine = model.moves_after(steps)
     opens = max(fine, round(model.time_window_grows_from * steps))
     full = max(opens, round(model.time_window_full_at * steps))
     decays = full if model.time_window < 1 else fine
@@ -50,7 +47,7 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
             "time_window_full_at": length.kept(old.full),
         }
     changed = model.model_copy(update=fractions)
-    begins = deform_schedule(changed, Rates(length.steps)).fine
+    begins = changed.moves_after(length.steps)
     if old.fine <= length.done < begins:
         raise DyngsError(
             f"train.steps={length.steps}: motion began after {old.fine:,} steps, and a run of {length.steps:,} trains "

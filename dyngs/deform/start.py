@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
-from dyngs.deform.fixed_cameras.changes import Footage, footage_of
+from dyngs.deform.bodies.paths import Shots, one_camera, shots_of
+from dyngs.deform.fixed_cameras.hulls import Footage, footage_of
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
 from dyngs.deform.scene import DynamicScene

@@ -77,6 +77,15 @@ class HumanModel(_OnTemplate):
         description="weight of the squared difference between neighbours' offsets, cm^2",
     )
 
+    @property
+    def moving_bytes(self) -> int:
+        """Bytes of its anchor, weights of joints, their gradients, and the Gaussian in a pose, where
+        the body fit is refined."""
+        return 2600
+
+    def size_key(self, count: int) -> tuple[str, float, float]:
+        return "model.resolution", self.resolution, 0.5
+
 
 class HumanPredictorModel(_OnTemplate):
     """A network that predicts people from a few images, trained on others

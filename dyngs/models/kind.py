@@ -138,34 +138,21 @@ class HasGaussians(ModelKind):
     speeds_up_short_runs: ClassVar[bool] = False
     """Learning rates are higher in shorter runs, see ``optim.rate_factor``."""
 
-    def num_added(self, section: Any) -> int:
-        """Return the number of Gaussians that are added whatever the strategy allows."""
-        return 0
-
     def adding(self, section: SceneModel, most: int) -> SceneModel:
-        """Return the section with which at most so many are added."""
+        """Return the section with which at most so many are added whatever the strategy allows."""
         return section
+
+
+class LimitsSize(HasGaussians):
+    """The size of its file follows from the number of its Gaussians."""
 
     def num_shared(self, section: Any, num_times: int, num_moving: int = 0) -> int:
         """Return the number of values that it learns next to those of its Gaussians."""
         return 0
 
-    def moving_bytes(self, section: Any) -> int:
-        """Return the bytes of memory that a Gaussian takes in training for being moved."""
-        return 0
-
-    def count_limit(self, section: Any) -> tuple[str, int] | None:
-        """Return the key that decides the number of Gaussians, and its value; None: the strategy
-        does."""
-        return None
-
 
 class Moves(ModelKind):
     """Moves over the times of the capture, after a while as a static model."""
-
-    @abstractmethod
-    def motion_begins_after(self, section: Any, steps: int) -> int:
-        """Return the last step without motion in a run of ``steps``."""
 
 
 class ExtendsTo(ModelKind):
@@ -222,9 +209,3 @@ def capability(section: ModelSection, wanted: type[C]) -> C | None:
     """Return the kind of a section if it has a capability, else None."""
     kind = kind_of(section)
     return kind if isinstance(kind, wanted) else None
-
-
-def motion_begins_after(section: ModelSection, steps: int) -> int | None:
-    """Return the last step without motion in a run of ``steps``; None where nothing will move."""
-    moves = capability(section, Moves)
-    return None if moves is None else moves.motion_begins_after(section, steps)

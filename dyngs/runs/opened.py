@@ -15,12 +15,14 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
+from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
-from dyngs.export.camera_paths.aim import up_direction
+from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
-from dyngs.io.formats.splat_file import Nonfinite, drawing_options
+from dyngs.io.formats.splat_file import Nonfinite
 from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.kind import HasBody, capability
@@ -31,7 +33,6 @@ from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
 from dyngs.static.keys import StaticModel
-from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dyngs.models.kind import HasGaussians
+from dyngs.models.kind import LimitsSize
 from dyngs.static.keys import StaticModel
 
 if TYPE_CHECKING:
     from dyngs.models.kind import Restore, Start
 
 
-class StaticKind(HasGaussians):
+class StaticKind(LimitsSize):
     """See the module."""
 
-    uses = HasGaussians.uses | {"init.scene"}
+    uses = LimitsSize.uses | {"init.scene"}
     speeds_up_short_runs = True
 
     def functions(self) -> tuple[Start, Restore]:
-        from dyngs.static.training import restore, start
+        from dyngs.gaussians.static_training import restore, start
 
         return start, restore
 

@@ -13,10 +13,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from statistics import fmean
 
 from dyngs.config import Config
-from dyngs.models.kind import motion_begins_after
 from dyngs.models.schedule import image_divisor, scaled
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 6.0, 300.0, 7e-4
@@ -70,32 +70,17 @@ class SaveTimer:
         self._duration = end - begin
 
 
-def with_steps(config: Config, steps: int) -> Config:
-    """Return ``config`` with another ``train.steps``, which all schedules follow."""
-    return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
-
-
-def full_pixels(config: Config | None, step: int, drawn: float) -> float:
-    """Return the pixels at full size of an image of which ``drawn`` are drawn at ``step``."""
-    return drawn if config is None else drawn * image_divisor(config.train, max(step, 1)) ** 2
-
-
-def step_cost(config: Config | None, step: int, pixels: float, num_gaussians: float) -> float:
+def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) -> float:
     """Return the cost of ``step``, whose image has so many pixels at full size; only ratios mean
-    something.
-
-    ``config`` None: the cost does not depend on the step.
-    """
-    factor = 1.0
-    if config is not None:
-        pixels = pixels / image_divisor(config.train, max(step, 1)) ** 2
-        begins = motion_begins_after(config.model, config.train.steps)
-        factor = MOTION if begins is not None and step > begins else 1.0
-    return factor * (FIXED + PER_MEGAPIXEL * 1e-6 * pixels + PER_GAUSSIAN * num_gaussians)
+    something."""
+    drawn = pixels / image_divisor(config.train, max(step, 1)) ** 2
+    cost = FIXED + PER_MEGAPIXEL * 1e-6 * drawn + PER_GAUSSIAN * num_gaussians
+    begins = config.model.moves_after(config.train.steps)
+    return cost if begins is None or step <= begins else MOTION * cost
 
 
 def cost_between(
-    config: Config | None, done: int, end: int, pixels: float, num_gaussians: Callable[[int], float]
+    config: Config, done: int, end: int, pixels: float, num_gaussians: Callable[[int], float]
 ) -> float:
     """Return the cost of the steps after ``done`` up to ``end``, with ``num_gaussians`` (step)
     Gaussians."""
@@ -106,8 +91,7 @@ def cost_between(
 
 @dataclass(frozen=True)
 class _Mark:
-    """A point of a run: steps done, seconds of training, the cost of the steps up to it as
-    predicted, Gaussians."""
+    """A point of a run: steps done, seconds of training, cost of the steps up to it, Gaussians."""
 
     step: int
     seconds: float
@@ -116,73 +100,63 @@ class _Mark:
 
 
 class Forecast:
-    """Prediction of the seconds that a run still takes, by its pace so far."""
+    """Prediction of the seconds that a run still takes, by its pace so far.
 
-    def __init__(self, done: int, seconds: float, num_gaussians: int = 0) -> None:
-        self._pixels = 0.0
-        self._marks = [_Mark(done, seconds, 0.0, num_gaussians)]
+    Args:
+        pixels: of a training image at full size.
+    """
 
-    def restart(self, step: int, seconds: float, num_gaussians: int = 0) -> None:
-        """Measure the pace from here on: the first step loads and compiles what others find
-        there."""
+    def __init__(self, step: int, seconds: float, num_gaussians: int, pixels: float) -> None:
+        self.pixels = pixels
         self._marks = [_Mark(step, seconds, 0.0, num_gaussians)]
 
     def pause(self, seconds: float) -> None:
+        """Leave ``seconds`` that were not spent training out."""
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 
-    def observe(
-        self, config: Config | None, step: int, seconds: float, num_gaussians: int, drawn: int = 0
-    ) -> None:
+    def observe(self, config: Config, step: int, seconds: float, num_gaussians: int) -> None:
         last = self._marks[-1]
-        self._pixels = full_pixels(config, step, drawn)
-        cost = last.cost + (step - last.step) * step_cost(config, step, self._pixels, num_gaussians)
-        self._marks.append(_Mark(step, seconds, cost, num_gaussians))
+        cost = (step - last.step) * step_cost(config, step, self.pixels, num_gaussians)
+        self._marks.append(_Mark(step, seconds, last.cost + cost, num_gaussians))
 
-    def seconds(self, config: Config | None, total: int, done: int | None = None) -> float:
+    @property
+    def mean_step(self) -> float:
+        """Mean seconds of a step so far."""
+        first = self._marks[0]
+        now = self._marks[-1]
+        return (now.seconds - first.seconds) / max(now.step - first.step, 1)
+
+    def pace(self, since: int = 0) -> float:
+        """Return the seconds per unit of cost since the mark at index ``since``."""
+        first = self._marks[since]
+        now = self._marks[-1]
+        return (now.seconds - first.seconds) / max(now.cost - first.cost, 1e-9)
+
+    def seconds(self, config: Config, total: int, done: int | None = None) -> float:
         """Return the seconds until step ``total`` of a run of ``config``, by the pace of the second
         half so far."""
-        first = self._marks[0]
         now = self._marks[-1]
         done = now.step if done is None else done
         if done >= total or now.cost == 0:
             return 0.0
-        middle = (first.step + now.step) / 2
-        since = next((m for m in reversed(self._marks[:-1]) if m.step <= middle), first)
-        cost = cost_between(
-            config, done, total, self._pixels, lambda step: self._expected(config, step, since)
-        )
-        return cost * (now.seconds - since.seconds) / max(now.cost - since.cost, 1e-9)
+        middle = len(self._marks) // 2 if len(self._marks) > 2 else 0
+        expected = partial(self._expected, config, self._marks[middle])
+        return self.pace(middle) * cost_between(config, done, total, self.pixels, expected)
 
-    def least_seconds(self, config: Config, steps: int) -> float:
-        """Return the seconds of a run of ``steps`` whose steps become dearer by larger images
-        alone."""
-        first = self._marks[0]
-        now = self._marks[-1]
-        pace = (now.seconds - first.seconds) / max(now.cost - first.cost, 1e-9)
-        train = with_steps(config, steps).train
-        sampled = [math.ceil(steps * (i + 0.5) / SAMPLES) for i in range(SAMPLES)]
-        pixels = [self._pixels / image_divisor(train, step) ** 2 for step in sampled]
-        return steps * pace * fmean(step_cost(None, 0, x, now.num_gaussians) for x in pixels)
-
-    def _expected(self, config: Config | None, step: int, since: _Mark) -> float:
+    def _expected(self, config: Config, since: _Mark, step: int) -> float:
         """Return how many Gaussians are expected at ``step``.
 
         They go on growing as since ``since`` until densification ends, and larger images hold
         detail for more; at most up to the configured cap.
         """
         now = self._marks[-1]
-        if config is None:
-            return now.num_gaussians
         stop = scaled(config.strategy.stop, config.train.steps)
         if now.step >= stop:
             return now.num_gaussians
-        added = max(now.num_gaussians - since.num_gaussians, 0) if since.num_gaussians else 0
-        grown = now.num_gaussians + added / max(now.step - since.step, 1) * max(
-            min(step, stop) - now.step, 0
-        )
-        before, after = (
-            image_divisor(config.train, max(s, 1)) for s in (now.step, min(step, stop))
-        )
-        return max(
-            now.num_gaussians, min(grown * (before / after) ** DETAIL, config.strategy.growth_limit)
-        )
+        added = max(now.num_gaussians - since.num_gaussians, 0) / max(now.step - since.step, 1)
+        end = min(step, stop)
+        grown = now.num_gaussians + added * max(end - now.step, 0)
+        before = image_divisor(config.train, max(now.step, 1))
+        after = image_divisor(config.train, max(end, 1))
+        limit = min(grown * (before / after) ** DETAIL, config.strategy.growth_limit)
+        return max(now.num_gaussians, limit)

@@ -9,15 +9,13 @@ from __future__ import annotations
 from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.models.kind import HasGaussians, capability, kind_of
-from dyngs.training.processes import Processes
+from dyngs.models.kind import HasGaussians, LimitsSize, capability, kind_of
 
 # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 RANDOM_FRACTION = 0.1
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
 """Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in
 docs/storage.md."""
-CLOSE = 0.8  # Fraction of the limit from which the limit counts as having held growth back
 FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 
@@ -48,13 +46,9 @@ def _given(config: Config) -> dict[str, object]:
     found: dict[str, object] = {
         key: x for key, x in _of_single_images(config).items() if x == "always"
     }
-    limits = config.budget.model_dump()
-    found |= {f"budget.{key}": x for key, x in limits.items() if x is not None}
-    found |= {
-        f"prune.{key}": getattr(config.prune, key)
-        for key in ("fraction", "mask_times")
-        if config.prune.is_wanted and getattr(config.prune, key)
-    }
+    for name, section in (("budget", config.budget), ("prune", config.prune)):
+        given = section.model_dump(exclude_defaults=True, exclude={"steps", "score"})
+        found |= {f"{name}.{key}": value for key, value in given.items()}
     if config.train.minutes is not None:
         found["train.minutes"] = config.train.minutes
     if config.train.batch_size > 1:
@@ -72,33 +66,13 @@ def _of_single_images(config: Config) -> dict[str, str]:
     }
 
 
-def shared(config: Config, processes: Processes) -> Config:
-    """Return ``config`` for so many processes: with one view for each of them where one per step
-    was asked for."""
-    if processes.size == 1:
-        return config
-    minutes = config.train.minutes
-    if minutes is not None:
-        raise DyngsError(
-            f"train.minutes={minutes:g}: is measured with one process; leave it out, or start without torchrun"
-        )
-    if config.train.batch_size == 1:
-        config = config.model_copy(
-            update={"train": config.train.model_copy(update={"batch_size": processes.size})}
-        )
-    processes.share(config.train.batch_size)
-    return config
-
-
-def within_cap(config: Config, num_times: int) -> Config:
-    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where
-    it has none."""
-    cap = most_gaussians(config, num_times)
+def within_cap(config: Config, cap: int | None) -> Config:
+    """Return ``config`` with all numbers of Gaussians lowered to ``cap``; None: as it is."""
     changes = {}
     if cap is None:
         return config
+    added = config.model.added_for_motion
     made_of = capability(config.model, HasGaussians)
-    added = 0 if made_of is None else made_of.num_added(config.model)
     if made_of is not None and added:
         added = min(added, int(RANDOM_FRACTION * cap))
         changes["model"] = made_of.adding(config.model, added)
@@ -111,14 +85,13 @@ def most_gaussians(config: Config, num_times: int) -> int | None:
     one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     megabytes = config.budget.max_mb
-    made_of = capability(config.model, HasGaussians)
-    if megabytes is not None and made_of is not None:
-        is_counted = made_of.count_limit(config.model) is None
-        limits += [room(config, made_of, num_times, megabytes)] if is_counted else []
+    by_size = capability(config.model, LimitsSize)
+    if megabytes is not None and by_size is not None:
+        limits.append(room(config, by_size, num_times, megabytes))
     return min(limits, default=None)
 
 
-def room(config: Config, made_of: HasGaussians, num_times: int, megabytes: float) -> int:
+def room(config: Config, kind: LimitsSize, num_times: int, megabytes: float) -> int:
     """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual
     precision.
 
@@ -127,7 +100,7 @@ def room(config: Config, made_of: HasGaussians, num_times: int, megabytes: float
     """
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
     fixed, whole = (
-        FIELD_BYTES * made_of.num_shared(config.model, num_times, moving) for moving in (0, 1)
+        FIELD_BYTES * kind.num_shared(config.model, num_times, moving) for moving in (0, 1)
     )
     each += whole - fixed  # if all move
     found = int((1e6 * megabytes - fixed) / each)

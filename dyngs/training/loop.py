@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType, TracebackType
 from typing import Any, Protocol
 
@@ -19,14 +19,17 @@ from dyngs.training.events import (
     Started,
     StepDone,
     StepReport,
+    TopologyChanged,
     TotalChanged,
 )
+from dyngs.training.trainer import Edit
 
 
 class Trainable(Protocol):
     """Interface of the trainers that the loop runs: of a scene, or of a network that predicts
     scenes."""
 
+    config: Any
     done: int
     """Steps done."""
 
@@ -50,6 +53,10 @@ class Trainable(Protocol):
         """Train on one image, or one choice of them."""
         ...
 
+    def apply(self, edit: Edit) -> None:
+        """Change the training between two steps."""
+        ...
+
     def checkpoint(self) -> Checkpoint:
         """Return everything that ``restore`` needs."""
         ...
@@ -59,16 +66,19 @@ class Trainable(Protocol):
         ...
 
 
+Editor = Callable[["Loop"], Edit | None]
+"""Returns the change of the training that it requests between two steps, if any."""
+
+
 class Loop:
-    """Steps of a trainer, told to listeners in their order.
+    """Steps of a trainer, and events for listeners in their order.
 
     Args:
         watch: seconds of training.
         advice: added to the message of a step that fails.
-
-    Attributes:
-        trainer: a listener may exchange it for one on other schedules.
-        before_step: is told the trainer of each step that is about to begin.
+        stages: editors that are asked before each step.
+        limits: editors that are asked after each step, before its event.
+        before_step: called with the trainer before each step.
     """
 
     def __init__(
@@ -77,36 +87,57 @@ class Loop:
         total: int,
         watch: Stopwatch,
         advice: Callable[[], str] | None = None,
+        *,
+        stages: Sequence[Editor] = (),
+        limits: Sequence[Editor] = (),
+        before_step: Callable[[Trainable], None] = lambda _: None,
     ) -> None:
-        self.trainer, self.total, self.watch = trainer, total, watch
+        self.trainer = trainer
+        self.total = total
+        self.watch = watch
         self._advice = advice
-        self.before_step: Callable[[Trainable], None] = lambda _: None
+        self._stages = stages
+        self._limits = limits
+        self._before_step = before_step
         self._listeners: list[Listener] = []
 
     def subscribe(self, *listeners: Listener) -> None:
         self._listeners += listeners
 
-    def tell(self, event: Event) -> None:
+    def emit(self, event: Event) -> None:
         for listener in self._listeners:
             listener(event)
 
-    def expect(self, total: int) -> None:
-        """Do another number of steps from now on."""
-        self.total = total
-        self.tell(TotalChanged(total))
-
     def run(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
         """Step until the end, or until ``is_stopped`` between two steps."""
-        self.tell(Started(self.trainer.done, self.total))
+        self.emit(Started(self.trainer.done, self.total))
         while self.trainer.done < self.total and not is_stopped():
+            self._edit(self._stages)
             report = self._step()
             for line in (report.finding or "").splitlines():
-                self.tell(Message(f"step {report.step}: {line}"))
-            self.tell(StepDone(report, self))
+                self.emit(Message(f"step {report.step}: {line}"))
+            self._edit(self._limits)
+            self.emit(StepDone(report, self))
+
+    def _edit(self, editors: Sequence[Editor]) -> None:
+        for editor in editors:
+            edit = editor(self)
+            if edit is None:
+                continue
+            trainer = self.trainer
+            before = trainer.num_gaussians
+            trainer.apply(edit)
+            if edit.message:
+                self.emit(Message(f"step {trainer.done}: {edit.message}"))
+            if edit.steps is not None:
+                self.total = edit.steps
+                self.emit(TotalChanged(self.total))
+            elif edit.kept is not None or edit.stops_growing:
+                self.emit(TopologyChanged(trainer.done, before, trainer.num_gaussians))
 
     def _step(self) -> StepReport:
         try:
-            self.before_step(self.trainer)
+            self._before_step(self.trainer)
             return self.trainer.step()
         except DyngsError as error:
             if self._advice is None:

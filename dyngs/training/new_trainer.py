@@ -16,10 +16,9 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.gaussians.start import FirstGaussians
+from dyngs.gaussians.start import FirstGaussians, surroundings
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.kind import Moves, Predicts, RunStart, capability, kind_of
 from dyngs.models.renderable import Renderable
@@ -34,13 +33,12 @@ from dyngs.ops.device import device_for
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import exposures_of
 from dyngs.training.corrections.robust import RobustMasks
-from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.prediction import network_trainer
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
-from dyngs.training.trainer import Trainer, ViewSampler
+from dyngs.training.trainer import Parts, Trainer
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -60,12 +58,16 @@ def build(
     *,
     restored: bool = False,
     first: FirstGaussians | None = None,
+    uncapped: Config | None = None,
+    images: ImageLoader | None = None,
 ) -> Trainable:
     """Return what the loop steps; see ``assemble`` for arguments and errors."""
     network = capability(config.model, Predicts)
     if network is not None:
         return network_trainer(config, network)
-    return assemble(config, capture, restored=restored, first=first)
+    return assemble(
+        config, capture, restored=restored, first=first, uncapped=uncapped, images=images
+    )
 
 
 def assemble(
@@ -76,6 +78,7 @@ def assemble(
     images: ImageLoader | None = None,
     held_out: frozenset[int] = frozenset(),
     first: FirstGaussians | None = None,
+    uncapped: Config | None = None,
 ) -> Trainer[Any]:
     """Return the trainer of a scene: its model begun, nothing trained.
 
@@ -86,11 +89,11 @@ def assemble(
         images: the training images of another trainer of the same ones; None: they are opened.
         held_out: indices of training views that are never trained on.
         first: Gaussians that it goes on from; None: it begins as ``config.init`` says.
+        uncapped: the config without the limits of the run: it may begin with more Gaussians than it
+            may end with; None: the same.
     """
     if capture is None:
         capture = read_capture(config.data) if restored else prepared(config)
-    asked = config
-    config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
@@ -101,46 +104,47 @@ def assemble(
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
     extent = surroundings(capture).extent
-    model = kind_of(config.model).start(
-        RunStart(config, asked, capture, images, background, extent, generator, first)
-    )
-    # before what asks the images for corrected cameras
-    refinement = _refinement(config, images, extent)
-    robust = _robust(config, capture, images)
-    exposures = exposures_of(config.train, images)
-    early = _early_opacity(config, capture, images, background)
     findings: list[str] = []
     if capture.has_alpha and config.train.alpha_weight == 0 and background != "random":
         findings = [
             f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
             "may be transparent"
         ]
-    losses = [
-        model.colour_loss or ImageLoss(config.train.ssim_weight),
-        SilhouetteLoss(config.train.alpha_weight, early, FULL_OPACITY_FROM * config.train.steps),
-        PenaltyLoss(),
-        *([] if exposures is None else [exposures]),
-        priors,
-        RegularizerLoss(),
-    ]
-    trainer = Trainer(
+    early = _early_opacity(config, capture, images, background)
+
+    def parts(config: Config) -> Parts:
+        start = RunStart(
+            config, uncapped or config, capture, images, background, extent, generator, first
+        )
+        model = kind_of(config.model).start(start)
+        # before what asks the images for corrected cameras
+        refinement = _refinement(config, images, extent)
+        robust = _robust(config, capture, images)
+        exposures = exposures_of(config.train, images)
+        weight = config.train.alpha_weight
+        losses = [
+            model.colour_loss or ImageLoss(config.train.ssim_weight),
+            SilhouetteLoss(weight, early, FULL_OPACITY_FROM * config.train.steps),
+            PenaltyLoss(),
+            *([] if exposures is None else [exposures]),
+            priors,
+            RegularizerLoss(),
+        ]
+        found = (robust, exposures, refinement)
+        return Parts(model, losses, [x for x in found if x is not None])
+
+    return Trainer(
         config=config,
-        model=model,
+        parts_of=parts,
         capture=capture,
         images=images,
-        sampler=ViewSampler(len(images)),
         background=background,
         extent=extent,
-        losses=losses,
         generator=generator,
-        held_out=held_out,
         findings=[*([] if restored else findings), *priors.lines],
-        robust=robust,
-        exposures=exposures,
-        refinement=refinement,
+        held_out=held_out,
+        device=device_for(config.run.device),
     )
-    trainer.place(device_for(config.run.device))
-    return trainer
 
 
 def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
@@ -197,8 +201,8 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
 
 
 def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors:
-    """Return the priors of the capture that are used; none for kinds that use
-    none."""
+    """Return the priors of the capture that are used; none for people, whose poses say how they
+    move."""
     if "train.priors" not in kind_of(config.model).uses:
         return UsedPriors()
     moves = capability(config.model, Moves) is not None and len(set(training_times(capture))) > 1

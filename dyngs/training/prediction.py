@@ -17,7 +17,7 @@ from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, se
 from dyngs.models.kind import Predicts
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
-from dyngs.training.trainer import ViewSampler
+from dyngs.training.trainer import Edit, ViewSampler
 
 WARM_UP = 0.05  # Fraction of the run in which the highest learning rate is reached
 WEIGHT_DECAY = 1e-5  # Weight decay of AdamW
@@ -62,6 +62,9 @@ class NetworkTrainer:
         """Do a step of AdamW; none for gradients that are not finite."""
         rate = rate_at(self.learner.lr, step, self.config.train.steps)
         self.bad_gradients += not updated(self.optimizer, self.learner.network, loss, rate)
+
+    def apply(self, edit: Edit) -> None:
+        """Do nothing: no limit is for networks."""
 
     def checkpoint(self) -> Checkpoint:
         network = self.learner.network

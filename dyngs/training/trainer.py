@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
+from itertools import islice
 from operator import add
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,17 +21,16 @@ from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
+from dyngs.models.correction import Correction, RenderedView
 from dyngs.models.model import Look, Loss, Model
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import CPU, sent
-from dyngs.training.corrections.camera_refinement import CameraRefinement, watched
-from dyngs.training.corrections.exposure import ViewExposures
-from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.events import StepReport
 from dyngs.training.losses import StepCheck
+from dyngs.training.plan import with_steps
 from dyngs.training.processes import Processes
 
 
@@ -60,13 +60,8 @@ class ViewSampler:
     def coming(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
         """Return up to ``count`` views of this epoch that come next, by what is ``wanted`` now;
         nothing is drawn."""
-        found: list[int] = []
-        for index in self._order[self._position :].tolist():
-            if len(found) == count:
-                break
-            if wanted(index):
-                found.append(index)
-        return found
+        rest = self._order[self._position :].tolist()
+        return list(islice(filter(wanted, rest), count))
 
     def state(self) -> dict[str, Tensor]:
         return {"order": self._order, "position": torch.tensor([self._position], device="cpu")}
@@ -74,41 +69,87 @@ class ViewSampler:
     def load_state(self, state: dict[str, Tensor]) -> None:
         order = require_indices("order", state["order"], (None,), self.num_views)
         position = require_indices("position", state["position"], (1,), len(order) + 1)
-        self._order, self._position = order.clone(), int(position)
+        self._order = order.clone()
+        self._position = int(position)
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A change of a training between two steps, as a limit or the pruning stage requests it.
+
+    Attributes:
+        message: what is changed, and what it costs.
+        kept: (N,) bool, the Gaussians that stay; None: all.
+        masks: times at which Gaussians are visible; None: they are always drawn.
+        stops_growing: the set of Gaussians stays as it is from now on.
+        steps: another length of the run, which all schedules follow; None: as it is.
+        config: the same run with other options of drawing or pruning; None: as it is.
+    """
+
+    message: str = ""
+    kept: Tensor | None = None
+    masks: Any = None
+    stops_growing: bool = False
+    steps: int | None = None
+    config: Config | None = None
 
 
 M = TypeVar("M", bound=Model[Any])
 
 
+class Parts(NamedTuple):
+    """What follows the schedules of a run.
+
+    The order of the losses decides the last bits of gradients.
+    """
+
+    model: Any
+    losses: Sequence[Loss]
+    corrections: Sequence[Correction]
+
+
 @dataclass
 class Trainer(Generic[M]):
-    """A run in memory: everything that a step reads and changes."""
+    """A run in memory: everything that a step reads and changes.
+
+    Attributes:
+        parts_of: begins model, losses and corrections on the schedules of a config.
+        background: "white", "black" or "random" (a new colour in each step, behind render and
+            image alike).
+        findings: lines that are reported with the next step.
+        bad_gradients: how often something was left out of a step because its gradient was not
+            finite.
+        held_out: indices of the training views that are not trained on.
+        processes: that take a fraction of the views of each step.
+        device: where the model is trained; see ``place``.
+    """
 
     config: Config
-    model: M
+    parts_of: Callable[[Config], Parts]
     capture: Capture
     images: ImageLoader
-    sampler: ViewSampler
-    # "white", "black" or "random" (a new colour in each step, behind render and truth alike)
     background: str
     extent: float
-    # terms of the loss, in an order that decides the last bits of its gradients
-    losses: Sequence[Loss]
     generator: torch.Generator
-    findings: list[str] = field(default_factory=list)  # lines that are told with the next step
-    # masks of what disagrees with the other views; None: all pixels count
-    robust: RobustMasks | None = None
-    # affine colours of the training images; None: they agree
-    exposures: ViewExposures | None = None
-    # of the cameras; None: they stay as the capture has them
-    refinement: CameraRefinement | None = None
-    done: int = 0
-    # how often something was left out of a step because its gradient was not finite
-    bad_gradients: Count = 0
-    held_out: frozenset[int] = frozenset()  # indices of the training views that are not trained on
-    # that take a fraction of the views of each step; one: this
+    findings: list[str] = field(default_factory=list)
+    held_out: frozenset[int] = frozenset()
+    device: torch.device = CPU
     processes: Processes = field(default_factory=Processes)
-    device: torch.device = CPU  # where the model is trained; see ``place``
+    done: int = field(default=0, init=False)
+    bad_gradients: Count = field(default=0, init=False)
+    sampler: ViewSampler = field(init=False)
+    model: M = field(init=False)
+    losses: Sequence[Loss] = field(init=False)
+    corrections: Sequence[Correction] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sampler = ViewSampler(len(self.images))
+        self._begin(self.config)
+
+    def _begin(self, config: Config) -> None:
+        self.config = config
+        self.model, self.losses, self.corrections = self.parts_of(config)
+        self.place(self.device)
 
     @property
     def has_test_views(self) -> bool:
@@ -136,12 +177,10 @@ class Trainer(Generic[M]):
         self.done = step
         if updated.is_rearranged:
             self.processes.require_same(tensors_of(self.model.scene.state()), f"after step {step}")
-        finding = (
-            "\n".join([*self.findings, *([] if updated.finding is None else [updated.finding])])
-            or None
-        )
+        findings = [*self.findings, updated.finding or ""]
         self.findings.clear()
-        return replace(reports[0], loss=loss, finding=finding)
+        finding = "\n".join(line for line in findings if line)
+        return replace(reports[0], loss=loss, finding=finding or None)
 
     def _averaged(self, step: int, losses: Sequence[float]) -> float:
         """Return the mean loss over the views of a step, and average their gradients, too."""
@@ -161,27 +200,26 @@ class Trainer(Generic[M]):
         """Add the gradients of the image of view ``index`` to those that are there, and return how
         it was drawn."""
         image = self._image(index, step)
+        for correction in self.corrections:
+            image = correction.before_render(image)
         background = sent(background_colour(self.background, self.generator), self.device)
         depth = any(loss.needs_depth(image) for loss in self.losses)
         drawn = self.model.draw(image, step, background, depth=depth)
-        rendering = drawn.rendering
-        image = drawn.image or image
-        if self.robust is not None:
-            draw = self._drawn_with_depth(background)
-            time = image.time
-            image = self.robust.masked(
-                index,
-                step,
-                image,
-                rendering.rgb[0],
-                background,
-                lambda cameras: draw(cameras, time),
-            )
-        rendered = rendering.rgb[0]
+        view = RenderedView(
+            index,
+            step,
+            drawn.image or image,
+            drawn.rendering,
+            drawn.rendering.rgb[0],
+            background,
+            self._drawn_with_depth(background),
+            self._wanted(step),
+        )
+        for correction in self.corrections:
+            view = correction.after_render(view)
+        image = view.image
+        rendered = view.rendered
         truth = image.composite(background)
-        if self.exposures is not None:
-            self.exposures.begin(step, self._wanted(step), self._drawn_with_depth(background))
-            rendered = self.exposures.applied((index, step), image, rendering, background)
         look = Look(index, step, image, drawn, rendered, truth, self.model, self.generator)
         terms: dict[str, Tensor] = {}
         for loss in self.losses:
@@ -192,13 +230,49 @@ class Trainer(Generic[M]):
             reduce(add, terms.values()).backward()
         value = check.loss(step, image, self.model.moves_by)
         drawn.after_backward()
-        if self.exposures is not None:
-            self.bad_gradients = self.bad_gradients + self.exposures.optimize(index, step)
-        if self.refinement is not None:
-            self.bad_gradients = self.bad_gradients + self.refinement.optimize(
-                step, index, image.cameras
-            )
+        for correction in self.corrections:
+            bad = correction.after_backward(index, step, image)
+            self.bad_gradients = self.bad_gradients + bad
         return StepReport(step, value, image, rendered.detach(), truth)
+
+    def apply(self, edit: Edit) -> None:
+        """Change the training between two steps."""
+        model: Any = self.model
+        if edit.steps is not None:
+            self._rescale(edit.steps)
+        if edit.config is not None:
+            self.config = edit.config
+            model.draw_as(edit.config.model)
+        if edit.stops_growing:
+            model.exchange(model.scene.unmasked())
+            model.stop_growing()
+        if edit.kept is not None:
+            model.keep(edit.kept, self.done)
+        if edit.masks is not None:
+            model.exchange(replace(model.scene, masks=edit.masks))
+
+    def _rescale(self, steps: int) -> None:
+        config = with_steps(self.config, steps)
+        if steps <= self.done:
+            self.config = config
+            return
+        step = self.done + 1
+        seen = self.model.window(step)
+        self.begin_again(config, self.checkpoint())
+        self.model.extend(seen, step)
+
+    def begin_again(self, config: Config, checkpoint: Checkpoint) -> None:
+        """Go back to ``checkpoint``, on the schedules of ``config``."""
+        self._begin(config)
+        self.restore(checkpoint)
+
+    def join(self, processes: Processes) -> None:
+        """Train together with other processes from now on."""
+        self.processes = processes
+
+    def hold_out(self, indices: Sequence[int]) -> None:
+        """Train on other views than these from now on."""
+        self.held_out = frozenset(indices)
 
     @property
     def info(self) -> CheckpointInfo:
@@ -210,7 +284,7 @@ class Trainer(Generic[M]):
 
     def checkpoint(self) -> Checkpoint:
         state = self.model.state()
-        for name, part in self._parts().items():
+        for name, part in self._image_parts().items():
             state |= prefixed(name, with_role(part.state(), Role.TRAINING))
         state |= with_role({"rng": self.generator.get_state()}, Role.TRAINING)
         tensors = {name: x.cpu() for name, x in tensors_of(state).items()}
@@ -221,7 +295,7 @@ class Trainer(Generic[M]):
         with reading(checkpoint.name, OTHER_CONFIG):
             try:
                 self.model.restore(checkpoint)
-                for name, part in self._parts().items():
+                for name, part in self._image_parts().items():
                     part.load_state(checkpoint.part(name))
                 self.generator.set_state(checkpoint.tensors["rng"])
             except KeyError as missing:
@@ -232,21 +306,14 @@ class Trainer(Generic[M]):
     def place(self, device: torch.device) -> None:
         """Go on on ``device``: with the model and the images.
 
-        What belongs to single images stays on the CPU: exposures, corrections of cameras, random
-        numbers.
+        Corrections of single images and random numbers stay on the CPU.
         """
         self.device = self.images.device = device
         self.model.place(device)
 
-    def _parts(self) -> dict[str, ViewSampler | RobustMasks | ViewExposures | CameraRefinement]:
-        """Return what belongs to images and has a state of its own, by its name in a checkpoint."""
-        parts = {
-            "sampler": self.sampler,
-            "robust": self.robust,
-            "exposures": self.exposures,
-            "cameras": self.refinement,
-        }
-        return {name: part for name, part in parts.items() if part is not None}
+    def _image_parts(self) -> dict[str, ViewSampler | Correction]:
+        """Return what belongs to images and has a state, by its name in a checkpoint."""
+        return {"sampler": self.sampler} | {x.name: x for x in self.corrections}
 
     def _drawn_with_depth(self, background: Tensor) -> Callable[[Cameras, float | None], Rendering]:
         scene = self.model.scene
@@ -279,8 +346,6 @@ class Trainer(Generic[M]):
             fraction = self.processes.share(batch)
             coming = self.sampler.coming(count, self._wanted(step))
             self.images.expect([view for i, view in enumerate(coming) if i % batch in fraction])
-        if self.refinement is not None:
-            image = replace(image, cameras=watched(image.cameras))
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:

@@ -330,9 +330,7 @@ def test_choices_are_a_table_in_the_run_folder(tmp_path: Path) -> None:
 
 def write_rolling_ball(root: Path) -> None:
     """32 images of 24 px of a ball that goes 1.6 along x, at eight times, from everywhere."""
-    write_still_capture(
-        root, StillOptions(size=24, num_train=32, num_test=1, samples=1, distance=4.0)
-    )
+    write_still_capture(root, StillOptions(size=24, num_train=32, num_test=1, samples=1))
     views = read_capture(DataConfig(root=root)).splits["train"]
     for split, times in (("train", [i % 8 / 7 for i in range(32)]), ("test", [0.5])):
         file = root / f"transforms_{split}.json"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-
 from dyngs.api.pair_scores import explained_pixels
 
 

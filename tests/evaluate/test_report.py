@@ -33,6 +33,7 @@ from dyngs.evaluate.report import (
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -42,7 +43,6 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
 )
 from dyngs.static.keys import StaticModel
-from dyngs.static.scene import StaticScene
 
 
 def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:

@@ -1,5 +1,4 @@
-"""The number of Gaussians in the end, which ``budget.max_gaussians`` or the size of a file limits,
-and what that costs.
+"""The number of Gaussians at the end, which ``budget.max_gaussians`` or the size of a file limits.
 
 Growth ends at the limit, but a run may begin with more, most of which show nothing: those that
 matter least are removed late, with steps left for the others to adapt.
@@ -12,38 +11,45 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dyngs.api.budget.run import LimitedRun
-from dyngs.compress.prune.stage import highest, scores_of
+from dyngs.compress.stage import highest, quality_of, scores_of
+from dyngs.config import Config
 from dyngs.core.errors import counted
-from dyngs.training.events import Event, StepDone
-from dyngs.training.limits import CLOSE, most_gaussians
+from dyngs.training.loop import Loop
+from dyngs.training.trainer import Edit, Trainer
+
+REMOVED_FROM = 0.7  # Fraction of the run from which Gaussians beyond the limit are removed
+CLOSE = 0.8  # Fraction of the limit from which the limit counts as having held growth back
 
 
 class CountLimit:
-    """Listener that keeps the number of Gaussians within ``most``.
+    """Editor that keeps the number of Gaussians within ``most``.
 
     Attributes:
         before: their number before the first removal; 0: there was none.
         lost: dB of training images by all removals, before anything was trained again.
     """
 
-    def __init__(self, run: LimitedRun, most: int) -> None:
-        self.run, self.most = run, most
-        self.before, self.lost = 0, 0.0
+    def __init__(self, most: int, seconds: float | None = None) -> None:
+        self.most = most
+        self._seconds = seconds
+        self.before = 0
+        self.lost = 0.0
 
-    def __call__(self, event: Event) -> None:
-        """Remove Gaussians after a step of a late stage, if there are too many."""
-        count = self.run.trainer.num_gaussians
-        if isinstance(event, StepDone) and count > self.most and self.run.stage:
-            before, after = self.run.remove(
-                highest(scores_of(self.run.trainer), 1 - self.most / count)
-            )
-            self.before = self.before or count
-            self.lost = self.lost + before - after
-            self.run.say(
-                f"step {event.step}: {self._name}: {count:,} -> {counted(self.most, 'Gaussian')}; "
-                f"{after - before:+.2f} dB on training views"
-            )
+    def __call__(self, loop: Loop) -> Edit | None:
+        trainer = loop.trainer
+        assert isinstance(trainer, Trainer)
+        count = trainer.num_gaussians
+        used = 0.0 if self._seconds is None else loop.watch.seconds / self._seconds
+        if count <= self.most or not is_late(trainer.config, trainer.done, used):
+            return None
+        kept = highest(scores_of(trainer), 1 - self.most / count)
+        scene = trainer.model.scene
+        gain = quality_of(trainer, scene.select(kept)) - quality_of(trainer, scene)
+        self.before = self.before or count
+        self.lost -= gain
+        name = _name(trainer.config, self.most)
+        left = counted(self.most, "Gaussian")
+        return Edit(f"{name}: {count:,} -> {left}; {gain:+.2f} dB on training views", kept)
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for a checkpoint; empty where nothing was removed."""
@@ -57,32 +63,30 @@ class CountLimit:
     def restore(self, stored: Mapping[str, Tensor]) -> None:
         """Restore the state that ``state`` returned."""
         if stored:
-            self.before, self.lost = int(stored["before"]), float(stored["lost"])
+            self.before = int(stored["before"])
+            self.lost = float(stored["lost"])
 
-    def reached(self) -> str:
+    def reached(self, config: Config, count: int) -> str:
         """Return the line about the limit after a run."""
-        count = self.run.trainer.num_gaussians
+        cost = "it cost nothing"
         if self.before:
             cost = f"{self.before:,} before, {-self.lost:+.2f} dB on training views when they were removed"
-        elif (
-            CLOSE * self.most <= count
-            and 0 < self.run.trainer.config.strategy.growth_limit <= self.most
-        ):
+        elif CLOSE * self.most <= count and config.strategy.growth_limit > 0:
             cost = "it held growth back; what more would bring is not known"
-        else:
-            cost = "it cost nothing"
-        return f"{self._name}: asked for at most {counted(self.most, 'Gaussian')}, got {count:,}; {cost}"
-
-    @property
-    def _name(self) -> str:
-        return (
-            "budget.max_gaussians"
-            if self.most == self.run.trainer.config.budget.max_gaussians
-            else "budget.max_mb"
-        )
+        asked = f"asked for at most {counted(self.most, 'Gaussian')}, got {count:,}"
+        return f"{_name(config, self.most)}: {asked}; {cost}"
 
 
-def count_limit(run: LimitedRun) -> CountLimit | None:
-    times = {view.time for view in run.trainer.images.views if view.time is not None}
-    most = most_gaussians(run.trainer.config, len(times))
-    return None if most is None else CountLimit(run, most)
+def is_late(config: Config, step: int, used: float) -> bool:
+    """Return whether Gaussians beyond the limit are removed after ``step``.
+
+    Where pruning follows training, that is after its beginning. ``used``: fraction of the time.
+    """
+    steps = config.train.steps
+    if config.total_steps > steps:
+        return step > steps
+    return max(step / steps, used) >= REMOVED_FROM
+
+
+def _name(config: Config, most: int) -> str:
+    return "budget.max_gaussians" if most == config.budget.max_gaussians else "budget.max_mb"

@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from dyngs.models.renderable import Posable
     from dyngs.models.schedule import Length
 
-POSING_BYTES = 2600
-"""Bytes of a Gaussian next to what any takes, where the body fit is refined: its anchor, weights of
-joints, their gradients, and the Gaussian in a pose."""
-
 
 class HumanKind(HasGaussians, HasBody, ExtendsTo):
     """See the module. The body says how it moves, and poses are refined instead of cameras."""
@@ -73,12 +69,6 @@ class HumanKind(HasGaussians, HasBody, ExtendsTo):
 
     def extended(self, section: HumanModel, length: Length) -> HumanModel:
         return section.model_copy(update={"refine_from": length.share(section.refine_from)})
-
-    def moving_bytes(self, section: HumanModel) -> int:
-        return POSING_BYTES
-
-    def count_limit(self, section: HumanModel) -> tuple[str, int]:
-        return "model.resolution", section.resolution
 
 
 HUMAN = HumanKind(HumanModel)

@@ -21,9 +21,10 @@ from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.gaussians.adam import AdamState
+from dyngs.gaussians.parameters import AdamState
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.models.correction import Correction
 from dyngs.ops.adam import Count, adam_step_
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.quaternions import rotation_matrices
@@ -199,8 +200,10 @@ def _numbered(keys: Sequence[Hashable]) -> tuple[list[int], dict[Hashable, int]]
     return [numbers.setdefault(key, len(numbers)) for key in keys], numbers
 
 
-class CameraRefinement:
+class CameraRefinement(Correction):
     """Corrections of the training cameras, and their optimizer."""
+
+    name = "cameras"
 
     def __init__(self, views: Sequence[View], size: float, steps: int) -> None:
         self.corrections = CameraCorrections(views, size)
@@ -211,8 +214,11 @@ class CameraRefinement:
             for name, x in self._values().items()
         }
 
+    def before_render(self, image: Image) -> Image:
+        return replace(image, cameras=watched(image.cameras))
+
     @torch.no_grad()
-    def optimize(self, step: int, index: int, cameras: Cameras) -> Count:
+    def after_backward(self, index: int, step: int, image: Image) -> Count:
         """Update the corrections of view ``index``; return how many had gradients that are not
         finite.
 
@@ -220,6 +226,7 @@ class CameraRefinement:
         they add.
         """
         rate = self.rate(step)
+        cameras = image.cameras
         left_out = torch.zeros((), dtype=torch.int64, device="cpu")
         by_pose = cameras.cam_from_world.grad
         by_intrinsics = cameras.intrinsics.grad
@@ -263,8 +270,6 @@ class CameraRefinement:
         return state
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore what ``state()`` returned. Raises KeyError, or ValueError for that of other
-        views."""
         for name, x in self._values().items():
             x.copy_(require_tensor(name, state[name], tuple(x.shape), x.dtype))
             stored = state[f"updates.{name}"]

@@ -15,7 +15,8 @@ Local letters: V views, M (V, 3, 4) deviations from the identity, matrix next to
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
@@ -26,12 +27,13 @@ from dyngs.core.state import tensors_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import videos
-from dyngs.gaussians.adam import AdamState
 from dyngs.gaussians.colour.affine import SATURATED, recoloured
+from dyngs.gaussians.parameters import AdamState
+from dyngs.models.correction import Correction, RenderedView
 from dyngs.models.model import Look, Loss
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
-from dyngs.training.other_views import Draw, log_gains
+from dyngs.training.other_views import log_gains
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little
@@ -67,18 +69,18 @@ def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | N
     return ViewExposures(beside, options.steps, images)
 
 
-class ViewExposures(Loss):
+class ViewExposures(Loss, Correction):
     """An affine colour per training image, and their Adam."""
+
+    name = "exposures"
 
     def __init__(
         self, neighbours: Sequence[Sequence[int]], steps: int, images: ImageLoader | None = None
     ) -> None:
         count = len(neighbours)
-        self._neighbours, self._steps, self._begins = (
-            [list(x) for x in neighbours],
-            steps,
-            round(WARM_UP * steps),
-        )
+        self._neighbours = [list(x) for x in neighbours]
+        self._steps = steps
+        self._begins = round(WARM_UP * steps)
         self._images = images
         self._visits = torch.zeros(count, dtype=torch.int64, device="cpu")
         self._values = torch.zeros(count, 12, device="cpu", requires_grad=True)
@@ -89,12 +91,12 @@ class ViewExposures(Loss):
         self._rates = rate * (MIXING_RATE + (1 - MIXING_RATE) * is_gain)
         self._weights = MIXING_WEIGHT + (GAIN_WEIGHT - MIXING_WEIGHT) * is_gain
 
-    def begin(self, step: int, which: Callable[[int], bool], draw: Draw) -> None:
-        """Find the gains of all images at once, if it is time to."""
-        if step != self._begins + 1 or self._images is None:
+    def _find_gains(self, view: RenderedView) -> None:
+        """Find the gains of all images at once."""
+        if self._images is None:
             return
-        looked_at = [i for i in range(len(self._visits)) if which(i)]
-        gains = log_gains(self._images, looked_at, draw).exp()
+        looked_at = [i for i in range(len(self._visits)) if view.trains_on(i)]
+        gains = log_gains(self._images, looked_at, view.draw).exp()
         self._visits[looked_at] = 1
         with torch.no_grad():
             self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2).copy_(
@@ -108,19 +110,21 @@ class ViewExposures(Loss):
         deviation = self._values[index].reshape(3, 4)
         return deviation + torch.eye(3, 4, dtype=deviation.dtype, device=deviation.device)
 
-    def applied(
-        self, view: tuple[int, int], image: Image, rendering: Rendering, background: Tensor
-    ) -> Tensor:
-        """Return (H, W, 3) the rendering of a view as its camera would have made it, for the
-        loss."""
-        index, step = view
-        if step <= self._begins:
-            return rendering.rgb[0]
+    def after_render(self, view: RenderedView) -> RenderedView:
+        """Return the view with the rendering as its camera would have recorded it."""
+        if view.step <= self._begins:
+            return view
+        if view.step == self._begins + 1:
+            self._find_gains(view)
+        index = view.index
+        image = view.image
+        background = view.background
+        rendering = view.rendering
         shown = recoloured(self.affine(index), image, rendering, background)
         if not int(self._visits[index]):
             self._guess(index, image, rendering, shown.detach(), background)
             shown = recoloured(self.affine(index), image, rendering, background)
-        return up_to_white(shown, image.composite(background))
+        return replace(view, rendered=up_to_white(shown, image.composite(background)))
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
         return self.penalties(look.index)
@@ -140,9 +144,7 @@ class ViewExposures(Loss):
         """Return the neighbours of an image that were trained on."""
         return [i for i in self._neighbours[index] if int(self._visits[i])]
 
-    def optimize(self, index: int, step: int) -> Count:
-        """Update the affine of the image that was trained on; return the number of rows left out, 0
-        or 1."""
+    def after_backward(self, index: int, step: int, image: Image) -> Count:
         if step <= self._begins:
             return 0
         self._visits[index] += 1

@@ -23,8 +23,8 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
 from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_indices, require_tensor
-from dyngs.data.loader import Image, ImageLoader
-from dyngs.models.renderable import Rendering
+from dyngs.data.loader import ImageLoader
+from dyngs.models.correction import Correction, RenderedView
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 
 # An image is looked at each so many times that it is trained on; in between its mask stays
@@ -46,9 +46,11 @@ twenty."""
 _OCTAVES, _PER_OCTAVE = 12, 16
 
 
-class RobustMasks:
+class RobustMasks(Correction):
     """Masks of the pixels that count, one per training image, brought up to date as it is trained
     on."""
+
+    name = "robust"
 
     def __init__(
         self,
@@ -63,38 +65,30 @@ class RobustMasks:
         self._left_out = torch.zeros(len(images), CELLS, CELLS, dtype=torch.uint8, device="cpu")
         self._histogram = torch.zeros(_OCTAVES * _PER_OCTAVE, dtype=torch.float64, device="cpu")
 
-    def masked(
-        self,
-        index: int,
-        step: int,
-        image: Image,
-        drawn: Tensor,
-        background: Tensor,
-        with_depth: Callable[[Cameras], Rendering],
-    ) -> Image:
-        """Return ``image``, of which only those pixels count that agree with the other views; call
-        once a step."""
-        if step <= self._begins:
-            return image
+    def after_render(self, view: RenderedView) -> RenderedView:
+        """Return the view with a mask of the pixels that agree with the other views."""
+        if view.step <= self._begins:
+            return view
+        index = view.index
         if int(self._visits[index]) % EVERY == 0:
-            self._look(index, image.cameras, drawn.detach().cpu(), background.cpu(), with_depth)
+            self._look(view)
         self._visits[index] += 1
+        image = view.image
         height, width = image.rgb_premultiplied.shape[:2]
         rows, columns = grid_of(width, height)
         left_out = self._left_out[index, :rows, :columns]
         if not bool(left_out.any()):
-            return image
+            return view
         at_rows = torch.arange(height, device="cpu") * rows // height
         at_columns = torch.arange(width, device="cpu") * columns // width
         counts = (1.0 - left_out.float())[at_rows][:, at_columns].to(image.rgb_premultiplied)
-        return replace(image, mask=counts if image.mask is None else counts * image.mask)
+        mask = counts if image.mask is None else counts * image.mask
+        return replace(view, image=replace(image, mask=mask))
 
     def state(self) -> dict[str, Tensor]:
         return {"visits": self._visits, "left_out": self._left_out, "histogram": self._histogram}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the state that ``state()`` returned. Raises KeyError, or ValueError for that of
-        other images."""
         count = len(self._visits)
         visits = require_tensor("visits", state["visits"], (count,), torch.int64)
         left_out = require_indices(
@@ -112,16 +106,12 @@ class RobustMasks:
             self._begins = 0.0  # also where the run has become longer
 
     @torch.no_grad()
-    def _look(
-        self,
-        index: int,
-        cameras: Cameras,
-        drawn: Tensor,
-        background: Tensor,
-        with_depth: Callable[[Cameras], Rendering],
-    ) -> None:
+    def _look(self, view: RenderedView) -> None:
+        index = view.index
+        cameras = view.image.cameras
+        background = view.background.cpu()
         grid = grid_of(cameras.width, cameras.height)
-        drawn = adaptive_avg_pool2d(drawn.permute(2, 0, 1), grid)
+        drawn = adaptive_avg_pool2d(view.rendered.detach().cpu().permute(2, 0, 1), grid)
         seen, keeps = self._others.cells_of(index, background)
         residual = (drawn - seen).abs().mean(0, keepdim=True)
         residual = avg_pool2d(residual * keeps, 3, stride=1, padding=1, count_include_pad=False)[0]
@@ -134,7 +124,7 @@ class RobustMasks:
         if not bool((residual[candidates] > SEED * median).any()):
             self._left_out[index] = 0
             return
-        coarse = with_depth(_as_cells(cameras, grid))
+        coarse = view.draw(_as_cells(cameras, grid), view.image.time)
         assert coarse.depth is not None
         shown = torch.cat([drawn, coarse.depth.cpu(), coarse.alpha.cpu()])
         others = self._others.difference(index, candidates, shown, background)

@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 
 import pytest
+from dyngs.api.budget.cost import CostMeter, Range
 from limited import limited
 
 from dyngs.api.budget import cost
-from dyngs.api.budget.cost import CostMeter, Range
 from dyngs.api.train import train
 from dyngs.config import (
     Config,

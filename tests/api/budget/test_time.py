@@ -10,12 +10,12 @@ from typing import cast
 
 import pytest
 import torch
+from dyngs.api.budget.run import LimitedRun
 from hypothesis import given
 from hypothesis import strategies as st
 from steps import Counting
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.budget.run import LimitedRun
 from dyngs.api.budget.time import (
     AIM,
     FEWEST_STEPS,

@@ -8,8 +8,7 @@ import torch
 from rolling_ball import rolling
 from tiny_fields import tiny_options
 
-from dyngs.deform.bodies.start import found_bodies
-from dyngs.deform.bodies.turning import angles_deg
+from dyngs.deform.bodies.start import angles_deg, found_bodies
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 
@@ -49,7 +48,3 @@ def test_what_slides_is_not_made_to_turn() -> None:
     shots, _, _ = rolling(turns=False)
     found = found_bodies(shots, 400, 4)
     assert found is None or angles_deg(found.bodies[0].turning.rotations).max() < 12
-
-
-def test_the_fewest_gaussians_must_do_for_all_bodies() -> None:
-    assert found_bodies(rolling()[0], 0, 1) is None

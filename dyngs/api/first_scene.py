@@ -1,0 +1,51 @@
+"""The scene that a training goes on from: its Gaussians in the world of the capture."""
+
+from __future__ import annotations
+
+import torch
+
+from dyngs.config import Config, SceneInit
+from dyngs.core.errors import DyngsError, counted, warn
+from dyngs.data.capture import Capture
+from dyngs.gaussians.start import FirstGaussians
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.splat_file import with_degree
+from dyngs.runs.opened import open_scene
+
+
+def first_of(config: Config, capture: Capture) -> FirstGaussians | None:
+    """Return the Gaussians that ``init.scene`` names, as the capture has them; None: the run begins
+    with points.
+
+    Raises DyngsError: it cannot be read, or nothing of it lies in ``init.box``.
+    """
+    init = config.init
+    if not isinstance(init, SceneInit):
+        return None
+    opened = open_scene(init.scene, nonfinite="skip")
+    scene = opened.scene.to("cpu")
+    if not scene.is_static:
+        raise DyngsError(
+            f"{init.scene}: moves; a training goes on from a still scene (dyngs export --time T makes one)"
+        )
+    has_filter = isinstance(scene, StaticScene) and scene.filter_std is not None
+    keeps_filter = has_filter and config.model.filter_3d
+    gaussians = scene.gaussians.detach() if keeps_filter else scene.at(None)
+    x, y, z = capture.world_offset.tolist()
+    how = Similarity(scale=capture.world_scale, shift=(x, y, z)).inverse().after(opened.world)
+    gaussians = gaussians if how == UNMOVED else how.gaussians(gaussians)
+    gaussians = with_degree(gaussians, config.stored_sh_degree)
+    frozen = None
+    if init.box is not None:
+        low, high = torch.tensor(init.box, dtype=torch.float64, device="cpu").reshape(2, 3)
+        means = torch.from_numpy(opened.world.points(scene.at(None).means.numpy()))
+        frozen = ~((means >= low) & (means <= high)).all(1)
+        if bool(frozen.all()):
+            raise DyngsError(
+                f"init.box: none of {counted(len(scene), 'Gaussian')} of {init.scene} lie in it"
+            )
+    mode = scene.options.mode
+    if mode is not config.model.rasterize_mode:
+        warn(f"{init.scene}: was trained with model.rasterize_mode={mode.value}, unlike this run")
+    return FirstGaussians(gaussians, frozen)

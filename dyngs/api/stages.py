@@ -1,0 +1,185 @@
+"""The stages that make the plan of a run before its first step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from dyngs.api.choose import choose
+from dyngs.api.first_scene import first_of
+from dyngs.capture.unposed import with_poses
+from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
+from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.core.conventions import ReportProgress
+from dyngs.core.errors import DyngsError, counted, show, warn
+from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
+from dyngs.models.checkpoint import Checkpoint, read_capture_of
+from dyngs.models.kind import HasBody, Moves, Predicts, capability, kind_of
+from dyngs.models.views import training_times
+from dyngs.runs.capture_record import changed_files, named
+from dyngs.runs.checkpoint import SCENE_FILE
+from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
+from dyngs.training.extend import told, with_length
+from dyngs.training.limits import most_gaussians, within_cap
+from dyngs.training.plan import Limits, RunPlan, Stage, with_steps
+from dyngs.training.processes import Processes
+
+
+def planned(plan: RunPlan, stages: Iterable[Stage]) -> RunPlan:
+    """Return the plan after all ``stages``; their messages are shown."""
+    for stage in stages:
+        plan, message = stage(plan)
+        if message:
+            show(message)
+    return plan
+
+
+def share_views(processes: Processes) -> Stage:
+    """Return the stage that gives each of several processes a view of each step."""
+
+    def stage(plan: RunPlan) -> tuple[RunPlan, None]:
+        config = plan.resolved
+        if processes.size == 1:
+            return plan, None
+        minutes = config.train.minutes
+        if minutes is not None:
+            raise DyngsError(
+                f"train.minutes={minutes:g}: is measured with one process; leave it out, or start without torchrun"
+            )
+        if config.train.batch_size == 1:
+            train = config.train.model_copy(update={"batch_size": processes.size})
+            config = config.model_copy(update={"train": train})
+        processes.share(config.train.batch_size)
+        return replace(plan, resolved=config), None
+
+    return stage
+
+
+def find_poses(report: ReportProgress) -> Stage:
+    """Return the stage that unpacks a capture, estimates its poses, and fits a body to a person,
+    where that is needed; what is found is kept for other runs."""
+
+    def stage(plan: RunPlan) -> tuple[RunPlan, str | None]:
+        config = plan.resolved
+        data = config.data
+        model = config.model
+        kind = kind_of(model)
+        if isinstance(kind, Predicts):
+            return plan, None  # its folder holds a capture per person
+        root = data.root
+        folder = capture_folder(root)
+        data = data.model_copy(update={"root": folder})
+        if isinstance(kind, HasBody):
+            data = kind.find_body(data, model, show, report)
+        else:
+            data = with_poses(data, needs_times=isinstance(kind, Moves), report=report)
+        if data.root == folder:  # the archive outlives the cache
+            data = data.model_copy(update={"root": root})
+        message = None if folder == root else f"{root} is unpacked in {folder}"
+        return replace(plan, resolved=config.model_copy(update={"data": data})), message
+
+    return stage
+
+
+def continue_scene(plan: RunPlan) -> tuple[RunPlan, None]:
+    """Keep what would take the scene apart that the run goes on from: images are whole from the
+    start; with frozen Gaussians none are removed and all keep their harmonics."""
+    config = plan.resolved
+    init = config.init
+    if not isinstance(init, SceneInit):
+        return plan, None
+    if "init.scene" not in kind_of(config.model).uses:
+        raise DyngsError(
+            f"init.kind=scene goes with model.kind=static, not with {config.model.kind}"
+        )
+    keeps = init.trains == "colour" or init.box is not None
+    train = {"initial_downscale": 1} | ({"remove_floaters": False} if keeps else {})
+    changes: dict[str, object] = {"train": config.train.model_copy(update=train)}
+    if init.trains == "colour":
+        changes["strategy"] = FixedStrategy()
+    if keeps and isinstance(config.colour, AutoColour):
+        changes["colour"] = ShColour(opacity_entropy=config.colour.opacity_entropy)
+    return replace(plan, resolved=config.model_copy(update=changes)), None
+
+
+def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
+    """Return the stage that reads the capture of a resumed run in its coordinates."""
+
+    def stage(plan: RunPlan) -> tuple[RunPlan, None]:
+        data = plan.resolved.data
+        if capability(plan.resolved.model, Predicts) is not None:
+            return plan, None
+        capture = read_capture_of(data, resumed.info)
+        changed = changed_files(folder, data, capture)
+        if changed:
+            views = counted(len(changed), "training view")
+            warn(f"files of {views} have changed since the run began: {named(changed)}")
+        return replace(plan, capture=capture), None
+
+    return stage
+
+
+def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
+    """Read the capture, find initial points, and resolve ``auto`` settings by pilot runs."""
+    config = plan.resolved
+    if capability(config.model, Predicts) is not None:
+        return plan, None
+    config, choices, capture = choose(config, require_images(read_capture(config.data)))
+    return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
+
+
+def find_first_gaussians(plan: RunPlan) -> tuple[RunPlan, str | None]:
+    """Read the scene that ``init.scene`` names, where there is one."""
+    init = plan.resolved.init
+    if not isinstance(init, SceneInit) or plan.capture is None:
+        return plan, None
+    first = first_of(plan.resolved, plan.capture)
+    assert first is not None
+    frozen = 0 if first.frozen is None else int(first.frozen.sum())
+    held = f", of which {frozen:,} stay as they are" if frozen else ""
+    count = counted(len(first.gaussians), "Gaussian")
+    return replace(plan, first=first), f"begins with {count} of {init.scene}{held}"
+
+
+def set_limits(plan: RunPlan) -> tuple[RunPlan, None]:
+    """Lower the numbers of Gaussians of the config to the limits of the run."""
+    config = plan.resolved
+    minutes = config.train.minutes
+    num_times = 0 if plan.capture is None else len(set(training_times(plan.capture)))
+    limits = Limits(
+        gaussians=most_gaussians(config, num_times),
+        megabytes=config.budget.max_mb,
+        seconds=None if minutes is None else 60 * minutes,
+    )
+    capped = within_cap(config, limits.gaussians)
+    return replace(plan, resolved=capped, uncapped=config, limits=limits), None
+
+
+def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
+    """Return the stage that changes a resumed run, in its folder, too, where another number of steps
+    is requested."""
+
+    def stage(plan: RunPlan) -> tuple[RunPlan, str | None]:
+        config = plan.resolved
+        stored = load_resolved(folder)
+        steps = config.train.steps
+        if steps == stored.train.steps:
+            return plan, None
+        if resumed is None:
+            raise DyngsError(
+                f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give another run.dir, "
+                "and begin with so many steps"
+            )
+        require_folder(stored.data.root)
+        done = resumed.info.step
+        longer = with_length(stored, done, steps)
+        if stored.budget.max_mb is not None:
+            # otherwise a run that is stopped now would take it for its own
+            (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
+        save_config(longer, folder / RESOLVED_NAME)
+        (folder / ASKED_NAME).unlink(missing_ok=True)  # what was requested now is what is there
+        config = with_length(with_steps(config, stored.train.steps), done, steps)
+        return replace(plan, requested=longer, resolved=config), told(stored, longer, done)
+
+    return stage

@@ -1,0 +1,206 @@
+"""The camera path of a command: placed by cameras, a person or points, read from a file, or the
+camera of one view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture, View
+from dyngs.export.camera_paths import (
+    CameraPath,
+    path_file,
+    pick_cameras,
+    read_path,
+    resize_cameras,
+    with_times,
+)
+from dyngs.export.images import file_stems
+from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.io.formats.similarity import AXES
+from dyngs.models.renderable import Renderable
+from dyngs.models.views import training_cameras
+from dyngs.runs.opened import Opened, cameras_for_paths, split_views
+
+DEFAULT_FRAMES = 120
+DEFAULT_SIZE = (960, 720)
+_RING = 24  # cameras around a scene, among which the one in front of a person is looked for
+
+
+@dataclass(frozen=True)
+class PathOptions:
+    """Cameras and times to render."""
+
+    # "orbit", "spiral", "along" (the training cameras), a JSON file of cameras
+    # (docs/camera_paths.md), or None: one fixed camera
+    path: str | None = "orbit"
+    # frames of a path that is not a file; None: as many as a motion has, else 120
+    num_frames: int | None = None
+    # width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file
+    size: tuple[int, int] | None = None
+    # scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of
+    # the view for a fixed camera, from 0 to 1 along a path
+    times: tuple[float, ...] | None = None
+    # the view of the fixed camera: its name, the name of its image, or its number from 0
+    view: str | None = None
+    split: str | None = None  # split of that view; None: test, or val or train if there is none
+
+
+def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
+    """Return the cameras and times along which a scene is rendered, with notes about defaults that
+    were chosen.
+
+    Raises DyngsError: a missing capture, no such view, an invalid path file, times that do not fit
+    its frames, or what a file cannot have.
+    """
+    scene = opened.renderable
+    times = options.times
+    if opened.captured is None:
+        _require_fitting(opened, options)
+    if options.path is None:
+        path = _fixed_camera(opened, options)
+    else:
+        file = path_file(options.path)
+        if file is None:
+            path = _placed(opened, options.path, options)
+        else:
+            path = read_path(file, opened.world_offset, options.size)
+            path = replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
+        if times is not None:
+            path = replace(path, warnings=())
+            path = with_times(path, times * len(path) if len(times) == 1 else times)
+    notes = path.notes
+    if scene.is_static and times is not None:
+        notes = (*notes, "nothing moves in this run: it looks the same at all times")
+    elif not scene.is_static and path.times is None:
+        path = with_times(path, np.linspace(0, 1, len(path)).tolist())
+        notes = (
+            *notes,
+            "time runs from 0 to 1 along the path; --time or --times choose other times",
+        )
+    if options.size is not None:
+        path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
+    return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
+
+
+def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
+    """Return the view called ``name``, by default the first one.
+
+    ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the
+    split, from 0. ``split``: None looks for a name in all, for a number in the first that has
+    views. Raises DyngsError: no such view or split.
+    """
+    order = [split] if split else [s for s in ("test", "val", "train") if capture.splits.get(s)]
+    candidates = [split_views(capture, s) for s in order]
+    first = candidates[0]
+    if name is None:
+        return first[0]
+    for views in candidates:
+        for view, stem in zip(views, file_stems([view.name for view in views]), strict=True):
+            if name in (view.name, stem):
+                return view
+    if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(first):
+        return first[int(name)]
+    raise DyngsError(
+        f"{capture.root}: no view {name!r}; the split {order[0]} has {len(first)} views: {first[0].name} (0) to "
+        f"{first[-1].name} ({len(first) - 1})"
+    )
+
+
+def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+    """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all
+    of their motion.
+
+    z is up where nothing says what is.
+    """
+    scene = opened.renderable
+    moves = opened.person is not None and not scene.is_static
+    times = np.linspace(0, 1, 8).tolist() if moves else [None]
+    means = torch.cat([points_at(scene, time) for time in times]).cpu().numpy()
+    x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
+    least = 0.0
+    if isinstance(scene, GaussianScene):
+        least = float(scene.gaussians.log_scales.detach().amax(1).median().exp())
+    return frame_orbit_for_points(means, count, size, (x, y, z), least)
+
+
+def points_at(scene: Renderable, time: float | None = None) -> Tensor:
+    """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box
+    of all else."""
+    return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
+
+
+def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+    """Return three neighbours on a circle around a scene, of which the second sees a person's
+    front."""
+    ring = orbit_around(opened, _RING, size)
+    front = 0
+    person = avatar_of(opened.renderable)
+    if person is not None:
+        facing = axis_angle_to_matrix(person.clip.poses[0, 0])[:, 2]
+        front = int((ring.centers @ facing).argmax())
+    return pick_cameras(ring, [(front + i) % _RING for i in (-1, 0, 1)])
+
+
+def _require_fitting(opened: Opened, options: PathOptions) -> None:
+    file = opened.config.data.root
+    if options.path == "along":
+        raise DyngsError(
+            f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit"
+        )
+    if opened.person is not None:
+        if options.view is not None:
+            raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
+    elif options.path is None or options.times is not None or options.view is not None:
+        kind = file.suffix.lower()
+        raise DyngsError(
+            f"{file}: a {kind} holds one time and no views; leave out --time, --times and --view"
+        )
+
+
+def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
+    times = opened.renderable.times
+    if opened.captured is None:
+        camera = in_front_of(opened, options.size or DEFAULT_SIZE).select(1)
+    else:
+        view = view_to_show(opened.capture, options.view, options.split)
+        (camera,) = training_cameras([view], opened.config.data)
+        times = (view.time or 0.0,) if opened.fps is None else times
+    times = times if options.times is None else options.times
+    return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
+
+
+def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
+    """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by
+    the scene."""
+    scene = opened.renderable
+    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(scene.times))
+    up = None if opened.stated_up is None else opened.direction_of(opened.stated_up)
+    if opened.captured is None:
+        size = options.size or DEFAULT_SIZE
+        if name == "orbit":
+            return CameraPath(orbit_around(opened, frames, size))
+        return CameraPath(spiral_path(in_front_of(opened, size), frames))
+    views = opened.capture.splits["train"]
+    cameras = cameras_for_paths(views, opened.config.data)
+    if name == "spiral":
+        return CameraPath(spiral_path(cameras, frames, up))
+    if name == "along":
+        times = [view.time for view in views if view.time is not None]
+        is_clip = len(times) == len(views) and not scene.is_static and opened.fps is None
+        return path_along(cameras, frames, times if is_clip else None, up)
+    path, is_all_around = orbit_path(cameras, frames, up)
+    if opened.person is None or is_all_around:
+        return path
+    around = orbit_around(opened, frames, (cameras.width, cameras.height))
+    return CameraPath(
+        around, notes=("the person was filmed from one side: the orbit goes all around them",)
+    )

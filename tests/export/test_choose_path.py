@@ -1,0 +1,239 @@
+"""Chosen camera paths: times along them, fixed cameras, views by name, and scenes without
+cameras."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
+from scaled_files import FACTORS, write_scaled
+
+from dyngs.api.train import train
+from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError
+from dyngs.data.loader import ImageLoader
+from dyngs.export.camera_paths import CameraPath, write_path
+from dyngs.export.choose_path import PathOptions, choose_path, orbit_around, view_to_show
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
+from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.io.formats.formats import write_splats
+from dyngs.io.formats.splat_file import SplatFile
+from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
+from dyngs.training.new_trainer import assemble
+
+MODEL = HumanModel(resolution=24, sh_degree=0, fit=False)
+TRAIN = TrainConfig(steps=1)
+
+
+@pytest.fixture(scope="module")
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    return open_run(write_moving_run(tmp_path_factory.mktemp("moving")))
+
+
+@pytest.fixture(scope="module")
+def still_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    return open_run(write_moving_run(tmp_path_factory.mktemp("still"), moves=False))
+
+
+@pytest.mark.parametrize("name", ["orbit", "spiral"])
+def test_time_runs_along_a_path_unless_told_otherwise(
+    name: str, moving_run: Opened, still_run: Opened
+) -> None:
+    path = choose_path(moving_run, PathOptions(name, 5))
+    assert path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert len(path.notes) == 1
+    assert "from 0 to 1" in path.notes[0]
+    frozen = choose_path(moving_run, PathOptions(name, 5, times=(0.4,)))
+    assert frozen.times == (0.4,) * 5
+    assert torch.equal(frozen.cameras.cam_from_world, path.cameras.cam_from_world)
+    together = choose_path(moving_run, PathOptions(name, 3, times=(1.0, 0.5, 0.0)))
+    assert together.times == (1.0, 0.5, 0.0)
+    assert (frozen.notes, together.notes) == ((), ())
+    still = choose_path(still_run, PathOptions(name, 3))
+    assert (still.times, still.notes) == (None, ())
+
+
+def test_a_clip_is_followed_in_its_own_time(moving_run: Opened, still_run: Opened) -> None:
+    path = choose_path(moving_run, PathOptions("along", 4))
+    assert path.times is not None
+    assert (path.times[0], path.times[-1]) == (min(TRAIN_TIMES), max(TRAIN_TIMES))
+    assert choose_path(still_run, PathOptions("along", 4)).times is None
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral", "along"])
+def test_up_counts_for_runs(path: str, moving_run: Opened) -> None:
+    for name, up in (("y", [0.0, 1.0, 0.0]), ("-y", [0.0, -1.0, 0.0])):
+        poses = choose_path(
+            replace(moving_run, stated_up=name), PathOptions(path, 3)
+        ).cameras.cam_from_world
+        rights = poses[:, 0, :3]
+        downs = poses[:, 1, :3]
+        torch.testing.assert_close(rights @ torch.tensor(up), torch.zeros(3), atol=1e-6, rtol=0)
+        assert (downs @ torch.tensor(up) < 0).all()
+
+
+def test_times_of_a_file_are_overridden(moving_run: Opened, tmp_path: Path) -> None:
+    cameras = cameras_for_paths(moving_run.capture.splits["train"], moving_run.config.data)
+    file = tmp_path / "path.json"
+    write_path(file, CameraPath(cameras, 12.0, (0.1, 0.2, 0.3, 0.4, 0.5)))
+    own = choose_path(moving_run, PathOptions(str(file)))
+    assert own.times == pytest.approx((0.1, 0.2, 0.3, 0.4, 0.5))
+    assert (own.fps, own.notes) == (12.0, ())
+    assert choose_path(moving_run, PathOptions(str(file), times=(0.7,))).times == (0.7,) * 5
+    given = (0.0, 0.0, 1.0, 1.0, 0.5)
+    assert choose_path(moving_run, PathOptions(str(file), times=given)).times == given
+    with pytest.raises(DyngsError, match="5 cameras, but there are 3 times"):
+        choose_path(moving_run, PathOptions(str(file), times=(0.0, 0.5, 1.0)))
+
+
+def test_a_camera_that_stands_still(moving_run: Opened) -> None:
+    capture = moving_run.capture
+    wanted = ImageLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
+    path = choose_path(moving_run, PathOptions(None, times=(0.0, 0.5, 1.0), view="1"))
+    assert path.times == (0.0, 0.5, 1.0)
+    assert (path.cameras.width, path.cameras.height) == (16, 16)
+    for i in range(3):
+        torch.testing.assert_close(path.cameras.cam_from_world[i], wanted.cameras.cam_from_world[0])
+        torch.testing.assert_close(path.cameras.intrinsics[i], wanted.cameras.intrinsics[0])
+    assert choose_path(moving_run, PathOptions(None, view="1")).times == (TEST_TIMES[1],)
+    assert choose_path(moving_run, PathOptions(None, split="train", view="1")).times == (
+        TRAIN_TIMES[1],
+    )
+    small = choose_path(moving_run, PathOptions(None, times=(0.5,), size=(8, 4))).cameras
+    assert (len(small), small.width, small.height) == (1, 8, 4)
+
+
+def test_views_are_found_by_name_image_and_number(moving_run: Opened) -> None:
+    capture = moving_run.capture
+    test = capture.splits["test"]
+    train = capture.splits["train"]
+    assert view_to_show(capture) is test[0]
+    assert view_to_show(capture, test[2].name) is test[2]
+    assert view_to_show(capture, "r_002") is test[2]
+    assert view_to_show(capture, "2") is test[2]
+    # no split given: names are looked for in all
+    assert view_to_show(capture, train[3].name) is train[3]
+    assert view_to_show(capture, "r_004") is train[4]
+    assert view_to_show(capture, "4", "train") is train[4]
+    assert view_to_show(capture.replace(splits={"train": train, "test": ()})) is train[0]
+    for name, split in (("9", None), ("r_9", None), ("-1", None), (train[0].name, "test")):
+        with pytest.raises(
+            DyngsError, match=rf"no view '{name}'; the split test has 3 views: .*\(0\) to .*\(2\)"
+        ):
+            view_to_show(capture, name, split)
+    with pytest.raises(DyngsError, match="'val' has no views"):
+        view_to_show(capture, None, "val")
+
+
+def some_gaussians(count: int = 50) -> Gaussians:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(count, 3, generator=generator)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    return Gaussians(
+        means, quats, torch.full((count, 3), -3.0), torch.zeros(count), torch.zeros(count, 1, 3)
+    )
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral"])
+@pytest.mark.parametrize("up", ["z", "-y", "x"])
+def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) -> None:
+    file = write_splats(
+        tmp_path / "a.ply", SplatFile(some_gaussians(), RasterizeMode.ANTIALIASED, 0.1)
+    ).path
+    opened = replace(open_scene(file), stated_up=up)
+    cameras = choose_path(opened, PathOptions(path, num_frames=5, size=(80, 60))).cameras
+    axis = np.zeros(3)
+    axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
+    means = torch.cat([opened.scene.gaussians.means, torch.ones(len(opened.scene), 1)], dim=1)
+    for i in range(5):
+        in_camera = (cameras.cam_from_world[i] @ means.T).T[:, :3]
+        pixels = (cameras.intrinsics[i] @ in_camera.T).T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        inside = (
+            (in_camera[:, 2] > 0)
+            & (pixels >= 0).all(dim=1)
+            & (pixels <= torch.tensor([80, 60])).all(dim=1)
+        )
+        assert inside.float().mean() > 0.9
+        image_up = -cameras.cam_from_world[i, 1, :3].numpy()
+        assert image_up @ axis > 0.5
+    assert (opened.scene.options.mode, opened.scene.options.eps2d) == (
+        RasterizeMode.ANTIALIASED,
+        0.1,
+    )
+    assert torch.equal(opened.background, torch.zeros(3))
+    assert (choose_path(opened, PathOptions(path)).times, opened.notes) == (None, ())
+    assert opened.scene.is_static
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Path) -> None:
+    source = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians(), up="z")).path
+    frames = []
+    centers = []
+    for file, unit in ((source, 1.0), (write_scaled(tmp_path / "b.ply", source, factor), factor)):
+        opened = open_scene(file)
+        cameras = choose_path(opened, PathOptions("orbit", num_frames=3, size=(80, 60))).cameras
+        frames.append(opened.renderable.render(cameras).rgb)
+        centers.append(cameras.centers / unit)
+    torch.testing.assert_close(centers[1], centers[0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(frames[1], frames[0], rtol=0, atol=2e-3)
+
+
+def test_a_single_gaussian_is_in_view_whole() -> None:
+    one = opened_scene(StaticScene(gaussians=some_gaussians(1)))
+    size = math.exp(-3)
+    distance = float((orbit_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
+    assert size < distance < 10 * size
+
+
+@pytest.mark.parametrize(
+    "options", [PathOptions(times=(0.5,)), PathOptions(None), PathOptions(view="0")]
+)
+def test_a_file_has_neither_times_nor_views(options: PathOptions, tmp_path: Path) -> None:
+    file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians())).path
+    with pytest.raises(DyngsError, match=r"a \.ply holds one time and no views"):
+        choose_path(open_scene(file), options)
+
+
+def directions(centers: torch.Tensor) -> np.ndarray:
+    """Angles about the vertical, degrees, of cameras seen from their middle."""
+    x, _, z = (centers - centers.mean(0)).double().numpy().T
+    return np.sort(np.degrees(np.arctan2(x, z)) % 360)
+
+
+def test_the_person_is_in_every_image(person: Path) -> None:
+    scene = assemble(
+        Config(data=DataConfig(root=person), model=MODEL, train=TRAIN, run=RunConfig(threads=1))
+    ).model.scene
+    assert isinstance(scene, HumanScene)
+    cameras = orbit_around(opened_scene(scene), 8, (60, 80))
+    assert np.diff(directions(cameras.centers)) == pytest.approx(45, abs=1)
+    for time in scene.times:
+        means = scene.at(time).means
+        for pose, intrinsics in zip(cameras.cam_from_world, cameras.intrinsics, strict=True):
+            local = means @ pose[:3, :3].T + pose[:3, 3]
+            pixels = local @ intrinsics.T
+            u, v = (pixels[:, :2] / pixels[:, 2:]).T
+            assert float(((u > 0) & (u < 60) & (v > 0) & (v < 80)).float().mean()) > 0.98
+
+
+def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
+    options = HumanOptions(size=32, num_frames=2, num_new=0, num_cameras=1, num_test=1, samples=1)
+    root = write_human_capture(tmp_path / "person", options)
+    run = RunConfig(threads=1, dir=tmp_path / "run")
+    folder = train(
+        Config(data=DataConfig(root=root, test_every=0), model=MODEL, train=TRAIN, run=run)
+    )
+    path = choose_path(open_run(folder), PathOptions("orbit", 4))
+    assert np.diff(directions(path.cameras.centers)) == pytest.approx(90, abs=1)
+    assert any("goes all around" in note for note in path.notes)
