@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.frame import Distance, Frame, direction, geo_frame, number, point, scale_of
+from dyngs.export.edit.frame import Frame, direction, geo_frame, number, point, scale_of
 from dyngs.io.formats.similarity import Similarity
 
 SCENE = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0.5, 0.5, 1]])
@@ -21,20 +21,6 @@ def table(path: Path, world: np.ndarray, scene: np.ndarray = SCENE, start: str =
     rows = np.concatenate([scene, world], axis=1)
     path.write_text(start + "\n".join(",".join(repr(float(x)) for x in row) for row in rows) + "\n")
     return path
-
-
-def test_a_frame_is_one_similarity() -> None:
-    """The origin goes to zero, up goes up, and two points are as far apart as told."""
-    start = (1.0, 2.0, 3.0)
-    end = (1.0, 2.0, 5.0)
-    frame = Frame(origin=(0.0, 1.0, 0.0), scale=Distance(start, end, 1.25))
-    found = frame.similarity((0.0, 0.6, 0.8), (0.0, -1.0, 0.0))
-    np.testing.assert_allclose(found.points(np.array([0.0, 1, 0])), 0, atol=1e-12)
-    np.testing.assert_allclose(found.rotation @ [0.0, 0.6, 0.8], [0, -1, 0], atol=1e-12)
-    assert np.linalg.norm(
-        found.points(np.array(start)) - found.points(np.array(end))
-    ) == pytest.approx(1.25)
-    assert Frame().similarity(None, (0.0, 1.0, 0.0)) == Similarity()
 
 
 @pytest.mark.parametrize(
