@@ -4,30 +4,22 @@ control points."""
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, printable, require_regular
+from dyngs.core.errors import DyngsError, printable
 from dyngs.data.scene_space import MAX_DISTANCE
 from dyngs.io.formats.similarity import AXES, Similarity, turn_between, turn_of
 from dyngs.io.formats.splat_file import geo_comment
-from dyngs.io.limits import require_at_most
+from dyngs.io.limits import read_limited
 
 _FACTORS = (1e-9, 1e9)
 _MOST_BYTES = 1 << 20  # of a file of control points
 Point = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Distance:
-    """Two points (3,) of the scene, and how long their distance is to be."""
-
-    start: Point
-    end: Point
-    length: float
 
 
 @dataclass(frozen=True)
@@ -37,42 +29,26 @@ class Frame:
     Attributes:
         up: direction (3,) of the scene that is up; "auto": by the cameras of its run.
         origin: point (3,) of the scene that becomes the origin.
-        scale: factor, or a distance that is known.
+        scale: factor.
     """
 
     up: Point | str | None = None
     origin: Point | None = None
-    scale: float | Distance | None = None
+    scale: float = 1.0
 
     def similarity(self, up: Sequence[float] | None, wanted: Sequence[float]) -> Similarity:
         """Return the similarity that brings the direction ``up`` (3,) to ``wanted`` (3,), and does
         the rest.
 
-        Without ``up`` nothing is turned. Raises DyngsError: the scale is no positive factor of
-        modest size.
+        Without ``up`` nothing is turned.
         """
-        found = Similarity(scale=_factor(self.scale))
+        found = Similarity(scale=self.scale)
         if up is not None:
             found = found.after(Similarity(turn_between(tuple(up), tuple(wanted))))
         if self.origin is None:
             return found
         x, y, z = (-found.points(np.array(self.origin))).tolist()
         return replace(found, shift=(x, y, z))
-
-
-def _factor(scale: float | Distance | None) -> float:
-    if scale is None:
-        return 1.0
-    length = scale.length if isinstance(scale, Distance) else scale
-    now = math.dist(scale.start, scale.end) if isinstance(scale, Distance) else 1.0
-    if not now > 0:
-        raise DyngsError("--scale: the two points are one; give points that are apart")
-    if not _FACTORS[0] <= length / now <= _FACTORS[1]:
-        what = "a positive factor, or two points and their distance"
-        raise DyngsError(
-            f"--scale: {length / now:g} is no factor from {_FACTORS[0]:g} to {_FACTORS[1]:g}; give {what}"
-        )
-    return length / now
 
 
 def point(text: str, option: str) -> Point:
@@ -111,18 +87,22 @@ def direction(text: str) -> Point | str:
     return found
 
 
-def scale_of(text: str) -> float | Distance:
-    """Return what ``--scale`` names: a factor, or "x,y,z x,y,z LENGTH". Raises DyngsError:
-    neither."""
+def scale_of(text: str) -> float:
+    """Return the factor that ``--scale`` names: itself, or "x,y,z x,y,z LENGTH", two points of the
+    scene and what their distance is to be. Raises DyngsError."""
     words = text.split()
     if len(words) == 3:
-        start, end = (point(word, "--scale") for word in words[:2])
-        return Distance(start, end, number(words[2], "--scale"))
-    if len(words) != 1 or "," in text:
+        now = math.dist(point(words[0], "--scale"), point(words[1], "--scale"))
+        factor = number(words[2], "--scale") / now if now > 0 else math.nan
+    else:
+        factor = number(text, "--scale")
+    low, high = _FACTORS
+    if not low <= factor <= high:
+        what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
         raise DyngsError(
-            f"--scale: {printable(repr(text), 60)}: give a factor, or 'x,y,z x,y,z LENGTH'"
+            f"--scale: {printable(repr(text), 60)} is no factor from {low:g} to {high:g}; give {what}"
         )
-    return number(text, "--scale")
+    return factor
 
 
 _STRAIGHT = 1e-4  # second singular value of points, over the first, below which they lie on a line
@@ -217,23 +197,24 @@ def _control_points(path: Path) -> np.ndarray:
     names, # remarks."""
     if not path.exists():
         raise DyngsError(f"{path}: no such file; give rows of x,y,z,X,Y,Z")
-    require_regular(path)
-    require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of control points")
+    text = read_limited(path, _MOST_BYTES).decode("utf-8", "replace")
     rows: list[list[float]] = []
-    lines = enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
-    told = [(i, line) for i, line in lines if line.strip() and not line.lstrip().startswith("#")]
-    for index, (line_number, line) in enumerate(told):
-        words = line.replace(",", " ").replace(";", " ").split()
+    has_names = True
+    for line_number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
         try:
-            row = [float(word) for word in words]
+            row = [float(word) for word in re.split(r"[\s,;]+", line.strip())]
         except ValueError:
-            if index == 0:  # names of columns
-                continue
             row = []
+        if not row and has_names:
+            has_names = False
+            continue
+        has_names = False
         if len(row) != 6 or not np.isfinite(row).all():
-            shown = printable(repr(line), 60)
             raise DyngsError(
-                f"{path}: line {line_number} is {shown}, not six numbers x,y,z,X,Y,Z (scene, then world)"
+                f"{path}: line {line_number} is {printable(repr(line), 60)}, not six numbers "
+                "x,y,z,X,Y,Z (scene, then world)"
             )
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 6)

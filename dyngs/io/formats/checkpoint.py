@@ -74,7 +74,7 @@ def _load(path: Path) -> object:
         return torch.load(path, map_location="cpu", mmap=True, weights_only=True)
     except OSError:
         raise
-    except Exception as error:  # a damaged pickle may raise any
+    except Exception as error:  # a damaged pickle may raise any; the text of torch misleads
         raise DyngsError(
             f"{path}: is damaged, or holds objects that only code could restore; {_HINT}"
         ) from error
@@ -95,13 +95,8 @@ def _tensors_of(contents: object) -> dict[str, Tensor]:
         and value.layout == torch.strided
         and value.device.type == "cpu"
     }
-    prefixes = [
-        name.removesuffix("means") for name in tensors if name == "means" or name.endswith(".means")
-    ]
+    prefixes = [name.removesuffix("means") for name in tensors if f".{name}".endswith(".means")]
     if len(prefixes) != 1:
         return {}
-    return {
-        name.removeprefix(prefixes[0]): tensor
-        for name, tensor in tensors.items()
-        if name.startswith(prefixes[0])
-    }
+    (prefix,) = prefixes
+    return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
