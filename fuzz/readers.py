@@ -290,8 +290,8 @@ def read_a_path(root: Path) -> object:
 
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
-    from dyngs.study.tradeoff.measure import read_measurement
-    from dyngs.study.tradeoff.table import table_rows
+    from dyngs.study.measure import read_measurement
+    from dyngs.study.sweep import table_rows
 
     measurement = read_measurement(only(root))
     return table_rows([measurement]), measurement
@@ -301,8 +301,8 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.tradeoff.table import parse_requirements
-    from dyngs.study.tradeoff.variants import parse_variations
+    from dyngs.study.sweep import parse_requirements
+    from dyngs.study.variants import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (

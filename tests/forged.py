@@ -16,8 +16,7 @@ from torch import Tensor
 
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.core.state import prefixed, tensors_of
-from dyngs.deform.fields import field_state
-from dyngs.deform.windows import WindowedField
+from dyngs.deform.fields import WindowedField, field_state
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene

@@ -14,8 +14,7 @@ from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import innermost, with_innermost
 from dyngs.deform.scene import DynamicScene
-from dyngs.gaussians.colour.training import HELD_OUT_EVERY
-from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
+from dyngs.gaussians.colour.training import HELD_OUT_EVERY, MeasuredView, find_view_dependent
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent

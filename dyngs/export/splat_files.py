@@ -17,7 +17,7 @@ import torch
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError, counted
 from dyngs.export.sog_levels import write_sog_levels
-from dyngs.gaussians.colour.bake import with_harmonics
+from dyngs.gaussians.colour.network import with_harmonics
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     Format,

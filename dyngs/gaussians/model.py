@@ -17,8 +17,12 @@ from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
-from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, TrainingLooks
-from dyngs.gaussians.colour.view_dependence import MeasuredView
+from dyngs.gaussians.colour.training import (
+    AutoTraining,
+    ColourTraining,
+    MeasuredView,
+    TrainingLooks,
+)
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import GaussianOptimizer, Still
 from dyngs.gaussians.rendering import RenderOptions

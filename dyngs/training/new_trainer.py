@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from dyngs.capture.first_points import with_first_points
+from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.inspection.problems import before_training
 from dyngs.config import Config, ModelSection, PointsInit, RandomInit
 from dyngs.core.errors import DyngsError, reading, warn
@@ -16,10 +16,9 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.gaussians.start import FirstGaussians
+from dyngs.gaussians.start import FirstGaussians, surroundings
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
