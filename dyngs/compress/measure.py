@@ -57,12 +57,8 @@ class StoragePlan:
     images: Images | None = None  # draws what was compared; None where no image can be drawn
 
 
-@dataclass(frozen=True)
-class _Shot:
-    """Camera and time of one training image."""
-
-    cameras: Cameras
-    time: float | None
+Shot = tuple[Cameras, float | None]
+"""Camera and time of one training image."""
 
 
 def storage_plan(
@@ -93,8 +89,8 @@ def storage_plan(
     @torch.no_grad()
     def images(drawn: Renderable) -> list[Tensor]:
         return [
-            drawn.render(shot.cameras, shot.time, options=options, background=background).rgb[0]
-            for shot in shots
+            drawn.render(camera, time, options=options, background=background).rgb[0]
+            for camera, time in shots
         ]
 
     def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
@@ -166,7 +162,7 @@ def coarsest_file(
     return None
 
 
-def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> list[_Shot]:
+def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> list[Shot]:
     """Return at most ``count`` training views, evenly chosen; where they have no times, those of
     the scene."""
     chosen = _chosen(capture, count)
@@ -177,7 +173,7 @@ def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> l
             for i in range(len(chosen))
         ]
     cameras = training_cameras(chosen, config.data)
-    return [_Shot(camera, time) for camera, time in zip(cameras, times, strict=True)]
+    return list(zip(cameras, times, strict=True))
 
 
 def _chosen(capture: Capture, count: int) -> list[View]:
@@ -186,9 +182,9 @@ def _chosen(capture: Capture, count: int) -> list[View]:
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
-def _visibility(scene: GaussianScene, shots: Sequence[_Shot]) -> Tensor:
+def _visibility(scene: GaussianScene, shots: Sequence[Shot]) -> Tensor:
     scene = scene.unmasked()
     total = torch.zeros(len(scene), device=scene.gaussians.means.device)
-    for shot in shots:
-        total += contributions(scene.at(shot.time), shot.cameras, scene.options)[0]
+    for camera, time in shots:
+        total += contributions(scene.at(time), camera, scene.options)[0]
     return total

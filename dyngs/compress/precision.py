@@ -106,21 +106,21 @@ def measured_precision(
         group = group_of(name, x)
         if group is not None and x.numel():
             groups.setdefault(group, {})[name] = x
-    num_values = sum(sum(x.numel() for x in group.values()) for group in groups.values())
-    steps = {}
-    too_coarse = {}
+    sizes = {name: sum(x.numel() for x in group.values()) for name, group in groups.items()}
+    steps: dict[str, float] = {}
+    enough: dict[str, float] = {}
     for name, group in groups.items():
-        fraction = sum(x.numel() for x in group.values()) / num_values
         steps[name], is_enough = _largest_step(
             lambda step, name=name, group=group: change({name: step}, group),
             list(group.values()),
-            allowed * fraction,
+            allowed * sizes[name] / sum(sizes.values()),
         )
-        too_coarse |= {} if is_enough else {name: 0.0}
-    kept, found = _scaled(steps, change, allowed)
-    if not found <= allowed:
-        kept, found = _scaled(steps | too_coarse, change, allowed)
-    if not found <= allowed:
+        enough[name] = steps[name] if is_enough else 0.0
+    for tried in (steps, enough):
+        kept, found = _scaled(tried, change, allowed)
+        if found <= allowed:
+            break
+    else:
         kept = dict.fromkeys((*groups, *exact), 0.0)
         found = change(kept)
     return Precision(kept, math.sqrt(found) * GREY_LEVELS, max_change)
