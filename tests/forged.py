@@ -25,12 +25,13 @@ from dyngs.runs.stored_file import (
     _DTYPES,
     MAGIC,
     MAX_HEADER,
+    Coding,
+    TensorKind,
     _Header,
     _Info,
     _stored,
     compressed,
 )
-from dyngs.runs.stored_tensors import Coding, TensorKind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

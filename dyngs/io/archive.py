@@ -12,8 +12,8 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from dyngs.core.errors import DyngsError, reading
-from dyngs.io.limits import require_at_most
-from dyngs.io.temporary import cache_folder, temporary_folder_beside
+from dyngs.io.fields import require_at_most
+from dyngs.io.write import cache_folder, temporary_folder_beside
 
 SUFFIXES = (".zip", ".r3d")
 """Endings of archives; the app Record3D calls its own .r3d."""

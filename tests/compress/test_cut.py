@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_fields import busy_config
 
-from dyngs.compress.cut import Cut, FieldSize, apply_cut, cut_config, field_size
+from dyngs.compress.search import Cut, FieldSize, apply_cut, cut_config, field_size
 from dyngs.config import Config, DynamicModel
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.new_trainer import assemble, restored_scene

@@ -12,10 +12,10 @@ from moving_scene import write_moving_run
 from dyngs.compress.measure import (
     FACTORS,
     StoragePlan,
+    assumed_precision,
     coarsest_file,
     storage_plan,
 )
-from dyngs.compress.precision import assumed_precision
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import GaussianScene

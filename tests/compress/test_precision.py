@@ -10,7 +10,7 @@ from moving_scene import camera
 from scenes import random_scene
 from torch import Tensor
 
-from dyngs.compress.precision import (
+from dyngs.compress.measure import (
     Draw,
     Precision,
     coarseness_of,
@@ -20,7 +20,7 @@ from dyngs.core.state import part_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.stored_tensors import (
+from dyngs.runs.stored_file import (
     MAX_COARSENESS,
     TensorKind,
     coding_of,

@@ -15,7 +15,7 @@ from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import is_capture
 from dyngs.io.archive import unpacked
-from dyngs.io.temporary import cache_folder
+from dyngs.io.write import cache_folder
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from torch import Tensor
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
-from dyngs.io.limits import require_at_most
 
 _HINT = "export a .ply with the program that wrote it, such as `ns-export gaussian-splat`"
 _SHAPES = {"means": 3, "scales": 3, "quats": 4, "opacities": 1}

@@ -21,10 +21,10 @@ from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.child import python_command
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats import usd_child
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
 from dyngs.io.formats.splat_file import SplatFile, described, from_linear, header_comments
-from dyngs.io.limits import require_at_most
 
 _SECONDS = 600.0  # of wall time; the child has less of processor time
 _NAMES = ("means", "scales", "opacities", "quats", "sh", "degree", "world")

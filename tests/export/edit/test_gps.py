@@ -10,7 +10,7 @@ from moving_scene import write_moving_run
 from PIL import Image
 
 from dyngs.data.capture import all_views
-from dyngs.export.edit.gps import east_north_up, gps_frame
+from dyngs.export.edit.frame import east_north_up, gps_frame
 from dyngs.io.formats.similarity import Similarity
 from dyngs.runs.opened import open_run
 

@@ -20,11 +20,12 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import splat_options
-from dyngs.io.formats.edit_note import note_path
+from dyngs.io.fields import VARIABLE
 from dyngs.io.formats.formats import (
     FORMATS,
     Format,
     moved_file,
+    note_path,
     read_splats,
     undone_file,
     upright,
@@ -32,7 +33,6 @@ from dyngs.io.formats.formats import (
 )
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.io.limits import VARIABLE
 
 LEAST_PSNR = {
     "ply": 99,

@@ -21,8 +21,7 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.stored_file import packed, unpacked
-from dyngs.runs.stored_tensors import (
+from dyngs.runs.stored_file import (
     FIXED_STEPS,
     LARGEST_HALF,
     LIMIT,
@@ -40,6 +39,7 @@ from dyngs.runs.stored_tensors import (
     is_step,
     opacities_from_grid,
     opacities_to_grid,
+    packed,
     rotations_from_grid,
     rotations_to_grid,
     sorted_axes,
@@ -47,6 +47,7 @@ from dyngs.runs.stored_tensors import (
     stored_edit,
     to_grid,
     to_whole,
+    unpacked,
 )
 
 
