@@ -24,16 +24,18 @@ from torch import Tensor
 
 from dyngs.compress.measure import CoarseFile, coarsest_file
 from dyngs.compress.stage import PROBED_VIEWS, probe_images, quality_of, removal, scores_of
-from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
+from dyngs.config import AutoColour, Config
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import innermost, with_innermost
+from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY, MeasuredView, find_view_dependent
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.renderable import Posable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
 from dyngs.training.new_trainer import GaussianTrainer
@@ -252,7 +254,7 @@ def unseen_images(trainer: GaussianTrainer) -> list[Image]:
     They play other motions there, in which poses are not refined.
     """
     views = trainer.capture.splits.get("val", ())
-    if not views or trainer.config.model.is_posed:
+    if not views or isinstance(trainer.model.scene, Posable):
         return []
     loader = ImageLoader(views, trainer.config.data)
     loader.device = trainer.device
