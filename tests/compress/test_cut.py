@@ -61,14 +61,6 @@ def test_everything_that_a_cut_says(trainer: Trainer) -> None:
     )
 
 
-def test_nothing_is_taken_by_no_cut(trainer: Trainer, end: Checkpoint, config: Config) -> None:
-    apply_cut(trainer, Cut(), torch.zeros(len(trainer.model.scene)))
-    assert cut_config(config, Cut()) == config
-    assert str(Cut()) == "nothing"
-    for name, x in trainer.checkpoint().tensors.items():
-        assert torch.equal(x, end.tensors[name]), name
-
-
 def test_the_configuration_says_what_is_left(config: Config) -> None:
     changed = cut_config(config, Cut(fraction=0.25, field=FieldSize(4, 2), harmonics=0.1))
     match changed.model:
