@@ -113,16 +113,6 @@ def test_depth_maps_in_another_unit_have_none(tmp_path: Path) -> None:
     assert points_of_depth_maps(plain, options, 1000) is None
 
 
-def test_a_still_capture_without_points_begins_with_those_of_its_depth_maps(tmp_path: Path) -> None:
-    capture = Capture(tmp_path, "polycam", {"train": tuple(_views(tmp_path))})
-    begun, lines = with_first_points(
-        capture, DataConfig(root=tmp_path), PointsInit(num_random=2000, dense=0)
-    )
-    assert lines == ["2,000 first points are from the depth maps"]
-    assert begun.points is not None
-    assert np.abs(begun.points.xyz[:, 2] - SLOPE * begun.points.xyz[:, 0]).max() < 1e-4
-
-
 def test_a_still_capture_without_any_points_is_swept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

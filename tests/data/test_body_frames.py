@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,9 @@ from dyngs.data.body_frames import (
     about_pelvis,
     body_frames,
     read_body_file,
-    rows_of,
     with_fitted_body,
 )
-from dyngs.data.capture import BodyFrames, Capture, View
+from dyngs.data.capture import BodyFrames, Capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
@@ -154,21 +152,6 @@ def test_bad_parameters(change: dict[str, Any], line: str) -> None:
         body_frames(FILE, **{**GOOD, **change})
     assert "body.npz" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def view_of(frame: int | None) -> View:
-    return View(f"v{frame}", Path(f"{frame}.png"), np.eye(4), np.eye(3), 4, 3, frame=frame)
-
-
-def test_views_find_their_rows_by_frame() -> None:
-    body = replace(random_body(0), frames=(2, 5, 9))
-    assert rows_of(FILE, body, [view_of(9), view_of(2), view_of(9)]).tolist() == [2, 0, 2]
-    with pytest.raises(
-        DyngsError, match=r"2 frames that have images \(3, 4\).* 3 frames from 2 to 9"
-    ):
-        rows_of(FILE, body, [view_of(2), view_of(4), view_of(3), view_of(4)])
-    with pytest.raises(DyngsError, match=r"None\.png has no frame number"):
-        rows_of(FILE, body, [view_of(None)])
 
 
 @pytest.fixture(scope="module")

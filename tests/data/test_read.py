@@ -103,14 +103,6 @@ def test_nothing_recognised_lists_what_was_looked_for(tmp_path: Path) -> None:
         assert wanted in str(caught.value)
 
 
-def test_missing_images_are_a_warning_and_then_an_error_of_the_loader(colmap_root: Path) -> None:
-    (colmap_root / "images/left/03.jpg").unlink()
-    capture = read(colmap_root)
-    assert "1 of 9 images are missing" in capture.warnings[0]
-    with pytest.raises(DyngsError, match=r"left/03\.jpg"):
-        ImageLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
-
-
 def test_views_without_images_may_be_left_out(colmap_root: Path) -> None:
     """Before every n-th of the others is held out; the count is of all splits."""
     for name in ("left/01.jpg", "left/03.jpg"):
@@ -149,21 +141,6 @@ def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> No
     assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
     assert (capture.span, capture.seconds) == ((0.0, 0.06), None)
     assert dict(report_on(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
-
-
-def test_times_from_0_to_1_are_kept_exactly(blender_root: Path) -> None:
-    set_times(blender_root, "train", [i / 15 for i in range(16)])
-    set_times(blender_root, "test", [0.1, 0.3])
-    edit_json(blender_root / "transforms_train.json", lambda c: c.update(fps=30))
-    edit_json(blender_root / "transforms_test.json", lambda c: c["frames"].clear())
-    capture = read(blender_root)
-    assert {view.time for view in capture.splits["train"]} == {i / 15 for i in range(16)}
-    assert (capture.span, capture.seconds) == ((0.0, 1.0), pytest.approx(0.5))
-    facts = dict(report_on(capture).facts)
-    assert (facts["times"], facts["duration"]) == (
-        "16 in 0 to 1",
-        "0.5 seconds from time 0 to time 1",
-    )
 
 
 def test_seconds_of_numbered_images(tmp_path: Path) -> None:
@@ -357,11 +334,3 @@ def test_priors_outside_the_capture_are_refused(tmp_path: Path, key: str) -> Non
     )
     with pytest.raises(DyngsError, match="outside the capture"):
         read_capture(root)
-
-
-def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
-    np.save(with_priors(tmp_path) / "b_flow.npy", np.zeros((4, 6, 2)))
-    with pytest.raises(
-        DyngsError, match=r"b_flow\.npy: the flow field is 6x4 but its image is 12x8"
-    ):
-        loaded(tmp_path)[1]

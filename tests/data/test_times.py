@@ -18,7 +18,6 @@ from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.times import (
     SECONDS_FILE,
     clip_seconds,
-    distinct_times,
     hold_out_frames,
     number_cameras,
     parse_frames,
@@ -285,20 +284,6 @@ def test_times_are_counted_over_all_splits() -> None:
         ("test/2", pytest.approx(0.625)),
     ]
     assert kept["train"][1].time == kept["test"][0].time
-
-
-def test_a_hair_apart_is_one_time() -> None:
-    """Also where rounding to decimals would part them; the distance to the neighbour counts."""
-    times = [0.0, 0.5, 0.5000004, 0.5000008, 0.500003, 1.0]
-    assert list(distinct_times(splits(times, [])["train"]).values()) == [
-        0.0,
-        0.5,
-        0.5,
-        0.5,
-        0.500003,
-        1.0,
-    ]
-    assert len(select_frames(ROOT, splits(times, []), "1:2")["train"]) == 3
 
 
 def filmed(camera: int, split: Split) -> dict[Split, tuple[View, ...]]:

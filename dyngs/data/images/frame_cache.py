@@ -238,12 +238,10 @@ def _remove(folder: Path) -> int:
         with (folder / _MARK_NAME).open("rb") as mark:
             if fcntl is not None:
                 fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            for path in _own_files(folder):
-                if path.name != _MARK_NAME:
-                    size = path.stat().st_size
-                    path.unlink()
-                    freed += size
-        (folder / _MARK_NAME).unlink()
+            for path in sorted(_own_files(folder), key=lambda path: path.name == _MARK_NAME):
+                size = path.stat().st_size
+                path.unlink()
+                freed += size
         folder.rmdir()
     except OSError:
         pass  # another process reads these frames, or somebody else's files are there, too

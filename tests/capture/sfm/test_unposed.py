@@ -96,17 +96,6 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
     assert video.read_bytes() == before
 
 
-def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
-    data = DataConfig(root=_videos(tmp_path / "rig", 2))
-    first = with_poses(data, needs_times=True, say=lambda _: None)
-    assert with_poses(data, needs_times=True, say=lambda _: None) == first
-    assert asked == [tmp_path / "rig"]
-    (tmp_path / "rig" / "videos.json").write_text('{"starts": 0}')
-    assert with_poses(data, needs_times=True, say=lambda _: None).root != first.root, (
-        "offsets are given now"
-    )
-
-
 def test_what_cannot_work_is_said_before_poses_are_estimated(
     tmp_path: Path, asked: list[Path]
 ) -> None:

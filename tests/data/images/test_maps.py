@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tiny_captures import random_pixels, write_image
+from tiny_captures import write_image
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Lens, Silhouette, View
@@ -46,11 +45,6 @@ def test_floats_are_taken_as_they_are(tmp_path: Path, ending: str) -> None:
     assert read_depth(path).tolist() == [[2.5, 0], [0, 0]]
 
 
-def test_labels_of_sixteen_bits_are_not_rounded_away(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.png", np.array([[[0], [1], [300]]], np.uint16))
-    assert read_labels(tmp_path / "a.png").tolist() == [[0, 1, 300]]
-
-
 def test_each_colour_of_a_label_image_is_a_label_and_alpha_is_none(tmp_path: Path) -> None:
     colours = np.array([[[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 0, 0]]], np.uint8)
     for image in (colours, np.pad(colours, ((0, 0), (0, 0), (0, 1)), constant_values=255)):
@@ -78,18 +72,6 @@ def test_sizes_are_checked_before_memory_is_allocated(tmp_path: Path) -> None:
     (tmp_path / "a.flo").write_bytes(flo(2**30, 2**30, np.zeros(2)))
     with pytest.raises(DyngsError, match="megapixels"):
         read_flow(tmp_path / "a.flo")
-
-
-@pytest.mark.parametrize(
-    ("person", "expected"),
-    [("white", [0, 1, 128, 255]), ("black", [255, 254, 127, 0]), ("nonzero", [0, 255, 255, 255])],
-)
-def test_silhouettes_become_alpha(tmp_path: Path, person: Any, expected: list[int]) -> None:
-    write_image(tmp_path / "m.png", np.array([[[0], [1], [128], [255]]], np.uint8))
-    pixels = torch.from_numpy(random_pixels(1, 4, 3))
-    cut = cut_out(pixels, Silhouette(tmp_path / "m.png", person))
-    assert cut[0, :, 3].tolist() == expected
-    assert torch.equal(cut[..., :3], pixels)
 
 
 def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
