@@ -12,7 +12,7 @@ from dyngs.cli.output import ProgressBar, print_lines, print_notes
 from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
-    from dyngs.human.fit.known_person import KnownAvatar
+    from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "spin", "room", "roll", "human", "people")
@@ -139,13 +139,6 @@ def _add_people(verbs: args.Commands) -> None:
     about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    parser.add_argument(
-        "--person",
-        type=int,
-        default=1,
-        metavar="N",
-        help="which of several people (1: the largest)",
-    )
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
@@ -343,15 +336,13 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
+    from dyngs.human.detect.detector import MediaPipe
     from dyngs.human.detect.find_person import write_found_person
-    from dyngs.human.detect.mediapipe import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
-        result = write_found_person(
-            options, arguments.out, detector, report, number=arguments.person
-        )
+        result = write_found_person(options, arguments.out, detector, report)
     print_lines(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
@@ -363,7 +354,7 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
     if person is None or not (person / RESOLVED_NAME).is_file():
         return None
     from dyngs.human.avatar.scene import avatar_of
-    from dyngs.human.fit.known_person import KnownAvatar
+    from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.runs.checkpoint import load_run
 
     run = load_run(person)

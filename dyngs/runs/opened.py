@@ -271,7 +271,7 @@ class Opened(LoadedRun):
         playing = scene.playing(clip)
         notes = (*self.notes, *motion.notes)
         if keep_feet:
-            from dyngs.human.motion.feet import feet_kept, sole_points  # late: scipy, as above
+            from dyngs.human.motion.feet import feet_kept, sole_points
             from dyngs.human.motion.placement import up_direction as up_of_body
 
             skeleton = playing.learned_skeleton
@@ -286,7 +286,7 @@ class Opened(LoadedRun):
     def at_rest(self) -> Opened:
         """Return the same with its person in the rest pose of the template, upright on the floor.
         Raises DyngsError."""
-        from dyngs.human.motion.placement import rest_clip  # late: scipy, as above
+        from dyngs.human.motion.placement import rest_clip
 
         scene, _ = self._person_for("--pose rest")
         rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
@@ -299,7 +299,7 @@ class Opened(LoadedRun):
         how = self.frame
         if self.edited is None or person is None:
             return self
-        from dyngs.human.motion.placement import moved  # late: scipy, as above
+        from dyngs.human.motion.placement import moved
 
         like = person.clip.trans
         pelvis = person.learned_skeleton.joints[0] * math.exp(person.fit.log_scale)

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.api.from_scene import first_of, settled
+from dyngs.api.from_scene import settled
 from moving_scene import write_moving_run
 
 from dyngs.api.edit import Edits, edit_scene
+from dyngs.api.first_scene import first_of
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, FixedStrategy
