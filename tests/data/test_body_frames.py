@@ -17,7 +17,6 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import (
     about_pelvis,
     body_frames,
-    read_body_file,
     with_fitted_body,
 )
 from dyngs.data.capture import BodyFrames, Capture
@@ -168,14 +167,6 @@ def write(path: Path, count: int = 3, **more: np.ndarray) -> Path:
         path, poses=np.zeros((count, 165)), trans=rows * np.ones(3), betas=np.zeros(44), **more
     )
     return path
-
-
-def test_rows_are_for_the_frames_that_the_file_names(tmp_path: Path) -> None:
-    body = read_body_file(write(tmp_path / "b.npz", frames=np.array([7, 3, 5])))
-    assert body.frames == (3, 5, 7)
-    assert body.trans[:, 0].tolist() == [1, 2, 0]
-    assert (body.shape_space, body.fitted_to) == ("smpl", "")
-    assert read_body_file(write(tmp_path / "c.npz")).frames == (0, 1, 2)
 
 
 def test_a_fit_replaces_the_bodies_of_a_capture(capture: Capture, tmp_path: Path) -> None:

@@ -70,13 +70,6 @@ def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
     assert len(asked) == 2
 
 
-def test_masks_beside_the_images_are_no_photos(tmp_path: Path, asked: list[Path]) -> None:
-    _photos(tmp_path / "scan" / "images")
-    _photos(tmp_path / "scan" / "masks")
-    with_poses(DataConfig(root=tmp_path / "scan"), say=lambda _: None)
-    assert asked == [tmp_path / "scan" / "images"]
-
-
 def test_no_output_replaces_the_video_that_a_run_is_made_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,15 +11,13 @@ import torch
 from tiny_captures import write_image
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.capture import Lens, Silhouette, View
+from dyngs.data.capture import Lens, View
 from dyngs.data.images.lens import undistort_map, undistorted_points
 from dyngs.data.images.maps import (
-    cut_out,
     flow_at,
     nearest_positions,
     read_depth,
     read_flow,
-    read_labels,
     silhouette_box,
     taken_at,
 )
@@ -45,16 +43,6 @@ def test_floats_are_taken_as_they_are(tmp_path: Path, ending: str) -> None:
     assert read_depth(path).tolist() == [[2.5, 0], [0, 0]]
 
 
-def test_each_colour_of_a_label_image_is_a_label_and_alpha_is_none(tmp_path: Path) -> None:
-    colours = np.array([[[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 0, 0]]], np.uint8)
-    for image in (colours, np.pad(colours, ((0, 0), (0, 0), (0, 1)), constant_values=255)):
-        write_image(tmp_path / "a.png", image)
-        (labels,) = read_labels(tmp_path / "a.png").tolist()
-        assert labels[0] == 0
-        assert labels[1] == labels[4]
-        assert len(set(labels)) == 4
-
-
 def flo(width: int, height: int, values: np.ndarray) -> bytes:
     return struct.pack("<fii", 202021.25, width, height) + values.astype("<f4").tobytes()
 
@@ -72,22 +60,6 @@ def test_sizes_are_checked_before_memory_is_allocated(tmp_path: Path) -> None:
     (tmp_path / "a.flo").write_bytes(flo(2**30, 2**30, np.zeros(2)))
     with pytest.raises(DyngsError, match="megapixels"):
         read_flow(tmp_path / "a.flo")
-
-
-def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
-    hdf5 = tmp_path / "m.hdf5"
-    masks = np.zeros((5, 2, 3), np.uint8)
-    masks[3, 1, 2] = 1
-    with h5py.File(hdf5, "w") as file:
-        file.create_dataset("masks", data=masks, compression="lzf")
-    pixels = torch.zeros(2, 3, 3, dtype=torch.uint8)
-    assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [
-        [0, 0, 0],
-        [0, 0, 255],
-    ]
-    with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
-        cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
 
 
 def test_the_box_holds_all_that_is_shown() -> None:
