@@ -44,6 +44,7 @@ MAX_WHOLE = 2**63 - 1
 REMOVED_KEYS: dict[tuple[str, ...], object] = {
     ("model", "loose"): False,
     ("budget", "min_fps"): None,
+    ("optim", "sparse"): False,
 }
 """Keys of earlier versions that configurations of runs may still have, with the value at which they
 had no effect."""

@@ -229,12 +229,9 @@ class GaussianModel(Model[GaussianScene]):
         generator = self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
         frozen = self.colours.frozen_rest()
-        dense = self.densifier.touches_all
         resting = self.training.resting(self._scene)
         still = self.training.still()
-        bad = self._optimizer.step(
-            step, lr_means, dense=dense, frozen_rest=frozen, resting=resting, still=still
-        )
+        bad = self._optimizer.step(step, lr_means, frozen_rest=frozen, resting=resting, still=still)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:

@@ -106,8 +106,6 @@ def test_it_begins_where_the_scene_was(kind: str, capture: Path, run: Path, tmp_
 class Wild(Densifier):
     """Doubles every Gaussian beside itself, makes all fainter, and shakes them, in every step."""
 
-    touches_all = True
-
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         source = torch.arange(len(parameters)).repeat(2)
         edit = TopologyEdit(source, torch.arange(len(source)) >= len(parameters))

@@ -529,16 +529,10 @@ def _seeds(body: Body, shots: Shots, limit: int, num_terms: int) -> Gaussians:
     usual = body.turning.colors[body.turning.counts > 0].mean(0)
     place = cells(ways, FINE)
     colors = np.where(body.turning.counts[place, None] > 0, body.turning.colors[place], usual)
-    sh = torch.zeros(count, num_terms, 3, device="cpu")
-    sh[:, 0] = torch.from_numpy((colors - 0.5) / SH_C0).float()
+    base = torch.from_numpy((colors - 0.5) / SH_C0).float()
     spacing = radius * math.sqrt(4 * math.pi / count)
-    return Gaussians(
-        means=torch.from_numpy(body.path.centers[middle] + away * ways).float(),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
-        log_scales=torch.full((count, 3), math.log(SCALE * spacing), device="cpu"),
-        logit_opacities=torch.full((count,), LOGIT, device="cpu"),
-        sh=sh,
-    )
+    means = torch.from_numpy(body.path.centers[middle] + away * ways).float()
+    return Gaussians.isotropic(means, math.log(SCALE * spacing), LOGIT, base, num_terms)
 
 
 def _quats(rotations: np.ndarray) -> np.ndarray:

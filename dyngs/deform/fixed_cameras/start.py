@@ -122,16 +122,9 @@ def surface(track: Track) -> tuple[np.ndarray, float]:
 def _on_surface(
     points: np.ndarray, side: float, here: Track, footage: Sequence[Footage], num_terms: int
 ) -> Gaussians:
-    count = len(points)
-    sh = torch.zeros(len(points), num_terms, 3, device="cpu")
-    sh[:, 0] = torch.from_numpy((_colors(points, here, footage) - 0.5) / SH_C0).float()
-    return Gaussians(
-        means=torch.from_numpy(points + here.centers[0]).float(),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
-        log_scales=torch.full((count, 3), math.log(SCALE * side), device="cpu"),
-        logit_opacities=torch.full((count,), LOGIT, device="cpu"),
-        sh=sh,
-    )
+    base = torch.from_numpy((_colors(points, here, footage) - 0.5) / SH_C0).float()
+    means = torch.from_numpy(points + here.centers[0]).float()
+    return Gaussians.isotropic(means, math.log(SCALE * side), LOGIT, base, num_terms)
 
 
 def _colors(points: np.ndarray, track: Track, footage: Sequence[Footage]) -> np.ndarray:
