@@ -18,7 +18,7 @@ from dyngs.config import DynamicModel, FreeField
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, with_role
 from dyngs.data.loader import Image
-from dyngs.deform.bodies.paths import Shots
+from dyngs.deform.bodies.paths import FrameStack
 from dyngs.deform.bodies.start import Bodies, found_bodies
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import FieldSetup, Offsets, deformed, innermost
@@ -73,7 +73,7 @@ class TrainingViews:
     standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
     # what one moving camera shows, against N Gaussians that stand still; None where there is no
     # such camera
-    shots: Callable[[Gaussians], Shots | None] = lambda _: None
+    shots: Callable[[Gaussians], FrameStack | None] = lambda _: None
     options: RenderOptions = field(default_factory=RenderOptions)  # how training images are drawn
 
 

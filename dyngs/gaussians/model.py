@@ -23,7 +23,7 @@ from dyngs.gaussians.colour.training import (
     TrainingLooks,
 )
 from dyngs.gaussians.densify import Densifier
-from dyngs.gaussians.optimizer import GaussianOptimizer, Still
+from dyngs.gaussians.optimizer import FrozenMask, GaussianOptimizer
 from dyngs.gaussians.order import morton_order
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
@@ -79,7 +79,7 @@ class SceneTraining(Generic[S]):
         None: of none."""
         return None
 
-    def still(self) -> Still | None:
+    def still(self) -> FrozenMask | None:
         """Return what stays as it is, whatever the images say."""
         return None
 

@@ -18,7 +18,7 @@ ADAM_EPS = 1e-15
 
 
 @dataclass(frozen=True)
-class Still:
+class FrozenMask:
     """What training leaves as it is: Gaussians (N,) bool, None: none; with ``shapes`` all but the
     colours of all."""
 
@@ -71,7 +71,7 @@ class GaussianOptimizer:
         *,
         frozen_rest: Tensor | None = None,
         resting: Tensor | None = None,
-        still: Still | None = None,
+        still: FrozenMask | None = None,
     ) -> Count:
         """Update the parameters, drop the gradients, and return the number of rows left out for bad
         gradients.

@@ -23,7 +23,7 @@ from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.densify import Densifier
-from dyngs.gaussians.optimizer import Still
+from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.runs.opened import open_run
 from dyngs.training.new_trainer import assemble
 
@@ -177,7 +177,7 @@ def test_what_stays_is_not_part_of_a_change() -> None:
     means = torch.arange(12.0).reshape(n, 3)
     sh = torch.ones(n, 1, 3)
     old = Gaussians(means, torch.ones(n, 4), torch.zeros(n, 3), torch.arange(4.0), sh)
-    still = Still(torch.tensor([False, True, False, True]))
+    still = FrozenMask(torch.tensor([False, True, False, True]))
     source = torch.tensor([0, 1, 1, 2, 2])
     edit = TopologyEdit(source, torch.tensor([False, False, True, False, True]))
     result = EditResult(edit, {"means": -means[source]})
