@@ -59,7 +59,7 @@ def test_nested_keys_name_the_kinds_that_have_them() -> None:
     ) in names, "fields have none"
     assert ("model.motion_from", ("dynamic",)) in names
     assert ("model.deform.kind", ("dynamic",)) in names
-    assert ("model.deform.move_scales", ("dynamic", "hexplane or mlp or control_nodes")) in names, (
+    assert ("model.deform.moves", ("dynamic", "hexplane or mlp or control_nodes")) in names, (
         "those have it alike"
     )
     assert ("model.deform.width", ("dynamic", "hexplane")) in names

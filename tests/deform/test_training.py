@@ -149,7 +149,7 @@ def test_motion_is_learned_from_images(kind: str) -> None:
     gaussians = flat_cloud()
     blobs = {"log_scales": torch.full((9, 3), -2.5), "logit_opacities": torch.full((9,), 2.0)}
     gaussians = gaussians.replace(**{name: x.requires_grad_() for name, x in blobs.items()})
-    planes = {"resolution": 3, "levels": (1,), "time_resolution": 4, "channels": 16, "width": 64}
+    planes = {"resolution": 3, "levels": (1,), "channels": 16, "width": 64}
     rates = {
         "hexplane": {**planes, "lr_planes": 0.05, "lr_decoder": 0.01},
         "mlp": {"lr": 0.01, "width": 32},
