@@ -60,11 +60,11 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
+from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.static.training import StaticTraining
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"

@@ -41,9 +41,9 @@ from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
 from dyngs.gaussians.densify import DefaultDensifier, Densifier, McmcDensifier
 from dyngs.gaussians.start import surroundings
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
 from dyngs.models.views import resolved_background, training_cameras, training_times
-from dyngs.static.scene import StaticScene
 from dyngs.training.losses import SilhouetteLoss
 from dyngs.training.new_trainer import assemble, with_points
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dyngs.api.choose import choose
 from dyngs.api.first_scene import first_of
-from dyngs.capture.unposed import is_unposed, with_poses
+from dyngs.capture.sfm.unposed import is_unposed, with_poses
 from dyngs.config import (
     AutoColour,
     FixedStrategy,

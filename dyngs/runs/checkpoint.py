@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from dyngs.compress.storage.file import read_scene
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.conventions import RasterizeMode
@@ -30,6 +29,7 @@ from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.models.renderable import Renderable
+from dyngs.runs.stored_file import read_scene
 from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
 from dyngs.training.new_trainer import restored_model
 
@@ -37,7 +37,7 @@ KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
 _MOST_TIMING_BYTES = 1 << 20
 SCENE_FILE = "scene.dyngs"
-"""Name of the .dyngs file that holds a finished run, see ``dyngs.compress.storage``."""
+"""Name of the .dyngs file that holds a finished run, see ``dyngs.runs.stored_file``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
 MAX_STEP = 2**53
 BACKGROUNDS = ("white", "black", "random")

@@ -18,13 +18,15 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
+from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
-from dyngs.io.formats.splat_file import Nonfinite, drawing_options
+from dyngs.io.formats.splat_file import Nonfinite
 from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.renderable import Renderable
@@ -33,7 +35,6 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""
@@ -270,7 +271,7 @@ class Opened(LoadedRun):
         playing = scene.playing(clip)
         notes = (*self.notes, *motion.notes)
         if keep_feet:
-            from dyngs.human.motion.feet import feet_kept, sole_points  # late: scipy, as above
+            from dyngs.human.motion.feet import feet_kept, sole_points
             from dyngs.human.motion.placement import up_direction as up_of_body
 
             skeleton = playing.learned_skeleton
@@ -285,7 +286,7 @@ class Opened(LoadedRun):
     def at_rest(self) -> Opened:
         """Return the same with its person in the rest pose of the template, upright on the floor.
         Raises DyngsError."""
-        from dyngs.human.motion.placement import rest_clip  # late: scipy, as above
+        from dyngs.human.motion.placement import rest_clip
 
         scene, _ = self._person_for("--pose rest")
         rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
@@ -298,7 +299,7 @@ class Opened(LoadedRun):
         how = self.frame
         if self.edited is None or person is None:
             return self
-        from dyngs.human.motion.placement import moved  # late: scipy, as above
+        from dyngs.human.motion.placement import moved
 
         like = person.clip.trans
         pelvis = person.learned_skeleton.joints[0] * math.exp(person.fit.log_scale)

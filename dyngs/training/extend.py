@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.config import Config, DynamicModel, HumanModel, TrainConfig
+from dyngs.config import Config, DynamicModel, TrainConfig
 from dyngs.core.errors import DyngsError, counted
 from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.training import DeformSchedule
@@ -68,9 +68,6 @@ def with_length(config: Config, done: int, steps: int) -> Config:
     match config.model:
         case DynamicModel():
             changed["model"] = _dynamic(config.model, length)
-        case HumanModel():
-            fraction = length.share(config.model.refine_from)
-            changed["model"] = config.model.model_copy(update={"refine_from": fraction})
         case BgTriangleModel():
             fraction = length.share(config.model.texture_from)
             changed["model"] = config.model.model_copy(update={"texture_from": fraction})

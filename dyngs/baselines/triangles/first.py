@@ -18,6 +18,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.start import densifier_of, first_gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.surface import (
     DepthView,
     Mesh,
@@ -30,7 +31,6 @@ from dyngs.gaussians.surface import (
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.static.scene import StaticScene
 
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000

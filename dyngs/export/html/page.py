@@ -22,15 +22,15 @@ from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_
 from dyngs.export.html.element import element_script, text_of
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
 from dyngs.export.html.template import filled, script_safe, source_hash
+from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.static.levels import LevelScene
-from dyngs.static.scene import StaticScene
 
 PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # in a folder for a web server
 # pixels of the first view that a place at its target may be off where motion is fitted

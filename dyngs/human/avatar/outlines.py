@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.capture.background import SEEN_BARE
+from dyngs.capture.masks import SEEN_BARE
 from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced

@@ -16,15 +16,7 @@ from hypothesis import strategies as st
 from steps import Counting
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.budget.time import (
-    AIM,
-    FEWEST_STEPS,
-    Deadline,
-    first_fit,
-    fitting_steps,
-    refitted,
-    same_phase,
-)
+from dyngs.api.budget.time import AIM, Deadline, first_fit, fitting_steps, same_phase
 from dyngs.api.train import _Run, train
 from dyngs.config import (
     AutoColour,
@@ -42,14 +34,17 @@ from dyngs.data.capture import View
 from dyngs.data.decoding import Decoded
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.deform.control_nodes import refitted
+from dyngs.deform.fixed_cameras.hulls import FEWEST_STEPS
 from dyngs.deform.schedule import motion_begins_after
 from dyngs.io.lock import Held
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
-from dyngs.training.clock import Forecast, Stopwatch, with_steps
+from dyngs.training.clock import Forecast, Stopwatch
 from dyngs.training.events import StepReport
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import assemble, prepared
+from dyngs.training.plan import with_steps
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
