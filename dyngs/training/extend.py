@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.config import Config, DynamicModel, TrainConfig
 from dyngs.core.errors import DyngsError, counted
-from dyngs.deform.schedule import deform_schedule
-from dyngs.deform.training import DeformSchedule
+from dyngs.deform.schedule import DeformSchedule, deform_schedule
 from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 from dyngs.training.corrections.exposure import WARM_UP
