@@ -24,10 +24,11 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, as_word, reading
 from dyngs.data.capture import View
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.io.limits import read_limited
+from dyngs.io.fields import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.runs.stored_file import read_scene
 from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
@@ -151,7 +152,7 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
     """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has
     none."""
     config = load_resolved(run_dir, data_root=data_root)
-    if config.model.is_network:
+    if capability(config.model, Predicts) is not None:
         raise DyngsError(
             f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
         )

@@ -24,7 +24,7 @@ from dyngs.capture.fixed_camera import (
 )
 from dyngs.capture.masks import with_background_masks
 from dyngs.capture.sfm.photos import digest_of
-from dyngs.config import DataConfig, HumanModel
+from dyngs.config import DataConfig
 from dyngs.config.io import load_config
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted, reading, show
@@ -54,11 +54,11 @@ from dyngs.human.fit.capture_fit import (
     surface_of,
 )
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.io.lock import make_once
 from dyngs.io.outputs import new_folder
-from dyngs.io.temporary import cache_folder
-from dyngs.io.write import atomic_file, write_image, write_text
+from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY, _CONFIG = "body_train.npz", "config.yaml"
 

@@ -13,7 +13,8 @@ from limited import limited, said
 
 from dyngs.cli.kernel_bench import STAGES
 from dyngs.compress.stage import quality_of
-from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, StaticModel, TrainConfig
+from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, TrainConfig
+from dyngs.static.keys import StaticModel
 from dyngs.training.events import Event, Message, TopologyChanged
 from dyngs.training.new_trainer import assemble
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.config import DataConfig, HumanModel
+from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import moved, read_body_file
 from dyngs.data.images.images import read_image
@@ -27,6 +27,7 @@ from dyngs.human.fit.fitted_capture import (
     write_fitted_capture,
     write_split,
 )
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.write import write_image
