@@ -235,8 +235,8 @@ def two_images(root: Path) -> Capture:
 
 def read_splats(root: Path) -> object:
     """Read a file of Gaussians, render it, and write it as another one."""
+    from dyngs.gaussians.rendering import splat_options
     from dyngs.io.formats.formats import known_format, read_splats, write_splats
-    from dyngs.io.formats.splat_file import splat_options
 
     path = next((p for p in sorted(root.iterdir()) if known_format(p) is not None), root / "a.ply")
     splat = read_splats(path)

@@ -13,7 +13,7 @@ from dyngs.cli.output import numbers_table, print_tables, results_alone
 from dyngs.core.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
-    from dyngs.compress.prune.search import Promise
+    from dyngs.compress.search import Promise
     from dyngs.evaluate.comparison import Cost
 
 MAX_LOSS = 0.2

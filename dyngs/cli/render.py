@@ -193,7 +193,7 @@ def _before(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:
     """Return the scene with levels of detail, if they are asked for."""
-    from dyngs.static.levels import LevelScene
+    from dyngs.gaussians.levels import LevelScene
 
     most: int | None = arguments.max_gaussians_drawn
     return opened if most is None else opened.showing(LevelScene.of(opened.renderable, most))

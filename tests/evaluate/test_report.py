@@ -14,7 +14,7 @@ from moving_scene import TEST_TIMES, row_of_balls, sliding_nodes, write_moving_r
 
 import dyngs
 from dyngs.cli import main
-from dyngs.config import Config, DataConfig, StaticModel, TrainConfig
+from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
@@ -33,6 +33,7 @@ from dyngs.evaluate.report import (
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -41,7 +42,7 @@ from dyngs.runs.checkpoint import (
     load_run,
     save_checkpoint,
 )
-from dyngs.static.scene import StaticScene
+from dyngs.static.keys import StaticModel
 
 
 def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:

@@ -14,19 +14,20 @@ from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
 from scaled_files import FACTORS, write_scaled
 
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
 from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.export.choose_path import PathOptions, choose_path, orbit_around, view_to_show
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
-from dyngs.static.scene import StaticScene
 from dyngs.training.new_trainer import assemble
 
 MODEL = HumanModel(resolution=24, sh_degree=0, fit=False)

@@ -32,8 +32,8 @@ from dyngs.export.images import (
 )
 from dyngs.export.video import VideoWriter
 from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run, opened_scene
-from dyngs.static.scene import StaticScene
 
 BALLS = StaticScene(gaussians=two_balls())
 LABEL, GAP = 22, 6  # px, of contact sheets

@@ -41,8 +41,8 @@ from dyngs.export.html.page import MOST_VIEWS, PAGE, write_folder, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run, opened_scene
-from dyngs.static.scene import StaticScene
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,393 @@
+"""Storage precision of a trained scene, measured on images of its capture, and the coarsest file
+that will do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from dyngs.config import Config
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture, View
+from dyngs.data.loader import ImageLoader
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import contributions
+from dyngs.gaussians.scene import GaussianScene, render_options
+from dyngs.models.checkpoint import Checkpoint, read_capture_of
+from dyngs.models.renderable import Renderable
+from dyngs.models.views import evaluation_background, training_cameras
+from dyngs.runs.stored_file import (
+    COARSENESS,
+    LIMIT,
+    MAX_COARSENESS,
+    TRIANGLES,
+    checked_coarseness,
+    coding_of,
+    completed,
+    decoded,
+    drawable,
+    encoded,
+    group_of,
+    restored,
+    step_below,
+)
+from dyngs.training.new_trainer import restored_model, restored_scene
+
+GREY_LEVELS = 255.0
+TRIALS = 4  # number of steps tried per group
+CLOSE = 0.8  # fraction of the allowed error from which the search ends
+FIRST_STEP = 2.0**-6  # first step as a fraction of the mean magnitude of the values
+WIDEST_JUMP = 32.0
+OUTLYING, USUAL_FRACTION = 64.0, 0.95
+"""Values so many times as large as this fraction of those that are not 0 are outliers: steps are
+chosen without them."""
+MOST_VISIBLE = 0.9  # quantile of visibility above which Gaussians are stored most finely
+ASSUMED_STEPS = {
+    "quats": 2**-8,
+    "log_scales": 2**-6,
+    "logit_opacities": 2**-10,
+    "sh_base": 2**-7,
+    "sh_rest": 2**-7,
+}
+
+Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]
+"""Images (H, W, 3), always from the same cameras at the same times, of a checkpoint's tensors."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Quantisation steps and the change of images that they cause."""
+
+    steps: dict[str, float]  # of each group of tensors; 0: it is stored as it is
+    # root mean square change of the images, grey levels of 255; None where none could be drawn
+    change: float | None = None
+    allowed: float | None = None  # what it was to be at most; None likewise
+
+
+def coarseness_of(visibility: Tensor) -> Tensor:
+    """Return (N,) uint8 octaves by which each Gaussian may be stored more coarsely than the most
+    visible ones.
+
+    An error of a Gaussian counts with the square of its weight in the images: half an octave per
+    octave. ``visibility``: (N,) sums of its blending weights over images.
+    """
+    if not len(visibility):
+        return torch.zeros(0, dtype=torch.uint8, device=visibility.device)
+    most = torch.quantile(
+        visibility[:: max(len(visibility) // 2**20, 1)].double(), MOST_VISIBLE
+    ).clamp_min(1e-30)
+    octaves = -0.5 * (visibility.double() / most).clamp(1e-30, 1.0).log2()
+    return octaves.round().clamp_max(MAX_COARSENESS).to(torch.uint8)
+
+
+def assumed_precision(gaussians: Gaussians) -> Precision:
+    """Return steps where no image can be drawn: fine ones; those of positions follow the size of
+    the Gaussians."""
+    log_scales = gaussians.log_scales.detach().double()
+    size = float(log_scales.median(1).values.median().exp()) if len(log_scales) else 1.0
+    return Precision(
+        {f"gaussians.{name}": step for name, step in ASSUMED_STEPS.items()}
+        | {"gaussians.means": size / 64}
+    )
+
+
+def measured_precision(
+    exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
+) -> Precision:
+    """Return the largest steps found that change the images by at most ``max_change``, grey levels
+    of 255.
+
+    ``exact``: from ``drawable``, with the coarseness of the Gaussians if they have any; ``draw``
+    draws its like anew. Raises DyngsError: a value is not finite.
+    """
+
+    def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
+        """Return the mean square over all values, with the tensors of these names quantised."""
+        return mean_square_change(wanted, draw(completed(rounded(exact, steps, names))))
+
+    allowed = (max_change / GREY_LEVELS) ** 2
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, x in exact.items():
+        group = group_of(name, x)
+        if group is not None and x.numel():
+            groups.setdefault(group, {})[name] = x
+    sizes = {name: sum(x.numel() for x in group.values()) for name, group in groups.items()}
+    steps: dict[str, float] = {}
+    enough: dict[str, float] = {}
+    for name, group in groups.items():
+        steps[name], is_enough = _largest_step(
+            lambda step, name=name, group=group: change({name: step}, group),
+            list(group.values()),
+            allowed * sizes[name] / sum(sizes.values()),
+        )
+        enough[name] = steps[name] if is_enough else 0.0
+    for tried in (steps, enough):
+        kept, found = _scaled(tried, change, allowed)
+        if found <= allowed:
+            break
+    else:
+        kept = dict.fromkeys((*groups, *exact), 0.0)
+        found = change(kept)
+    return Precision(kept, math.sqrt(found) * GREY_LEVELS, max_change)
+
+
+def rounded(
+    exact: Mapping[str, Tensor], steps: Mapping[str, float], names: Iterable[str] | None = None
+) -> dict[str, Tensor]:
+    """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
+
+    ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``names``:
+    of the tensors that are rounded.
+    """
+    coarseness = (
+        checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"]))
+        if COARSENESS in exact
+        else None
+    )
+    found = dict(exact)
+    for name in exact if names is None else names:
+        coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
+        found[name] = restored(exact[name], coding, coarseness)
+    return found
+
+
+def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> float:
+    """Return the mean square over all values of images in [0, 1], after clamping; NaN where one of
+    them is."""
+    total = sum(
+        float((x.clamp(0, 1) - y.clamp(0, 1)).double().square().sum())
+        for x, y in zip(before, after, strict=True)
+    )
+    return total / max(sum(x.numel() for x in before), 1)
+
+
+def _scaled(
+    steps: dict[str, float], change: Callable[[Mapping[str, float]], float], allowed: float
+) -> tuple[dict[str, float], float]:
+    """Return all steps times one factor, so that together they change the images by what is allowed
+    or less.
+
+    And the mean square change that they make, which is larger only where no factor that was tried
+    is small enough.
+    """
+    best = None
+    tried = steps
+    found = math.inf
+    factor = 1.0
+    for trial in range(2 * TRIALS):
+        tried = {name: step and step_below(factor * step) for name, step in steps.items()}
+        found = change(tried)
+        if found <= allowed and (best is None or found > best[1]):
+            best = (tried, found)
+        if best is not None and (trial >= TRIALS or found > CLOSE * allowed):
+            break
+        if math.isnan(found):
+            break
+        factor *= min(max(math.sqrt(0.95 * allowed / max(found, 1e-300)), 0.5), 2.0)
+    return (tried, found) if best is None else best
+
+
+def _largest_step(
+    change: Callable[[float], float], group: Sequence[Tensor], allowed: float
+) -> tuple[float, bool]:
+    """Return the largest step tried that changes images by at most ``allowed``, else the finest;
+    and whether it does.
+
+    The first one tried where these images do not depend on the group at all: others may.
+    """
+    size, mean_square = _usual_size(torch.cat([x.flatten() for x in group]))
+    if size == 0:
+        return 1.0, True
+    finest = 2 * size / LIMIT
+    coarsest = 4 * size
+    step = first = min(max(FIRST_STEP * math.sqrt(mean_square), finest), coarsest)
+    best = None
+    for _ in range(TRIALS):
+        step = step_below(min(max(step, finest), coarsest))
+        found = change(step)
+        if math.isnan(found):
+            return finest, False
+        if found <= allowed:
+            best = max(best or 0.0, step)
+            if found > CLOSE**2 * allowed or step >= coarsest / 2:
+                break
+        step *= min(
+            max(math.sqrt(0.9 * allowed / max(found, 1e-300)), 1 / WIDEST_JUMP), WIDEST_JUMP
+        )
+    if best is None:
+        return finest, change(step_below(finest)) <= allowed
+    return step_below(first) if best >= coarsest / 2 else best, True
+
+
+def _usual_size(values: Tensor) -> tuple[float, float]:
+    """Return the largest of the values without outliers, and the mean of their squares."""
+    sizes = values.abs().double()
+    nonzero = sizes[sizes > 0]
+    if not len(nonzero):
+        return 0.0, 0.0
+    usual = nonzero.kthvalue(max(int(USUAL_FRACTION * len(nonzero)), 1)).values
+    sizes = sizes[sizes <= OUTLYING * usual]
+    return float(sizes.max()), float(sizes.square().mean())
+
+
+LOSS_DB = 0.025
+"""Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""
+# of triangles: places as they are, all else in half precision
+_ASSUMED = Precision({TRIANGLES: 0.0})
+COMPARED = 6  # number of training views in which the change is measured
+SMALLEST_CHANGE = 0.01  # smallest change to allow, in grey levels of 255
+LOOKED_AT = 50  # number of training views in which the visibility of each Gaussian is measured
+
+# factors on the usual steps that are tried, by bisection
+FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))
+
+Images = Callable[[Renderable], list[Tensor]]
+"""Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
+
+
+@dataclass(frozen=True)
+class StoragePlan:
+    """Precision and coarseness with which a scene is stored."""
+
+    precision: Precision  # steps, and how much the images change
+    coarseness: Tensor | None = None  # (N,) uint8 of the Gaussians, or None
+    images: Images | None = None  # draws what was compared; None where no image can be drawn
+
+
+Shot = tuple[Cameras, float | None]
+"""Camera and time of one training image."""
+
+
+def storage_plan(
+    config: Config, checkpoint: Checkpoint, scene: Renderable, max_change: float | None
+) -> StoragePlan:
+    """Return how exactly ``scene`` must be stored: measured where the run's capture can be read.
+
+    ``checkpoint``: of ``scene``. ``max_change``: root mean square over all values of some training
+    images, grey levels of 255. None: what lowers their PSNR by ``LOSS_DB``, if it is independent of
+    the scene's own errors.
+    """
+    try:
+        capture = read_capture_of(config.data, checkpoint.info)
+    except DyngsError:
+        return StoragePlan(
+            assumed_precision(scene.gaussians) if isinstance(scene, GaussianScene) else _ASSUMED
+        )
+    coarseness = None
+    if isinstance(scene, GaussianScene):
+        coarseness = coarseness_of(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
+    _, background = evaluation_background(config.data.background, capture.has_alpha)
+    shots = _shots(config, capture, scene, COMPARED)
+    info = checkpoint.info
+    options = scene.options
+    if isinstance(scene, GaussianScene):
+        options = render_options(config.model, info.extent, info.world_scale)
+
+    @torch.no_grad()
+    def images(drawn: Renderable) -> list[Tensor]:
+        return [
+            drawn.render(camera, time, options=options, background=background).rgb[0]
+            for camera, time in shots
+        ]
+
+    def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
+        return images(restored_model(replace(checkpoint, tensors=dict(tensors)), config.model))
+
+    wanted = images(scene)
+    if max_change is None:
+        loader = ImageLoader(_chosen(capture, COMPARED), config.data)
+        truth = (loader[i].composite(background) for i in range(len(loader)))
+        errors = [
+            float((x.clamp(0, 1) - y).square().mean()) for x, y in zip(wanted, truth, strict=True)
+        ]
+        max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
+    exact = drawable(scene) | ({} if coarseness is None else {COARSENESS: coarseness})
+    return StoragePlan(
+        measured_precision(exact, wanted, redrawn, max(max_change, SMALLEST_CHANGE)),
+        coarseness,
+        images,
+    )
+
+
+@dataclass(frozen=True)
+class CoarseFile:
+    """A file in memory."""
+
+    data: bytes  # its bytes
+    factor: float  # on the usual steps
+    quality: float  # of the scene that is read from it
+    refused: float | None  # quality at the next coarser steps; None where none were tried
+
+
+def coarsest_file(
+    config: Config, checkpoint: Checkpoint, quality: Callable[[GaussianScene], float], least: float
+) -> CoarseFile | None:
+    """Return the file with the coarsest steps tried at which ``quality`` is at least ``least``;
+    None: it never is.
+
+    All steps are those that ``storage_plan`` measures, times one factor. The bytes are read again
+    before they count. ``quality``: of a scene, the higher the better.
+    """
+    scene = restored_scene(checkpoint, config.model)
+    plan = storage_plan(config, checkpoint, scene, None)
+    exact = drawable(scene) | ({} if plan.coarseness is None else {COARSENESS: plan.coarseness})
+
+    def drawn(tensors: dict) -> GaussianScene:
+        return restored_scene(Checkpoint(checkpoint.info, tensors), config.model)
+
+    def steps(factor: float) -> dict[str, float]:
+        return {
+            name: step and step_below(factor * step) for name, step in plan.precision.steps.items()
+        }
+
+    low = 0
+    high = len(FACTORS)
+    refused = None
+    while low < high:
+        middle = (low + high) // 2
+        found = quality(drawn(completed(rounded(exact, steps(FACTORS[middle])))))
+        if found >= least:
+            low = middle + 1
+        else:
+            refused, high = found, middle
+    for index in range(low - 1, -1, -1):
+        data = encoded(checkpoint.info, scene, steps(FACTORS[index]), plan.coarseness)
+        found = quality(drawn(decoded(data).tensors))
+        if found >= least:
+            return CoarseFile(data, FACTORS[index], found, refused)
+        refused = found
+    return None
+
+
+def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> list[Shot]:
+    """Return at most ``count`` training views, evenly chosen; where they have no times, those of
+    the scene."""
+    chosen = _chosen(capture, count)
+    times: Sequence[float | None] = [view.time for view in chosen]
+    if scene.times and None in times:
+        times = [
+            scene.times[(2 * i + 1) * len(scene.times) // (2 * len(chosen))]
+            for i in range(len(chosen))
+        ]
+    cameras = training_cameras(chosen, config.data)
+    return list(zip(cameras, times, strict=True))
+
+
+def _chosen(capture: Capture, count: int) -> list[View]:
+    views = capture.splits["train"]
+    count = min(count, len(views))
+    return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
+
+
+def _visibility(scene: GaussianScene, shots: Sequence[Shot]) -> Tensor:
+    scene = scene.unmasked()
+    total = torch.zeros(len(scene), device=scene.gaussians.means.device)
+    for camera, time in shots:
+        total += contributions(scene.at(time), camera, scene.options)[0]
+    return total
