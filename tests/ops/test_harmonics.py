@@ -122,3 +122,8 @@ def test_gradients_of_dimmed_colours() -> None:
     found = dimmed(sh, left, left[::2], 2)
     torch.testing.assert_close(found[:, 0] * SH_C0 + 0.5, (sh[:, 0] * SH_C0 + 0.5) * left[:, None])
     assert torch.autograd.gradcheck(lambda x, y: dimmed(x, y.detach(), y, 1), (sh, left))
+
+
+def test_harmonics_of_light_have_no_mean() -> None:
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    assert light_harmonics(axes).mean(0).abs().max() < 1e-6
