@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 
-from dyngs.capture.fixed_camera import FOCAL, is_plain_clip, read_fixed_camera, zoomed
+from dyngs.capture.fixed_camera import FOCAL, is_plain_clip, read_fixed_camera
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_image
@@ -81,12 +81,3 @@ def test_what_is_a_clip(tmp_path: Path) -> None:
     assert is_plain_clip(tmp_path / "a.mp4")
     with pytest.raises(DyngsError):
         read_fixed_camera(DataConfig(root=tmp_path / "a.mp4"))
-
-
-def test_a_zoomed_camera_stands_back(tmp_path: Path) -> None:
-    view = read_fixed_camera(DataConfig(root=frames(tmp_path / "c", 1))).splits["train"][0]
-    far = zoomed(view, 2.0, 3.0)
-    point = view.cam_from_world @ np.array([0.4, 0.2, -3.0, 1.0])
-    before = view.intrinsics @ point[:3]
-    after = far.intrinsics @ (far.cam_from_world @ [0.4, 0.2, -3.0, 1.0])[:3]
-    assert (after / after[2]).tolist() == pytest.approx((before / before[2]).tolist())
