@@ -7,11 +7,11 @@ from scenes import look_around
 from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel, HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.core.state import State, part_of, tensors_of
+from dyngs.deform.fields import OPEN, WindowedField
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.windows import OPEN, WindowedField
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
@@ -22,6 +22,7 @@ from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs

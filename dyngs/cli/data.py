@@ -99,12 +99,6 @@ def _add_sfm(verbs: args.Commands) -> None:
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument(
-        "--mapper",
-        choices=("auto", "global", "incremental"),
-        default="auto",
-        help="COLMAP's mapping",
-    )
-    parser.add_argument(
         "--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep"
     )
     frames = "frames to take of a video (default 100; of each of several: up to 300)"
@@ -219,7 +213,7 @@ def _add_synth(verbs: args.Commands) -> None:
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, or on videos without poses."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
-    from dyngs.capture.unposed import is_videos
+    from dyngs.capture.sfm.unposed import is_videos
     from dyngs.data.read import capture_folder
 
     arguments.path = capture_folder(arguments.path)
@@ -257,10 +251,10 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
 
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and print the next commands."""
-    from dyngs.capture.multi_video.estimate import poses_of_videos
-    from dyngs.capture.sfm import estimate_poses
-    from dyngs.capture.sfm_work import SfmOptions
-    from dyngs.capture.unposed import is_several_videos
+    from dyngs.capture.sfm.colmap import SfmOptions
+    from dyngs.capture.sfm.estimate import estimate_poses
+    from dyngs.capture.sfm.several_videos import poses_of_videos
+    from dyngs.capture.sfm.unposed import is_several_videos
     from dyngs.data.read import capture_folder
 
     limits = args.data_section(arguments.overrides)
@@ -273,7 +267,6 @@ def run_sfm(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{images}: --start is for a folder of several videos")
     options = SfmOptions(
         matching=arguments.matching,
-        mapper=arguments.mapper,
         num_frames=arguments.frames,
         masks=arguments.masks,
         starts=_starts(arguments.start),
@@ -293,7 +286,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 
 def _require_options_of_videos(arguments: argparse.Namespace) -> None:
     """Refuse options that several videos do not have."""
-    usual = {"matching": "auto", "mapper": "auto", "masks": None}
+    usual = {"matching": "auto", "masks": None}
     for option in (name for name, value in usual.items() if getattr(arguments, name) != value):
         raise DyngsError(
             f"{arguments.images}: --{option} is for one video or photos; leave it out for several videos"
@@ -320,8 +313,8 @@ def _starts(words: list[str]) -> dict[str, float] | None:
 
 def run_fit(arguments: argparse.Namespace) -> int:
     """Fit a body and print how good the fit is, and the next command."""
-    from dyngs.config import HumanModel
     from dyngs.human.fit.fitted_capture import FitInputs, write_fitted_capture
+    from dyngs.human.keys import HumanModel
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
     passed = {name: getattr(arguments, name) for name in _OF_A_FIT}

@@ -1,8 +1,8 @@
 """Networks that predict scenes from a few images: what each of them is, in training and at work.
 
-A kind of network has a module with ``learner(config, generator)``, which returns its ``Learner``,
-and ``predictor(config, checkpoint, data)``, which returns its ``Predictor`` for one capture. One
-trainer (``dyngs.training.prediction``) and one command (``dyngs.api.predict``) serve all kinds.
+A kind of network (``dyngs.models.kind.Predicts``) makes its ``Learner``, and its ``Predictor`` for
+one capture. One trainer (``dyngs.training.prediction``) and one command (``dyngs.api.predict``)
+serve all kinds.
 What is predicted is any ``Renderable``: Gaussians, an avatar, a field.
 """
 
@@ -112,14 +112,21 @@ class Learner(ABC, Generic[N]):
 
     Attributes:
         network: its weights are learned.
+        lr: highest learning rate of AdamW.
         names: of the people.
         background: "white", "black" or "random".
     """
 
     def __init__(
-        self, config: Config, network: N, names: Sequence[str], device: torch.device = CPU
+        self,
+        config: Config,
+        network: N,
+        names: Sequence[str],
+        lr: float,
+        device: torch.device = CPU,
     ) -> None:
         self.config, self.network, self.names, self.device = config, network, names, device
+        self.lr = lr
         chosen = config.data.background
         self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
 

@@ -15,16 +15,17 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.runs.opened import Captured, Opened, cameras_for_paths
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.captured_views import captured_views
 from dyngs.view.gate import free_port
-from dyngs.view.render_thread import Drawer
 from dyngs.view.server import Serving, Viewer, require_viser
+from dyngs.view.session import Drawer
 from dyngs.view.source import Source
+from dyngs.view.views import captured_views
 
 FRACTION = 0.2
 """Most of the time of training that images for browsers may take."""
@@ -64,10 +65,8 @@ class DrawnBetweenSteps:
             self._refreshed_at = start
         with torch.no_grad():
             for session in sessions:
-                session.take(
-                    session.opened.showing(_shell(scene, session.opened.background)),
-                    refreshes=refreshes,
-                )
+                shell = _shell(scene, session.opened.background)
+                session.take(session.opened.showing(shell), refreshes=refreshes)
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
@@ -85,7 +84,7 @@ class TrainingView:
     """
 
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
-        if config.model.is_network:
+        if capability(config.model, Predicts) is not None:
             raise DyngsError(
                 "--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts"
             )

@@ -10,8 +10,9 @@ import pytest
 import torch
 from tiny_stereo import stereo_config
 
-from dyngs.config import Config, HumanPredictorModel
+from dyngs.config import Config
 from dyngs.core.errors import DyngsError
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.gps.stereo import GpsNetwork
 from dyngs.io.tensor_file import FileKind, write_tensors
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo

@@ -15,9 +15,7 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
     FixedStrategy,
-    HumanModel,
     McmcStrategy,
     PointsInit,
     RandomInit,
@@ -25,6 +23,8 @@ from dyngs.config import (
 )
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.deform.keys import DynamicModel
+from dyngs.human.keys import HumanModel
 from dyngs.training import memory
 from dyngs.training.memory import (
     MemoryForecast,

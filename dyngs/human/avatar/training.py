@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.capture.background import SEEN_BARE
-from dyngs.config import HumanModel
+from dyngs.capture.masks import SEEN_BARE
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, with_role
@@ -41,6 +40,7 @@ from dyngs.human.avatar.posing import (
     share_sides,
 )
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Look, Loss
 from dyngs.models.views import background_colour

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from dyngs.capture.background import at_size, outlined
 from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
-from dyngs.capture.photos import digest_of
+from dyngs.capture.masks import at_size, outlined
+from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted, show

@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.capture.background import with_background_masks
 from dyngs.capture.fixed_camera import (
     FORMAT,
     is_plain_clip,
     read_fixed_camera,
     silhouettes_of,
 )
-from dyngs.capture.photos import digest_of
-from dyngs.config import DataConfig, HumanModel
+from dyngs.capture.masks import with_background_masks
+from dyngs.capture.sfm.photos import digest_of
+from dyngs.config import DataConfig
 from dyngs.config.io import load_config
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted, reading, show
@@ -51,6 +51,7 @@ from dyngs.human.fit.capture_fit import (
     surface_of,
 )
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.io.lock import make_once
 from dyngs.io.outputs import new_folder

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dyngs.config import HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
@@ -25,6 +24,7 @@ from dyngs.human.avatar.posing import Anchors
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.keys import HumanModel
 
 
 @settings(max_examples=40, deadline=None)

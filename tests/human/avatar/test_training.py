@@ -18,7 +18,6 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    HumanModel,
     OptimConfig,
     RunConfig,
     TrainConfig,
@@ -29,6 +28,7 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.runs.opened import open_run

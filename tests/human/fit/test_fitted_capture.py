@@ -27,6 +27,7 @@ from dyngs.human.fit.fitted_capture import (
     write_fitted_capture,
     write_split,
 )
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.write import write_image

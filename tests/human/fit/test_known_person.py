@@ -12,7 +12,7 @@ import torch
 from synthetic_bodies import model, write_npz
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, OptimConfig, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.human.avatar import pose_fit
@@ -27,6 +27,7 @@ from dyngs.human.fit.fitted_capture import (
     shape_of,
     with_shape,
 )
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.io.write import write_image
 from dyngs.training.new_trainer import assemble

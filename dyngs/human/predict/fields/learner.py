@@ -3,12 +3,13 @@ of one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
 from dyngs.config import Config, DataConfig
+from dyngs.core.conventions import ReportProgress
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import fields_moved_to
 from dyngs.data.loader import Image
@@ -107,8 +108,10 @@ class FieldLearner(Learner[FieldNetwork]):
         people: Sequence[DataConfig],
         device: torch.device = CPU,
     ) -> None:
-        super().__init__(config, network, [person.root.name for person in people], device)
-        self._template = template_of(section_of(config))
+        model = section_of(config)
+        names = [person.root.name for person in people]
+        super().__init__(config, network, names, model.lr, device)
+        self._template = template_of(model)
         self._opened = kept_open(self._open, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
@@ -132,7 +135,7 @@ class FieldLearner(Learner[FieldNetwork]):
         another view."""
         rings = [ring for ring in moments(person.views).values() if len(ring) > FEWEST_VIEWS]
         ring = rings[random_index(len(rings), generator)]
-        most = min(self.config.model.source_views, len(ring) - 1)
+        most = min(section_of(self.config).source_views, len(ring) - 1)
         count = FEWEST_VIEWS + random_index(most - FEWEST_VIEWS + 1, generator)
         if random_index(2, generator):
             sources = spread(ring, count, random_index(len(ring), generator))
@@ -173,18 +176,22 @@ def learner(config: Config, generator: torch.Generator) -> FieldLearner:
 
 
 def predictor(
-    config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any
+    config: Config,
+    checkpoint: Checkpoint,
+    data: DataConfig,
+    say: Callable[[str], None],
+    report: ReportProgress,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
 
-    ``told``: ``say`` and ``report`` of that fit.
+    ``say`` and ``report`` are told of that fit.
     """
     model = section_of(config)
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = with_fitted_body(data, only_if_needed=True, **told)
+        data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
     return FieldPredictor(config, network, person_of(data, template_of(model)), data)
 
 

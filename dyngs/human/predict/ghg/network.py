@@ -16,7 +16,6 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from dyngs.config import HumanPredictorModel
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
@@ -36,6 +35,7 @@ from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import rest_shape
 from dyngs.human.body.mesh import interpolate, rasterize, vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.models.convolution import ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import unit_quats

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, GpsModel
+from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
+from dyngs.core.conventions import ReportProgress
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import fields_moved_to
 from dyngs.data.capture import Capture, all_views
@@ -23,6 +24,7 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.static_scene import Sides, StaticScene
 from dyngs.gaussians.static_training import StaticTraining
+from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     Pair,
@@ -132,7 +134,8 @@ class GpsLearner(Learner[GpsNetwork]):
         people: Sequence[DataConfig],
         device: torch.device = CPU,
     ) -> None:
-        super().__init__(config, network, [person.root.name for person in people], device)
+        names = [person.root.name for person in people]
+        super().__init__(config, network, names, _section(config).lr, device)
         self._opened = kept_open(_lessons, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
@@ -200,7 +203,13 @@ def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     return GpsLearner(config, GpsNetwork(generator).to(device), captures_in(config.data), device)
 
 
-def predictor(config: Config, checkpoint: Checkpoint, data: DataConfig, **_: Any) -> Predictor[Any]:
+def predictor(
+    config: Config,
+    checkpoint: Checkpoint,
+    data: DataConfig,
+    say: Callable[[str], None],
+    report: ReportProgress,
+) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the capture of ``data``."""
     network = GpsNetwork(torch.Generator())
     load_weights(network, checkpoint)
