@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from dyngs.capture.fixed_camera import FORMAT
-from dyngs.config import DataConfig, HumanModel
+from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import moved, read_body_file
 from dyngs.data.images.images import read_image
