@@ -47,8 +47,7 @@ from dyngs.data.times import evenly_spaced, write_seconds
 from dyngs.io.containment import images_up_to, inside, staying_within
 from dyngs.io.fields import first_few, is_number, read_json_object
 from dyngs.io.outputs import require_new_folder
-from dyngs.io.temporary import temporary_folder_beside
-from dyngs.io.write import write_image, write_text
+from dyngs.io.write import temporary_folder_beside, write_image, write_text
 
 if TYPE_CHECKING:
     import pycolmap

@@ -26,9 +26,8 @@ from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.video import DECODER_VERSION, VideoInfo, probe_video, read_numbered_frames
 from dyngs.io.containment import inside
-from dyngs.io.limits import read_limited
-from dyngs.io.temporary import CACHE_VARIABLE, cache_folder
-from dyngs.io.write import atomic_file, image_error, write_text
+from dyngs.io.fields import read_limited
+from dyngs.io.write import CACHE_VARIABLE, atomic_file, cache_folder, image_error, write_text
 
 try:
     import fcntl

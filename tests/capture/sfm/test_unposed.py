@@ -18,8 +18,7 @@ from dyngs.config.io import save_config
 from dyngs.core.errors import DyngsError
 from dyngs.export.video import VideoWriter
 from dyngs.io.outputs import SOURCES_NAME
-from dyngs.io.temporary import cache_folder
-from dyngs.io.write import write_image
+from dyngs.io.write import cache_folder, write_image
 
 
 @pytest.fixture(autouse=True)

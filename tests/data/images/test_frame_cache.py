@@ -20,7 +20,7 @@ from dyngs.data.capture import VideoFrame
 from dyngs.data.images import frame_cache
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import read_image
-from dyngs.io.temporary import cache_folder
+from dyngs.io.write import cache_folder
 
 
 @pytest.fixture
