@@ -79,8 +79,6 @@ MUTATIONS = (
     ("human/avatar/posing.py", "height == min(heights)", "height == max(heights)", "human/avatar/test_anchors.py"),
     ("ops/harmonics.py", "3 * z * z - 1", "3 * z * z", "ops/test_harmonics.py"),
     ("ops/harmonics.py", "by_terms[6], y, value=-2", "by_terms[6], y, value=2", "ops/test_harmonics.py"),
-    ("human/avatar/observations.py", "index_add(1, near, x, alpha=-1)", "index_add(1, near, x)", "human/avatar/test_neighbours.py"),
-    ("human/avatar/posing.py", "by_parts - parts * by_parts.sum(1, keepdim=True)", "by_parts", "human/avatar/test_anchors.py"),
     ("human/body/skinning.py", "(above - turned).mT", "above.mT", "human/body/test_skinning.py"),
     ("human/body/skinning.py", "along * poses", "along", "human/body/test_skinning.py"),
     ("human/avatar/posing.py", "features[1:].flatten()", "rotations[1:].flatten()", "human/avatar/test_posing.py human/avatar/test_scene.py"),
