@@ -170,9 +170,9 @@ def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
 def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
     write(still_scene(), tmp_path / "page.html", large(camera(), 6))
     page = browser.open((tmp_path / "page.html").as_uri(), 320, 240, touch=True)
-    page.wait_for("window.dyngs?.core !== undefined")
+    page.wait_for("window.dyngs?.camera !== undefined")
     assert page.evaluate("dyngs.parts.bar.hidden")
-    before = page.evaluate("[dyngs.core.camera.yaw, dyngs.core.camera.distance]")
+    before = page.evaluate("[dyngs.camera.yaw, dyngs.camera.distance]")
     session = page.driven.context.new_cdp_session(page.driven)
 
     def touch(kind: str, *places: tuple[int, int]) -> None:
@@ -182,13 +182,13 @@ def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
     touch("touchStart", (100, 100))
     touch("touchMove", (140, 100))
     touch("touchEnd")
-    yaw, distance = page.evaluate("[dyngs.core.camera.yaw, dyngs.core.camera.distance]")
+    yaw, distance = page.evaluate("[dyngs.camera.yaw, dyngs.camera.distance]")
     assert yaw < before[0]
     assert distance == before[1]
     touch("touchStart", (100, 100), (140, 100))
     touch("touchMove", (80, 100), (160, 100))
     touch("touchEnd")
-    assert page.evaluate("dyngs.core.camera.distance") < 0.7 * distance
+    assert page.evaluate("dyngs.camera.distance") < 0.7 * distance
     assert page.errors == []
     page.close()
 
