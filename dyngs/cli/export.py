@@ -496,7 +496,8 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
 
 def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
-    from dyngs.export.rigged.mesh_file import Played, write_mesh
+    from dyngs.export.rigged.mesh_file import write_mesh
+    from dyngs.export.rigged.skeleton import Played
     from dyngs.export.rigged.splat_files import write_rigged_splats
     from dyngs.runs.opened import FRAME_RATE, open_scene
 
@@ -523,9 +524,8 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         if arguments.motion is not None
         else None
     )
-    written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
-    print_notes(written.notes)
-    print_written(written.path)
+    print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
+    print_written(out)
     return 0
 
 

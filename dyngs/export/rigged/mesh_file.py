@@ -4,27 +4,25 @@ no Gaussians."""
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.config import HumanModel
 from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.skeleton import (
-    BodyMesh,
-    JointAnimation,
+    Played,
     Rig,
     add_animation,
-    add_skeleton,
+    add_person,
     add_weights,
     anchor_normals,
-    animation_of,
     body_mesh,
     rest_vertices,
     rig_of,
+    vertex_normals,
 )
 from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
@@ -43,25 +41,9 @@ _LARGEST = 2048  # texels along a side of the largest texture
 _MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
 
 
-@dataclass(frozen=True)
-class Played:
-    """The motion that a file shows: its name and frame rate; the run plays it."""
-
-    name: str
-    fps: float
-
-
-@dataclass(frozen=True)
-class MeshFile:
-    """A mesh that was written."""
-
-    path: Path  # of the file
-    notes: tuple[str, ...]  # a line about each thing that was chosen, or that glTF cannot hold
-
-
-def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> MeshFile:
+def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tuple[str, ...]:
     """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up,
-    facing +z.
+    facing +z; return a line about each thing that was chosen, or that glTF cannot hold.
 
     The size is that of the capture; the soles stand at y = 0. Colours have the light of the capture
     in them, hence a material without light. ``played`` becomes an animation. Raises DyngsError: not
@@ -84,20 +66,17 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
         surface = fitted_surface(
             scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals)
         )
-        mesh = body_mesh(scene, body, surface.vertices)
         rig = rig_of(scene, surface.vertices)
-        animation = None
+        document = mesh_document(body, rig, surface.vertices, image)
         if played is not None:
-            animation = animation_of(
-                scene, rig, surface.vertices, body.weights, played.fps, played.name
-            )
-    document = mesh_document(mesh, rig, image, animation)
+            add_animation(document, scene, rig, surface.vertices, body.weights, played)
     with atomic_file(path) as temporary:
         document.write(temporary)
-    fraction = (filled.mirrored + filled.spread) / max(len(texels), 1)
+    count = max(len(texels), 1)
+    unseen = 100 * (filled.mirrored + filled.spread) / count
     notes = [
-        f"texture of {len(image)} x {len(image)}; {100 * fraction:.1f} % of the body is not seen in the Gaussians and "
-        f"has colours from around it, {100 * filled.mirrored / max(len(texels), 1):.1f} % from its mirror side"
+        f"texture of {len(image)} x {len(image)}; {unseen:.1f} % of the body is not seen in the Gaussians and "
+        f"has colours from around it, {100 * filled.mirrored / count:.1f} % from its mirror side"
     ]
     if surface.margin is None:
         notes.append(
@@ -110,8 +89,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
         )
     if scene.shapes is not None:
         notes.append("offsets that depend on the pose are left out: glTF's skins have none")
-    notes += scene.left_out
-    return MeshFile(path, tuple(notes))
+    return (*notes, *scene.left_out)
 
 
 def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTemplate]:
@@ -137,52 +115,38 @@ def texture_size(scene: HumanScene) -> int:
     return min(_FINER * max(round(1 / finest), 1), _LARGEST)
 
 
-def mesh_document(
-    mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointAnimation | None
-) -> GlbDocument:
-    """Return a mesh with its skeleton, texture and animation as a glTF document."""
+def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndarray) -> GlbDocument:
+    """Return a mesh over ``vertices`` (M, 3) at rest with its skeleton and texture as a glTF
+    document."""
     from PIL import Image
 
     document = GlbDocument()
-    nodes = list[dict[str, Any]]()
-    armature, first = add_skeleton(document, rig, nodes)
-    nodes.append({"name": "person", "mesh": 0, "skin": 0})
+    mesh = body_mesh(body)
+    normals = vertex_normals(vertices, body.faces)[mesh.source]
     uv = torch.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], dim=1)
-    attributes = {
-        "POSITION": document.add_numbers(
-            rig.placed(mesh.vertices).float().numpy(), VERTICES, limits=True
-        ),
-        "NORMAL": document.add_numbers(mesh.normals.float().numpy(), VERTICES),
-        "TEXCOORD_0": document.add_numbers(uv.float().numpy(), VERTICES),
-    } | add_weights(document, mesh.weights)
-    kind = np.uint16 if len(mesh.vertices) < 2**16 - 1 else np.uint32
-    indices = document.add_numbers(mesh.faces.flatten().numpy().astype(kind), INDICES)
+    places = rig.placed(vertices[mesh.source]).float().numpy()
+    kind = np.uint16 if len(mesh.source) < 2**16 - 1 else np.uint32
+    primitive = {
+        "attributes": {
+            "POSITION": document.add_numbers(places, VERTICES, limits=True),
+            "NORMAL": document.add_numbers(normals.float().numpy(), VERTICES),
+            "TEXCOORD_0": document.add_numbers(uv.float().numpy(), VERTICES),
+        }
+        | add_weights(document, body.weights[mesh.source]),
+        "indices": document.add_numbers(mesh.faces.flatten().numpy().astype(kind), INDICES),
+        "material": 0,
+    }
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, "PNG")
     view = document.add_bytes(stream.getvalue())
+    unlit = "KHR_materials_unlit"
     texture = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
+    material = {"name": "person", "pbrMetallicRoughness": texture, "extensions": {unlit: {}}}
     document.json |= {
-        "scene": 0,
-        "scenes": [{"nodes": [armature, len(nodes) - 1]}],
-        "nodes": nodes,
-        "meshes": [
-            {
-                "name": "person",
-                "primitives": [{"attributes": attributes, "indices": indices, "material": 0}],
-            }
-        ],
-        "materials": [
-            {
-                "name": "person",
-                "pbrMetallicRoughness": texture,
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
+        "materials": [material],
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"name": "albedo", "bufferView": view, "mimeType": "image/png"}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "extensionsUsed": ["KHR_materials_unlit"],
     }
-    if animation is not None:
-        add_animation(document, animation, first)
+    add_person(document, rig, primitive, unlit)
     return document

@@ -36,41 +36,23 @@ _MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three 
 
 @dataclass(frozen=True)
 class BodyMesh:
-    """A skinned mesh at rest; m, y up, facing +z."""
+    """A mesh whose vertices are those of a template, doubled at the seams of its atlas."""
 
-    vertices: Tensor  # (V, 3)
-    normals: Tensor  # (V, 3) outward unit normals
     uv: Tensor  # (V, 2) texture coordinates, row of the image = (1 - v) * H
     faces: Tensor  # (T, 3) int64, counter-clockwise from outside
-    # (V,) int64 vertex of the template that each is a copy of; more than one where the atlas has a
-    # seam
-    source: Tensor
-    weights: Tensor  # (V, J) skinning weights, rows sum to 1
-    skeleton: Skeleton  # of the person
+    source: Tensor  # (V,) int64 vertex of the template that each is a copy of
 
 
-def body_mesh(scene: HumanScene, body: BodyTemplate, vertices: Tensor) -> BodyMesh:
-    """Return the mesh of a person: the template's triangles over ``vertices`` (M, 3) at rest, the
-    person's joints.
-
-    Raises DyngsError: the template has no texture coordinates.
-    """
+def body_mesh(body: BodyTemplate) -> BodyMesh:
+    """Return the mesh of a template. Raises DyngsError: it has no texture coordinates."""
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(
             f"the body template '{body.name}' has no texture coordinates; train with model.uv=FILE.obj for a mesh"
         )
     pairs = body.faces.flatten() * len(body.uv) + body.uv_faces.flatten()
     corners, inverse = torch.unique(pairs, return_inverse=True)
-    source = corners // len(body.uv)
-    return BodyMesh(
-        vertices=vertices[source],
-        normals=vertex_normals(vertices, body.faces)[source],
-        uv=body.uv[corners % len(body.uv)],
-        faces=inverse.reshape(-1, 3),
-        source=source,
-        weights=body.weights[source],
-        skeleton=scene.learned_skeleton,
-    )
+    count = len(body.uv)
+    return BodyMesh(body.uv[corners % count], inverse.reshape(-1, 3), corners // count)
 
 
 def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
@@ -149,27 +131,30 @@ class Rig:
         return moved
 
 
-@dataclass(frozen=True)
-class JointAnimation:
-    """Motion of a rig's joints."""
-
-    name: str  # of the animation
-    seconds: np.ndarray  # (F,) float64
-    quats: np.ndarray  # (F, J, 4) xyzw, relative to the parent joints
-    root: np.ndarray  # (F, 3) place of the root joint
-    root_scale: np.ndarray  # (F,) its scale; 1 for a person who keeps the size
-
-
 def rig_of(scene: HumanScene, vertices: Tensor) -> Rig:
     """Return the rig of a person whose surface at rest has ``vertices`` (V, 3), m."""
     scale = float(scene.clip.scale.mean()) * float(np.exp(scene.fit.log_scale))
     return Rig(scene.learned_skeleton, scale, -scale * float(vertices[:, 1].amin()))
 
 
-def animation_of(
-    scene: HumanScene, rig: Rig, vertices: Tensor, weights: Tensor, fps: float, name: str
-) -> JointAnimation:
-    """Return the motion that a person plays: y up, on the floor y = 0, around the origin.
+@dataclass(frozen=True)
+class Played:
+    """The motion that a file shows: its name and frame rate; the run plays it."""
+
+    name: str
+    fps: float
+
+
+def add_animation(
+    document: GlbDocument,
+    scene: HumanScene,
+    rig: Rig,
+    vertices: Tensor,
+    weights: Tensor,
+    played: Played,
+) -> None:
+    """Add the motion that a person plays, y up, on the floor y = 0, around the origin, as an
+    animation of the joints, which are the first nodes; joints that never turn have no channel.
 
     ``vertices``: (V, 3) at rest, m, of which the lowest one stands on the floor. ``weights``: (V,
     J).
@@ -188,55 +173,54 @@ def animation_of(
     root = root - np.array([middle[0], min(lowest), middle[2]])
     poses = clip.poses.double().numpy()
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
-    seconds = np.arange(len(root)) / fps
-    return JointAnimation(
-        name, seconds, shorter_ways(quats), root, clip.scale.double().numpy() / rig.scale
-    )
+    quats = shorter_ways(quats)
+    scale = clip.scale.double().numpy() / rig.scale
+    channels = [(0, "translation", root)]
+    if np.abs(scale - 1).max() > _STILL:  # not of a person who keeps the size
+        channels.append((0, "scale", np.repeat(scale[:, None], 3, axis=1)))
+    for joint in range(quats.shape[1]):
+        if np.abs(quats[:, joint, :3]).max() > _STILL:
+            channels.append((joint, "rotation", quats[:, joint]))
+    document.add_animation(played.name, np.arange(len(root)) / played.fps, channels)
 
 
-def add_skeleton(document: GlbDocument, rig: Rig, nodes: list[dict[str, Any]]) -> tuple[int, int]:
-    """Add the nodes of the joints below one called Armature, and a skin; return the nodes Armature
-    and first joint."""
+def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any], extension: str) -> None:
+    """Add a node with a mesh of one ``primitive``, a skin, and the nodes of the joints, which are
+    the first ones, below one called Armature."""
     joints = rig.joints.double()
     parents = rig.skeleton.parents
-    first = len(nodes)
+    nodes: list[dict[str, Any]] = []
     for i, (name, parent) in enumerate(zip(rig.names, parents, strict=True)):
         place = joints[i] - joints[parent] if parent >= 0 else joints[i]
+        children = [child for child, above in enumerate(parents) if above == i]
         node: dict[str, Any] = {"name": name, "translation": place.tolist()}
-        children = [first + child for child, above in enumerate(parents) if above == i]
         nodes.append(node | {"children": children} if children else node)
-    roots = [first + i for i, parent in enumerate(parents) if parent < 0]
+    roots = [i for i, parent in enumerate(parents) if parent < 0]
     nodes.append({"name": "Armature", "children": roots})
+    nodes.append({"name": "person", "mesh": 0, "skin": 0})
     bind = np.tile(np.eye(4, dtype=np.float32), (len(joints), 1, 1))
     bind[:, 3, :3] = -joints.numpy()  # columns first
-    matrices = document.add_numbers(bind.reshape(-1, 16))
     skin = {
-        "joints": list(range(first, first + len(joints))),
-        "inverseBindMatrices": matrices,
+        "joints": list(range(len(joints))),
+        "inverseBindMatrices": document.add_numbers(bind.reshape(-1, 16)),
         "skeleton": roots[0],
     }
-    document.json["skins"] = [skin]
-    return len(nodes) - 1, first
-
-
-def add_animation(document: GlbDocument, animation: JointAnimation, first: int) -> None:
-    """Add an animation of the joints, whose nodes begin at ``first``; joints that never turn have
-    no channel."""
-    channels = [(first, "translation", animation.root)]
-    if np.abs(animation.root_scale - 1).max() > _STILL:
-        channels.append((first, "scale", np.repeat(animation.root_scale[:, None], 3, axis=1)))
-    for joint in range(animation.quats.shape[1]):
-        if np.abs(animation.quats[:, joint, :3]).max() > _STILL:
-            channels.append((first + joint, "rotation", animation.quats[:, joint]))
-    document.add_animation(animation.name, animation.seconds, channels)
+    document.json |= {
+        "skins": [skin],
+        "scene": 0,
+        "scenes": [{"nodes": [len(joints), len(joints) + 1]}],
+        "nodes": nodes,
+        "meshes": [{"name": "person", "primitives": [primitive]}],
+        "extensionsUsed": [extension],
+    }
 
 
 def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
     """Add the joints and weights (V, J) of vertices; return the accessors by attribute, the
     heaviest four first."""
     joints, fractions = heaviest_joints(weights)
-    filled = -(-fractions.shape[1] // 4) * 4 - fractions.shape[1]
-    joints, fractions = (torch.nn.functional.pad(x, (0, filled)) for x in (joints, fractions))
+    missing = -fractions.shape[1] % 4
+    joints, fractions = (torch.nn.functional.pad(x, (0, missing)) for x in (joints, fractions))
     joints = torch.where(fractions > 0, joints, 0).to(torch.uint8)
     found: dict[str, int] = {}
     for k in range(0, fractions.shape[1], 4):

@@ -6,7 +6,6 @@ Local letters: N Gaussians, J joints, K joints that one Gaussian follows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +13,18 @@ import torch
 
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
-from dyngs.export.rigged.mesh_file import Played, person_and_template
+from dyngs.export.rigged.mesh_file import person_and_template
 from dyngs.export.rigged.skeleton import (
-    Rig,
+    Played,
     add_animation,
-    add_skeleton,
+    add_person,
     add_weights,
     anchor_normals,
-    animation_of,
     rest_vertices,
     rig_of,
 )
 from dyngs.export.rigged.texture import frontal_colours
-from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import heaviest_joints
-from dyngs.human.avatar.scene import HumanScene
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.ply import write_ply
 from dyngs.io.formats.splat_file import SplatFile, require_writable
@@ -40,19 +36,12 @@ from dyngs.runs.inputs import inputs_of
 SUFFIXES = (".ply", ".glb")
 
 
-@dataclass(frozen=True)
-class RiggedSplats:
-    """Files of Gaussians with joints that were written: where, and a line about each thing that
-    they cannot hold."""
-
-    path: Path
-    notes: tuple[str, ...]
-
-
 @torch.no_grad()
-def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None) -> RiggedSplats:
+def write_rigged_splats(
+    run: LoadedRun, path: Path, played: Played | None = None
+) -> tuple[str, ...]:
     """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing
-    +z, soles at y = 0.
+    +z, soles at y = 0; return a line about each thing that the file cannot hold.
 
     ``.ply``: columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7``
     after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
@@ -88,51 +77,26 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
         log_scales=gaussians.log_scales + float(np.log(rig.scale)),
     )
     require_writable(path, gaussians)
-    if suffix == ".ply":
-        _write_columns(path, run, scene, rig, gaussians)
-        return RiggedSplats(path, notes)
-    document = _document(scene, rig, gaussians)
-    if played is not None:
-        animation = animation_of(scene, rig, vertices, body.weights, played.fps, played.name)
-        add_animation(document, animation, 0)
-    with atomic_file(path) as temporary:
-        document.write(temporary)
-    unsure = "KHR_gaussian_splatting does not say whether skins turn Gaussians: viewers may show the rest pose"
-    return RiggedSplats(path, (*notes, unsure))
-
-
-def _write_columns(
-    path: Path, run: LoadedRun, scene: HumanScene, rig: Rig, gaussians: Gaussians
-) -> None:
+    if suffix == ".glb":
+        document = GlbDocument()
+        primitive = add_gaussians(document, gaussians)
+        primitive["attributes"] |= add_weights(document, scene.weights)
+        add_person(document, rig, primitive, EXTENSION)
+        if played is not None:
+            add_animation(document, scene, rig, vertices, body.weights, played)
+        with atomic_file(path) as temporary:
+            document.write(temporary)
+        unsure = "KHR_gaussian_splatting does not say whether skins turn Gaussians: viewers may show the rest pose"
+        return (*notes, unsure)
     joints, weights = heaviest_joints(scene.weights)
     columns = {f"joint_{k}": joints[:, k].numpy() for k in range(joints.shape[1])}
     columns |= {f"weight_{k}": weights[:, k].numpy() for k in range(weights.shape[1])}
-    places = [" ".join(f"{x:.6f}" for x in place) for place in rig.joints.tolist()]
-    lines = [
-        f"joint {i} {name} {parent} {place}"
-        for i, (name, parent, place) in enumerate(
-            zip(rig.names, rig.skeleton.parents, places, strict=True)
-        )
-    ]
+    lines = []
+    for i, place in enumerate(rig.joints.tolist()):
+        x, y, z = (f"{number:.6f}" for number in place)
+        lines.append(f"joint {i} {rig.names[i]} {rig.skeleton.parents[i]} {x} {y} {z}")
     model = run.config.model
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, comments=tuple(lines), up="y")
     with atomic_file(path) as temporary:
         write_ply(temporary, splat, columns)
-
-
-def _document(scene: HumanScene, rig: Rig, gaussians: Gaussians) -> GlbDocument:
-    """Return Gaussians with a skin as a glTF document; the joints are the first nodes."""
-    document = GlbDocument()
-    nodes: list[dict[str, object]] = []
-    armature, _ = add_skeleton(document, rig, nodes)
-    nodes.append({"name": "person", "mesh": 0, "skin": 0})
-    primitive = add_gaussians(document, gaussians)
-    primitive["attributes"] |= add_weights(document, scene.weights)
-    document.json |= {
-        "scene": 0,
-        "scenes": [{"nodes": [armature, len(nodes) - 1]}],
-        "nodes": nodes,
-        "meshes": [{"name": "person", "primitives": [primitive]}],
-        "extensionsUsed": [EXTENSION],
-    }
-    return document
+    return notes
