@@ -1,0 +1,194 @@
+"""The numbers of a page: lists as they are read, motion as splines, uniforms of shaders."""
+
+from __future__ import annotations
+
+import base64
+import re
+import zlib
+from importlib.resources import files
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scene_kinds import KINDS, scene_of_kind
+from tiny_fields import HEADS, cloud, followed, stirred_field
+from tiny_fields import KINDS as FIELDS
+
+from dyngs.deform.field import Offsets
+from dyngs.deform.nodes import Nodes
+from dyngs.deform.spline_fit import spline_basis
+from dyngs.export import html
+from dyngs.export.html.curves import Curves, curves_of, fitted_curves
+from dyngs.export.html.numbers import CHUNK, Lists, add_scene
+from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.ops.quaternions import rotation_matrices
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_has_the_lists_that_it_needs(kind: str) -> None:
+    scene = scene_of_kind(kind)
+    lists = Lists()
+    told = add_scene(scene, lists, 0.01)
+    layout = lists.layout
+    assert (told["count"], told["moves"]) == (len(scene), not scene.is_static)
+    for name, columns in {
+        "means": 3,
+        "quats": 4,
+        "log_scales": 3,
+        "logit_opacities": 1,
+        "base": 3,
+    }.items():
+        assert (layout[name]["rows"], layout[name]["columns"]) == (len(scene), columns)
+    assert ("boned" in layout, "bones" in told) == (kind == "human",) * 2
+    assert ("masks" in layout) == (kind == "masked")
+    assert ("pivots" in layout) == (kind in ("control_nodes", "windowed"))
+    assert ("windows" in layout) == (kind == "windowed")
+    assert ("network" in told) == (scene.colour is not None)
+    assert ("rest" in layout) == (scene.colour is None and scene.gaussians.sh_degree > 0)
+    assert ("curve_means" in layout) == (kind != "static")
+
+
+def read(lists: Lists, name: str) -> NDArray[Any]:
+    """A list as ``data.js`` reads it."""
+    told = lists.layout[name]
+    data = zlib.decompress(base64.b64decode(lists.text()))[told["at"] :]
+    rows = told["rows"]
+    columns = told["columns"]
+    if told["kind"] != "quantised":
+        return np.frombuffer(data, told["kind"], rows * columns).reshape(rows, columns)
+    count = -(-rows // told["chunk"])
+    ranges = (
+        np.frombuffer(data, "<f4", 2 * count * columns)
+        .reshape(count, columns, 2)
+        .repeat(told["chunk"], axis=0)
+    )
+    planes = told["bits"] // 8
+    steps = np.frombuffer(data, np.uint8, planes * rows * columns, ranges.nbytes // told["chunk"])
+    steps = steps.reshape(columns, planes, rows).astype(int)
+    whole = steps[:, 0] if planes == 1 else steps[:, 0] * 256 + steps[:, 1]
+    return ranges[:rows, :, 0] + ranges[:rows, :, 1] * whole.T
+
+
+def test_rotations_of_a_clip_begin_with_their_scalar_part() -> None:
+    scene = scene_of_kind("human")
+    lists = Lists()
+    add_scene(scene, lists, 0.01)
+    found = torch.from_numpy(read(lists, "clip_quats").reshape(-1, 4))
+    person = avatar_of(scene)
+    assert person is not None
+    wanted = axis_angle_to_matrix(person.moves_as.poses.reshape(-1, 3)).double()
+    torch.testing.assert_close(rotation_matrices(found.double()), wanted, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("rows", [1, CHUNK, CHUNK + 3])
+def test_quantised_lists_err_by_half_a_step(bits: Literal[8, 16], rows: int) -> None:
+    values = np.random.default_rng(0).normal(size=(rows, 3)).astype(np.float32)
+    values[:, 1] = 7.25  # the same everywhere: exact
+    values[0, 0] = 1000.0  # far away: spoils its own chunk alone
+    lists = Lists()
+    lists.exact("before", np.arange(5, dtype=np.uint8)[:, None])
+    lists.quantised("values", values, bits)
+    found = read(lists, "values")
+    assert np.array_equal(found[:, 1], values[:, 1])
+    for start in range(0, rows, CHUNK):
+        part = slice(start, start + CHUNK)
+        spread = np.ptp(values[part].astype(np.float64), axis=0)
+        assert (
+            np.abs(found[part] - values[part]) <= 0.501 * spread / (2**bits - 1) + 1e-4 * 2.0**-bits
+        ).all()
+
+
+def played(curves: Curves, time: float) -> dict[str, torch.Tensor]:
+    """The drivers' offsets at a time, by attribute."""
+    points = curves.heads["means"].shape[1]
+    fractions = spline_basis(torch.tensor([time]), points - 3)[0].float()
+    return {name: torch.einsum("p,spd->sd", fractions, x) for name, x in curves.heads.items()}
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FIELDS if kind != "control_nodes"])
+def test_every_gaussian_has_its_own_driver_without_nodes(kind: str) -> None:
+    means = cloud().means
+    field = stirred_field(kind, len(means))
+    curves = curves_of(field, means, 40, 1e-3)
+    assert curves.followed is None
+    assert len(curves.heads) == 1 + len(HEADS)
+    scale = float(field.offsets(means, 0.3).means.detach().norm(dim=1).max())
+    for time in (0.0, 0.31, 0.77, 1.0):
+        truth = field.offsets(means, time)
+        found = played(curves, time)
+        assert (
+            float((found["means"] - truth.means.detach()).norm(dim=1).median())
+            < 0.05 * scale + curves.error
+        )
+
+
+def test_nodes_are_exact() -> None:
+    means = cloud().means
+    field = stirred_field("control_nodes", len(means))
+    curves = curves_of(field, means, 40, 1e-3)
+    assert curves.pivots is not None
+    assert curves.followed is not None
+    assert curves.fractions is not None
+    assert curves.error == 0
+    assert curves.followed.shape == curves.fractions.shape == (len(means), 4)
+    torch.testing.assert_close(curves.fractions.sum(1), torch.ones(len(means)))
+    nodes: Nodes = field.nodes_for(means)  # type: ignore[attr-defined]
+    for time in (0.0, 0.31, 1.0):
+        heads = played(curves, time)
+        heads["logit_opacities"] = heads["logit_opacities"][:, 0]
+        truth = field.offsets(means, time)
+        found = followed(nodes, means, Offsets(**heads))
+        for name, x in vars(truth).items():
+            torch.testing.assert_close(getattr(found, name), x.detach(), atol=1e-5, rtol=1e-4)
+
+
+def test_pieces_are_added_until_places_are_near() -> None:
+    def swinging(time: float) -> Offsets:
+        return Offsets(torch.tensor([[torch.tensor(30 * time).sin(), 0.0, 0.0]]))
+
+    coarse, error = fitted_curves(swinging, 300, 0.5)
+    fine, smaller = fitted_curves(swinging, 300, 0.001)
+    assert coarse["means"].shape[1] < fine["means"].shape[1]
+    assert error <= 0.5
+    assert smaller <= 0.001
+    limited, _ = fitted_curves(swinging, 20, 0.0)
+    assert limited["means"].shape == (1, 2 * 19 + 3, 3)
+    _, between_few_times = fitted_curves(swinging, 3, 0.01)
+    assert between_few_times <= 0.01
+
+
+FOLDER = files(html)
+MAIN = r'(?<!\.)\bat\("(\w+)(?:\[0\])?"\)|list\("(\w+)"'
+COPY = r'copy\.at\("(\w+)"\)'
+SET = [
+    ("renderer.js", "project.", MAIN),
+    ("renderer.js", "splat.", r'splat\.at\("(\w+)"\)'),
+    ("renderer.js", "copy.", COPY),
+    ("triangles.js", "triangles.", MAIN),
+    ("triangles.js", "copy.", COPY),
+]
+HARMONICS = {"uHarmonics"}  # set by drawing.js for both
+
+
+@pytest.mark.parametrize(("program", "shader", "names"), SET)
+def test_the_script_sets_the_uniforms_that_a_shader_has(
+    program: str, shader: str, names: str
+) -> None:
+    script = (FOLDER / program).read_text(encoding="utf-8")
+    paths = [
+        path
+        for path in FOLDER.iterdir()
+        if path.name.startswith(shader) and path.name.endswith(".glsl")
+    ]
+    declared = {
+        name
+        for path in paths
+        for name in re.findall(r"\buniform (?:\w+ )+(\w+)", path.read_text("utf-8"))
+    }
+    given = {name for found in re.finditer(names, script) for name in found.groups() if name}
+    assert declared
+    assert given == declared - HARMONICS
