@@ -12,43 +12,15 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from scene_kinds import KINDS, scene_of_kind
-from tiny_fields import HEADS, cloud, followed, stirred_field
-from tiny_fields import KINDS as FIELDS
+from scene_kinds import scene_of_kind
 
 from dyngs.deform.field import Offsets
-from dyngs.deform.nodes import Nodes
-from dyngs.deform.spline_fit import spline_basis
 from dyngs.export import html
-from dyngs.export.html.curves import Curves, curves_of, fitted_curves
+from dyngs.export.html.curves import fitted_curves
 from dyngs.export.html.numbers import CHUNK, Lists, add_scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.quaternions import rotation_matrices
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_has_the_lists_that_it_needs(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    lists = Lists()
-    told = add_scene(scene, lists, 0.01)
-    layout = lists.layout
-    assert (told["count"], told["moves"]) == (len(scene), not scene.is_static)
-    for name, columns in {
-        "means": 3,
-        "quats": 4,
-        "log_scales": 3,
-        "logit_opacities": 1,
-        "base": 3,
-    }.items():
-        assert (layout[name]["rows"], layout[name]["columns"]) == (len(scene), columns)
-    assert ("boned" in layout, "bones" in told) == (kind == "human",) * 2
-    assert ("masks" in layout) == (kind == "masked")
-    assert ("pivots" in layout) == (kind in ("control_nodes", "windowed"))
-    assert ("windows" in layout) == (kind == "windowed")
-    assert ("network" in told) == (scene.colour is not None)
-    assert ("rest" in layout) == (scene.colour is None and scene.gaussians.sh_degree > 0)
-    assert ("curve_means" in layout) == (kind != "static")
 
 
 def read(lists: Lists, name: str) -> NDArray[Any]:
@@ -100,50 +72,6 @@ def test_quantised_lists_err_by_half_a_step(bits: Literal[8, 16], rows: int) -> 
         assert (
             np.abs(found[part] - values[part]) <= 0.501 * spread / (2**bits - 1) + 1e-4 * 2.0**-bits
         ).all()
-
-
-def played(curves: Curves, time: float) -> dict[str, torch.Tensor]:
-    """The drivers' offsets at a time, by attribute."""
-    points = curves.heads["means"].shape[1]
-    fractions = spline_basis(torch.tensor([time]), points - 3)[0].float()
-    return {name: torch.einsum("p,spd->sd", fractions, x) for name, x in curves.heads.items()}
-
-
-@pytest.mark.parametrize("kind", [kind for kind in FIELDS if kind != "control_nodes"])
-def test_every_gaussian_has_its_own_driver_without_nodes(kind: str) -> None:
-    means = cloud().means
-    field = stirred_field(kind, len(means))
-    curves = curves_of(field, means, 40, 1e-3)
-    assert curves.followed is None
-    assert len(curves.heads) == 1 + len(HEADS)
-    scale = float(field.offsets(means, 0.3).means.detach().norm(dim=1).max())
-    for time in (0.0, 0.31, 0.77, 1.0):
-        truth = field.offsets(means, time)
-        found = played(curves, time)
-        assert (
-            float((found["means"] - truth.means.detach()).norm(dim=1).median())
-            < 0.05 * scale + curves.error
-        )
-
-
-def test_nodes_are_exact() -> None:
-    means = cloud().means
-    field = stirred_field("control_nodes", len(means))
-    curves = curves_of(field, means, 40, 1e-3)
-    assert curves.pivots is not None
-    assert curves.followed is not None
-    assert curves.fractions is not None
-    assert curves.error == 0
-    assert curves.followed.shape == curves.fractions.shape == (len(means), 4)
-    torch.testing.assert_close(curves.fractions.sum(1), torch.ones(len(means)))
-    nodes: Nodes = field.nodes_for(means)  # type: ignore[attr-defined]
-    for time in (0.0, 0.31, 1.0):
-        heads = played(curves, time)
-        heads["logit_opacities"] = heads["logit_opacities"][:, 0]
-        truth = field.offsets(means, time)
-        found = followed(nodes, means, Offsets(**heads))
-        for name, x in vars(truth).items():
-            torch.testing.assert_close(getattr(found, name), x.detach(), atol=1e-5, rtol=1e-4)
 
 
 def test_pieces_are_added_until_places_are_near() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -169,21 +168,6 @@ def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
 
 
 @needs_browser
-def test_nothing_is_upside_down(browser: Browser, tmp_path: Path) -> None:
-    """What lies toward `up` is in the upper half, also where the first camera is rolled."""
-    gaussians = replace(still_scene().gaussians, means=torch.tensor([[0.0, -0.7, 0]]).repeat(5, 1))
-    rolled = camera(120, 84).cam_from_world.clone()
-    rolled[0, :2] *= -1  # upside down
-    view = Cameras(rolled, large(camera(), 6).intrinsics, 120, 84)
-    write(StaticScene(gaussians=gaussians), tmp_path / "page.html", view)
-    page = opened(browser, tmp_path / "page.html")
-    rows = np.argwhere((page.screenshot("#canvas")[:, 90:230] < 200).all(-1))[:, 0]
-    assert len(rows) > 20
-    assert rows.mean() < 110
-    page.close()
-
-
-@needs_browser
 @pytest.mark.parametrize("most", [None, 9000])
 def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_path: Path) -> None:
     scene, view = levels_of_a_cloud(tmp_path / "page", most)
@@ -261,20 +245,6 @@ def test_a_page_begins_with_the_same_view_in_any_unit(factor: float, tmp_path: P
         pose = np.array(a["camFromWorld"]).reshape(4, 4)
         pose[:3, 3] /= factor
         np.testing.assert_allclose(pose, np.array(b["camFromWorld"]).reshape(4, 4), atol=1e-4)
-
-
-def test_without_the_capture_a_page_begins_outside(tmp_path: Path) -> None:
-    run = write_moving_run(tmp_path, moves=False)
-    shutil.rmtree(tmp_path / "capture")
-    written = write_page(open_run(run), tmp_path / "a.html", title="<i>")
-    (note,) = written.notes
-    assert "without the capture" in note
-    assert not written.header["moves"]
-    assert written.header["background"] == [1.0, 1.0, 1.0]
-    assert "<title>&lt;i&gt;</title>" in (tmp_path / "a.html").read_text(encoding="utf-8")
-    for view in written.header["views"]:  # the balls, around the origin, are in front of each
-        pose = torch.tensor(view["camFromWorld"]).reshape(4, 4)
-        assert float(pose[2, 3]) > float(camera().cam_from_world[0, 2, 2])
 
 
 def settled(page: Page) -> NDArray[np.uint8]:
