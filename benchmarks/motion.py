@@ -30,7 +30,7 @@ from torch import Tensor
 
 from dyngs.api.load import read_capture
 from dyngs.api.train import train
-from dyngs.config import Config, PointsInit, RandomInit, StaticModel
+from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.config.io import load_config
 from dyngs.core.metrics import Lpips
 from dyngs.core.state import Role
@@ -56,15 +56,16 @@ from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
-from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"

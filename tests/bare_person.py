@@ -11,15 +11,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel
+from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import SH_C0
-from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.corrections import new_corrections
-from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.posing import Skeleton, new_corrections, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
 from dyngs.runs.checkpoint import CheckpointInfo, LoadedRun
 

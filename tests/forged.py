@@ -14,7 +14,15 @@ from moving_scene import camera
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.compress.storage.file import (
+from dyngs.config import NetworkColour, SceneModel
+from dyngs.core.state import prefixed, tensors_of
+from dyngs.deform.fields import WindowedField, field_state
+from dyngs.deform.keys import DynamicModel
+from dyngs.gaussians.colour.training import NetworkTraining
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.runs.stored_file import (
     _DTYPES,
     MAGIC,
     MAX_HEADER,
@@ -23,15 +31,8 @@ from dyngs.compress.storage.file import (
     _stored,
     compressed,
 )
-from dyngs.compress.storage.tensors import Coding, TensorKind
-from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
-from dyngs.core.state import prefixed, tensors_of
-from dyngs.deform.fields import field_state
-from dyngs.deform.windows import WindowedField
-from dyngs.gaussians.colour.training import NetworkTraining
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.runs.stored_tensors import Coding, TensorKind
+from dyngs.static.keys import StaticModel
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

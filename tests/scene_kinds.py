@@ -7,24 +7,22 @@ from scenes import look_around
 from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel, HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.core.state import State, part_of, tensors_of
+from dyngs.deform.fields import OPEN, WindowedField
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.windows import OPEN, WindowedField
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.schedule import Rates
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
-from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
-from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
+from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
@@ -113,7 +111,7 @@ def _person() -> HumanScene:
     subject = Subject(
         Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)), shapes
     )
-    scene = HumanTraining(PERSON, (0, 1, 2), Rates(10)).first_scene(gaussians, subject)
+    scene = first_scene(gaussians, subject)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)
     return scene

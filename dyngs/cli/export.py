@@ -416,7 +416,7 @@ def _export_tracks(
 def _export_dyngs(arguments: argparse.Namespace) -> int:
     """Write the run as a .dyngs file and print how much its images change."""
     from dyngs.api.scene_file import write_scene_file
-    from dyngs.compress.storage.measure import SMALLEST_CHANGE
+    from dyngs.compress.measure import SMALLEST_CHANGE
 
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
@@ -539,7 +539,9 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
         raise DyngsError(
             f"{source}: a file has no training views, whose depths make a surface; give the run"
         )
-    return source.is_dir() and not load_resolved(source).model.is_posed
+    from dyngs.models.kind import HasBody, capability
+
+    return source.is_dir() and capability(load_resolved(source).model, HasBody) is None
 
 
 def _export_surface(arguments: argparse.Namespace) -> int:

@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from dyngs.compress.storage.file import read_scene
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.conventions import RasterizeMode
@@ -29,7 +28,9 @@ from dyngs.io.limits import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
+from dyngs.runs.stored_file import read_scene
 from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
 from dyngs.training.new_trainer import restored_model
 
@@ -37,7 +38,7 @@ KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
 _MOST_TIMING_BYTES = 1 << 20
 SCENE_FILE = "scene.dyngs"
-"""Name of the .dyngs file that holds a finished run, see ``dyngs.compress.storage``."""
+"""Name of the .dyngs file that holds a finished run, see ``dyngs.runs.stored_file``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
 MAX_STEP = 2**53
 BACKGROUNDS = ("white", "black", "random")
@@ -151,7 +152,7 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
     """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has
     none."""
     config = load_resolved(run_dir, data_root=data_root)
-    if config.model.is_network:
+    if capability(config.model, Predicts) is not None:
         raise DyngsError(
             f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
         )

@@ -12,9 +12,11 @@ from pathlib import Path
 import torch
 
 from dyngs.config import Config
+from dyngs.config.io import without_removed_keys
 from dyngs.core.errors import DyngsError, reading
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import Predicts, capability
 from dyngs.runs.checkpoint import info_of
 from dyngs.runs.inputs import inputs_of
 
@@ -69,8 +71,9 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
         model = header["model"]
         if not isinstance(model, dict) or model.get("body") is not None:
             raise ValueError("its section model is not that of a network")
+        model = without_removed_keys(model)
         config = Config.model_validate({"data": {"root": path.parent}, "model": model})
-        if not config.model.is_network:
+        if capability(config.model, Predicts) is None:
             raise ValueError(f"it is of model.kind={config.model.kind}")
     return config, Checkpoint(
         info, {n: x.float() if x.is_floating_point() else x for n, x in tensors.items()}, path

@@ -15,6 +15,7 @@ import torch
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.motion.placement import rest_clip
 from dyngs.io.write import to_uint8
@@ -386,7 +387,7 @@ def in_motion(
         return opened
     if choice in files:
         return opened.in_motion(files[choice], keep_feet=keep_feet)
-    person = opened.person
+    person = avatar_of(opened.renderable)
     if person is None:
         raise ValueError("only a person can be posed")
     clip = rest_clip(person.clip, person.skeleton.joints, person.skeleton.parents)

@@ -17,6 +17,7 @@ from dyngs.export.camera_paths import resize_cameras
 from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
@@ -196,13 +197,13 @@ def _motion_colours(scene: GaussianScene) -> Tensor:
 
 def shows_filled(opened: Opened) -> bool:
     """Return whether it is known which surface of a person no training view shows."""
-    person = opened.person
+    person = avatar_of(opened.renderable)
     return person is not None and person.seen is not None and person.colour is None
 
 
 def _filled(opened: Opened, shot: Shot) -> Rendering:
     """Return the image with marked what is filled in; the plain one where that is not known."""
-    person = opened.person
+    person = avatar_of(opened.renderable)
     if person is None or person.seen is None or not shows_filled(opened):
         return _rendering(opened, shot)
     now = opened.scene.time_step(shot.time)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from dyngs.api.predict import network_config, predict
+from dyngs.api.predict import network_config, predict, require_network
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.errors import DyngsError
@@ -19,6 +19,7 @@ from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.io.formats.formats import format_to_read
 from dyngs.io.wrong_place import command_for
+from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import Opened, open_scene
@@ -74,6 +75,7 @@ def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
     Raises DyngsError: not the run of a network, or no captures there.
     """
     config = network_config(run)
+    num_views = require_network(config, run).num_views(config.model)
     data = config.data
     captures = []
     if capture is not None:
@@ -82,7 +84,7 @@ def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
             read_capture(data)
             captures = [data]
     people = {one.root.name: one for one in captures or captures_in(data)}
-    return PeopleNetwork(run, people, config.model.source_views)
+    return PeopleNetwork(run, people, num_views)
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def open_source(
         raise DyngsError(
             f"{path}: no such run, file or folder; give what `dyngs train` or `dyngs export` wrote"
         )
-    if _is_run(path) and load_resolved(path).model.is_network:
+    if _is_run(path) and _predicts(path):
         if most is not None:
             raise DyngsError(
                 f"{path} is a network of people; levels of detail are for still scenes"
@@ -183,6 +185,11 @@ def first_of(source: Source) -> Opened:
     raise failed[0]
 
 
+def _predicts(run: Path) -> bool:
+    """Return whether a run holds a network that predicts people."""
+    return capability(load_resolved(run).model, Predicts) is not None
+
+
 def runs_in(folder: Path) -> list[Path]:
     """Return the runs with a scene in a folder and the folders below it, by name; networks are left
     out."""
@@ -202,7 +209,7 @@ def _is_run(folder: Path) -> bool:
 def _has_scene(run: Path) -> bool:
     try:
         has_any = (run / SCENE_FILE).is_file() or bool(checkpoint_paths(run))
-        return has_any and not load_resolved(run).model.is_network
+        return has_any and not _predicts(run)
     except (DyngsError, OSError):
         return False
 

@@ -19,7 +19,7 @@ from two_balls import two_balls
 from dyngs.api import choose as module
 from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig, DynamicModel
+from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -31,6 +31,7 @@ from dyngs.data.synthetic.captures import (
     write_dynamic_capture,
     write_still_capture,
 )
+from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.rendering import render
 from dyngs.runs.folder import CHOICES_NAME
 from dyngs.training.trainer import Trainer

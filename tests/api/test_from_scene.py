@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.api.from_scene import first_of, settled
+from dyngs.api.from_scene import settled
 from moving_scene import write_moving_run
 
+from dyngs.api.edit import Edits, edit_scene
+from dyngs.api.first_scene import first_of
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, FixedStrategy
@@ -19,7 +21,6 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.edit.frame import Frame
-from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.densify import Densifier

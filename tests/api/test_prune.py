@@ -13,8 +13,8 @@ from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.prune import file_of, prune_run, prune_within
 from dyngs.api.train import train
-from dyngs.compress.prune.search import evenly_held_out
-from dyngs.compress.prune.stage import quality_of
+from dyngs.compress.search import evenly_held_out
+from dyngs.compress.stage import quality_of
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -49,7 +49,7 @@ def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
         "HARMONIC_LOSSES": (0.03,),
     }
     for name, candidates in few.items():
-        monkeypatch.setattr(f"dyngs.compress.prune.search.{name}", candidates)
+        monkeypatch.setattr(f"dyngs.compress.search.{name}", candidates)
 
 
 def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_where_nothing_can_go_the_run_stays_as_it_is(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every candidate is worse by 5 dB than what was there."""
-    monkeypatch.setattr("dyngs.compress.prune.search.apply_cut", _spoil)
+    monkeypatch.setattr("dyngs.compress.search.apply_cut", _spoil)
     promise = prune_within(run_dir, tmp_path / "same", 0.2, BRIEFLY, silent)
     assert (
         checkpoint_paths(tmp_path / "same")[-1].read_bytes()
@@ -138,7 +138,7 @@ def test_where_nothing_can_go_the_run_stays_as_it_is(
 
 
 def _spoil(trainer: object, cut: object, scores: object) -> None:
-    from dyngs.compress.prune.cut import Cut, apply_cut
+    from dyngs.compress.cut import Cut, apply_cut
 
     apply_cut(trainer, cut, scores)  # pyright: ignore[reportArgumentType]
     if cut != Cut():
@@ -155,7 +155,7 @@ def test_an_interruption_leaves_nothing(
         patch.setattr("dyngs.api.prune.write_config", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_run(run_dir, tmp_path / "small", ASKED)
-        patch.setattr("dyngs.compress.prune.search.apply_cut", interrupted)
+        patch.setattr("dyngs.compress.search.apply_cut", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_within(run_dir, tmp_path / "small", 50.0, BRIEFLY, silent)
     assert not list(tmp_path.iterdir())

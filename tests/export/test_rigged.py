@@ -46,8 +46,7 @@ from dyngs.export.rigged.texture import (
     texture_image,
 )
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
+from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import apply_shape

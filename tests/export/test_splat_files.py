@@ -31,8 +31,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, PointCloud
 from dyngs.data.read import read_capture
 from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.windows import WindowedField
 from dyngs.export import splat_files
 from dyngs.export.body_nodes import write_bodies
 from dyngs.export.cameras import NAME, write_cameras

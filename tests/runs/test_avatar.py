@@ -17,9 +17,10 @@ from torch import Tensor
 
 from dyngs.api.train import train
 from dyngs.cli import main
-from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, DefaultStrategy, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -45,7 +46,7 @@ def trained(capture: Path, folder: Path, **model: object) -> Path:
     return train(
         Config(
             data=DataConfig(root=capture),
-            model=HumanModel(resolution=16, refine_from=0.0, sh_degree=0, fit=False, **model),  # type: ignore[arg-type]
+            model=HumanModel(resolution=16, sh_degree=0, fit=False, **model),  # type: ignore[arg-type]
             strategy=DefaultStrategy(grow=False),
             train=TrainConfig(steps=4),
             run=RunConfig(dir=folder, threads=1),

@@ -15,8 +15,7 @@ import torch
 from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
-from dyngs.compress.storage.tensors import drawable
-from dyngs.config import Config, DataConfig, RunConfig, StaticModel
+from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -34,6 +33,8 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
+from dyngs.runs.stored_tensors import drawable
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import restored_scene
 
 

@@ -15,9 +15,7 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
     FixedStrategy,
-    HumanModel,
     McmcStrategy,
     PointsInit,
     RandomInit,
@@ -25,6 +23,8 @@ from dyngs.config import (
 )
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.deform.keys import DynamicModel
+from dyngs.human.keys import HumanModel
 from dyngs.training import memory
 from dyngs.training.memory import (
     MemoryForecast,
@@ -252,7 +252,7 @@ def test_a_gaussian_takes_what_is_forecast_within_the_band(
             case "human":
                 config = Config(
                     data=DataConfig(root=request.getfixturevalue("person")),
-                    model=HumanModel(resolution=16 + 16 * size, sh_degree=0, refine_from=0.0),
+                    model=HumanModel(resolution=16 + 16 * size, sh_degree=0),
                     strategy=FixedStrategy(),
                 )
             case _:

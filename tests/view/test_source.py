@@ -65,11 +65,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"run.dir={root / 'net'}",
         "train.steps=1",
     ]
-    options += [
-        f"model.{name}={getattr(NET, name)}"
-        for name in ("resolution", "source_views", "target_views")
-    ]
-    options += ["model.source_sets=1", "model.widths=[8, 8]", "run.threads=1"]
+    options += [f"model.{name}={getattr(NET, name)}" for name in ("resolution", "source_views")]
+    options += ["run.threads=1"]
     dyngs.train(dyngs.load_config("human_predictor", options))
     return root
 

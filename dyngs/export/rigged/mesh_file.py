@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.skeleton import (
     Played,
@@ -30,6 +29,7 @@ from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
+from dyngs.human.keys import HumanModel
 from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
 from dyngs.runs.checkpoint import LoadedRun

@@ -24,7 +24,7 @@ from dyngs.export.rigged.skeleton import (
     rig_of,
 )
 from dyngs.export.rigged.texture import frontal_colours
-from dyngs.human.avatar.anchors import heaviest_joints
+from dyngs.human.avatar.posing import heaviest_joints
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.ply import write_ply
 from dyngs.io.formats.splat_file import SplatFile, require_writable

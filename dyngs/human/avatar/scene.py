@@ -3,6 +3,7 @@ says."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
@@ -16,38 +17,39 @@ from dyngs.core.tensor_checks import (
     require_positive,
     require_tensor,
 )
+from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
-from dyngs.human.avatar.anchors import Anchors, skinning_weights
-from dyngs.human.avatar.corrections import (
-    SharedCorrection,
-    corrected_clip,
-    corrected_pose,
-    corrected_skeleton,
-    learned_light,
-    new_corrections,
-)
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (
     LEFT_OUT,
     TERMS,
+    Anchors,
     BodyPose,
     Light,
     PoseBlendShapes,
+    SharedCorrection,
     Skeleton,
+    corrected_clip,
+    corrected_pose,
+    corrected_skeleton,
     frame_pose,
+    learned_light,
+    new_corrections,
     pose_gaussians,
     rest_offsets,
+    skinning_weights,
 )
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
-from dyngs.human.motion.motion import MotionClip
-from dyngs.models.renderable import Renderable, clamped_time
+from dyngs.human.motion.motion import MotionClip, captured_motion, same_bodies
+from dyngs.models.renderable import Posable, Renderable, clamped_time
 
 
 @dataclass(frozen=True, kw_only=True)
-class HumanScene(GaussianScene):
+class HumanScene(GaussianScene, Posable):
     """N Gaussians at rest, m, and a person who moves as a clip says."""
 
     anchors: Anchors  # of the Gaussians, with the template's weights
@@ -151,7 +153,7 @@ class HumanScene(GaussianScene):
     @property
     def up(self) -> Tensor:
         """The up direction (3,) of the world, as training saw it."""
-        from dyngs.human.motion.placement import up_direction  # late: scipy
+        from dyngs.human.motion.placement import up_direction
 
         if "up" not in self._derived:
             self._derived["up"] = up_direction(self.clip)
@@ -247,6 +249,43 @@ class HumanScene(GaussianScene):
         """
         return replace(self, played=clip)
 
+    def up_of_body(self) -> Tensor:
+        from dyngs.human.motion.placement import up_direction  # late: scipy
+
+        return up_direction(self.clip)
+
+    def at_rest(self) -> HumanScene:
+        from dyngs.human.motion.placement import rest_clip  # late: scipy
+
+        return self.playing(rest_clip(self.clip, self.skeleton.joints, self.skeleton.parents))
+
+    def placed(self, rotation: Tensor, scale: float, shift: Tensor) -> HumanScene:
+        from dyngs.human.motion.placement import moved  # late: scipy
+
+        pelvis = self.learned_skeleton.joints[0] * math.exp(self.fit.log_scale)
+        rotation = rotation.to(self.clip.trans)
+        shift = shift.to(self.clip.trans)
+
+        def there(clip: MotionClip) -> MotionClip:
+            return moved(clip, rotation, scale, shift, pelvis)
+
+        played = None if self.played is None else there(self.played)
+        return replace(self, clip=there(self.clip), played=played)
+
+    def as_filmed(self, capture: Capture, split: Split) -> HumanScene:
+        """Return the person as the views of a split show them.
+
+        The split pose, and splits with body parameters of their own, have the poses of their files.
+        Others show the clip of training with its refined poses, interpolated at times between.
+        """
+        if capture.body is None:
+            return self
+        own = capture.body[split]
+        if split != "pose" and same_bodies(own, capture.body["train"]):
+            return self
+        views = capture.splits[split]
+        return self.playing(captured_motion(capture.root, own, views, self.skeleton.joints).clip)
+
     def drawing_state(self) -> State:
         """Return what drawing needs; learned corrections of skinning weights are applied to
         them."""
@@ -281,6 +320,22 @@ class HumanScene(GaussianScene):
                 "shapes.faces": self.shapes.faces.int(),
             }
         return state | {name: StateTensor(x, Role.SHARED) for name, x in given.items()}
+
+
+def first_scene(
+    gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
+) -> HumanScene:
+    """Return the scene of the first Gaussians: nothing is learned yet; light only with their
+    ``normals`` (N, 3)."""
+    clip = subject.motion.clip
+    return HumanScene(
+        gaussians=gaussians,
+        anchors=subject.anchors,
+        skeleton=subject.skeleton,
+        clip=clip,
+        learned=new_corrections(clip, subject.skeleton, subject.anchors, normals),
+        shapes=subject.shapes,
+    )
 
 
 def avatar_of(scene: Renderable) -> HumanScene | None:

@@ -25,8 +25,7 @@ import numpy as np
 import torch
 
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.order import morton_order
+from dyngs.core.gaussians import Gaussians, morton_order
 from dyngs.io.formats.packing import (
     logit,
     pack_fractions,
@@ -75,7 +74,7 @@ def read_ply(path: Path) -> SplatFile:
             gaussians = _read_compressed(header, file, path)
         else:
             gaussians = _gaussians(header.read(file, "vertex"))
-    return described(SplatFile(gaussians, comments=header.comments), path)
+    return described(SplatFile(gaussians, comments=header.comments))
 
 
 def write_ply(

@@ -19,7 +19,7 @@ import numpy as np
 
 from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.io.child import python_command
 from dyngs.io.formats import usd_child
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
@@ -67,9 +67,7 @@ def read_usd(path: Path) -> SplatFile:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
     found = [_gaussians(path, {name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
     up = _UP.get(str(read["up"]), "y")
-    return described(
-        SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())), path
-    )
+    return described(SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())))
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:

@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.api.budget.run import STAGES, stage
+from dyngs.api.budget.run import stage
 from hypothesis import given
 from hypothesis import strategies as st
 from limited import limited, said
 
-from dyngs.compress.prune.stage import quality_of
-from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, StaticModel, TrainConfig
+from dyngs.cli.kernel_bench import STAGES
+from dyngs.compress.stage import quality_of
+from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, TrainConfig
+from dyngs.static.keys import StaticModel
 from dyngs.training.events import Event, Message, TopologyChanged
 from dyngs.training.new_trainer import assemble
 

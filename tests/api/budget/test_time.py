@@ -10,31 +10,20 @@ from typing import cast
 
 import pytest
 import torch
-from dyngs.api.budget.run import LimitedRun
 from hypothesis import given
 from hypothesis import strategies as st
 from steps import Counting
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.budget.time import (
-    AIM,
-    FEWEST_STEPS,
-    Deadline,
-    first_fit,
-    fitting_steps,
-    refitted,
-    same_phase,
-)
+from dyngs.api.budget.time import fitting_steps
 from dyngs.api.train import _Run, train
 from dyngs.config import (
     AutoColour,
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
@@ -42,14 +31,18 @@ from dyngs.data.capture import View
 from dyngs.data.decoding import Decoded
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.deform.schedule import motion_begins_after
+from dyngs.deform.control_nodes import refitted
+from dyngs.deform.fixed_cameras.hulls import FEWEST_STEPS
+from dyngs.deform.keys import DynamicModel
 from dyngs.io.lock import Held
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
-from dyngs.training.clock import Forecast, Stopwatch, with_steps
+from dyngs.static.keys import StaticModel
+from dyngs.training.clock import Forecast, Stopwatch
 from dyngs.training.events import StepReport
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import assemble, prepared
+from dyngs.training.plan import with_steps
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
@@ -128,7 +121,7 @@ def test_a_step_unlike_the_others_is_not_taken_for_the_pace() -> None:
     now = 0.0
     planned = list[int]()
     for done in itertools.count(1):
-        now += 30.0 if done == motion_begins_after(config, config.train.steps) else 0.02
+        now += 30.0 if done == motion_begins_after(config.model, config.train.steps) else 0.02
         deadline._forecast.observe(config, done, now, 1000, 10_000)
         found = deadline.steps(config, done, now)
         config = with_steps(config, found)

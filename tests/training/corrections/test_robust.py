@@ -20,19 +20,13 @@ from flat_wall import (
 )
 from torch import Tensor
 
-from dyngs.config import (
-    Config,
-    DataConfig,
-    DynamicModel,
-    RandomInit,
-    RunConfig,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
+from dyngs.deform.keys import DynamicModel
 from dyngs.models.renderable import Rendering
 from dyngs.ops.loss import l1_ssim_loss
+from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.robust import EVERY, WARM_UP, RobustMasks
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
