@@ -16,8 +16,7 @@ from scene_kinds import scene_of_kind
 
 from dyngs.deform.field import Offsets
 from dyngs.export import html
-from dyngs.export.html.curves import fitted_curves
-from dyngs.export.html.numbers import CHUNK, Lists, add_scene
+from dyngs.export.html.numbers import CHUNK, Lists, add_scene, fitted_curves
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.quaternions import rotation_matrices

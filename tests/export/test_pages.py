@@ -37,8 +37,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr, ssim
 from dyngs.export.html import numbers
-from dyngs.export.html.element import element_script
-from dyngs.export.html.page import ELEMENT, MOST_VIEWS, write_folder, write_page
+from dyngs.export.html.page import ELEMENT, MOST_VIEWS, element_script, write_folder, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene

@@ -27,17 +27,18 @@ from plyfile import PlyData
 from synthetic_bodies import model, write_npz
 
 from dyngs.core.errors import DyngsError
-from dyngs.export.rigged.mesh_file import mesh_document, write_mesh
-from dyngs.export.rigged.skeleton import (
+from dyngs.export.rigged.people import (
     Played,
     add_animation,
     anchor_normals,
     body_mesh,
+    mesh_document,
     rest_vertices,
     rig_of,
     vertex_normals,
+    write_mesh,
+    write_rigged_splats,
 )
-from dyngs.export.rigged.splat_files import write_rigged_splats
 from dyngs.export.rigged.surface import MARGINS, FittedSurface, fitted_surface
 from dyngs.export.rigged.texture import (
     BakedTexels,

@@ -34,7 +34,6 @@ from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
 from dyngs.export import splat_files
-from dyngs.export.body_nodes import write_bodies
 from dyngs.export.cameras import NAME, write_cameras
 from dyngs.export.redrawn import compare_run, compare_splats
 from dyngs.export.splat_files import (
@@ -45,6 +44,7 @@ from dyngs.export.splat_files import (
     splats_at,
     tracks_of,
     up_of,
+    write_bodies,
     write_moving,
     write_run_sequence,
     write_run_splats,

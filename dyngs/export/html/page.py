@@ -1,4 +1,5 @@
-"""The page of a scene: one file with everything in it, which asks no host for anything."""
+"""The page of a scene: one file with everything in it, which asks no host for anything, and the script
+that defines ``<dyngs-scene src="PAGE">``, which draws our pages and stands in those of others."""
 
 from __future__ import annotations
 
@@ -18,7 +19,6 @@ from dyngs.data.aim import look_at_point
 from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
-from dyngs.export.html.element import element_script, text_of
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
 from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.gaussians.levels import LevelScene
@@ -223,3 +223,33 @@ def _assembled(opened: Opened, header: dict[str, Any], lists: Lists, title: str 
     size = len(page) + sum(len(x) for x in fixed.values())
     about = counted(header["count"], "triangle" if "texture" in header else "Gaussian")
     return filled(page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")})
+
+
+SCRIPTS = (
+    "fetched.js",
+    "data.js",
+    "chunks.js",
+    "motion.js",
+    "sort.js",
+    "drawing.js",
+    "renderer.js",
+    "levels.js",
+)
+SCRIPTS += ("triangles.js", "camera.js", "player.js", "controls.js", "element.js")
+SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
+SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
+
+
+def element_script() -> str:
+    """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages
+    may be of any."""
+    texts = {"STYLE": text_of("scene.css"), "SHADERS": {name: text_of(name) for name in SHADERS}}
+    constants = [f"const {name} = {script_safe(value)};" for name, value in texts.items()]
+    parts = "\n".join([*constants, *map(text_of, SCRIPTS)])
+    script = f'// <dyngs-scene src="PAGE">: a scene of dyngs (Apache-2.0).\n(() => {{\n"use strict";\n{parts}}})();\n'
+    return script.encode("ascii", "backslashreplace").decode("ascii")
+
+
+def text_of(name: str) -> str:
+    """Return a file of this folder."""
+    return (Path(__file__).parent / name).read_text(encoding="utf-8")
