@@ -52,8 +52,7 @@ from dyngs.io.formats.splat_file import (
     with_degree,
 )
 from dyngs.io.gltf import GlbDocument
-from dyngs.io.temporary import remove_quietly, temporary_folder_beside
-from dyngs.io.write import atomic_file
+from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 from dyngs.ops.quaternions import shorter_ways, unit_quats
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened

@@ -86,7 +86,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     two."""
     config = busy_config(timed(tmp_path / "capture", [0.0, 1.0, 0.0, 1.0, 1.0]), tmp_path, kind)
     assert isinstance(config.model, DynamicModel)
-    automatic = {"hexplane": {"time_resolution": 0}, "control_nodes": {"pieces": 0}}.get(kind, {})
+    automatic = {"control_nodes": {"pieces": 0}}.get(kind, {})
     model = config.model.model_copy(
         update={"deform": config.model.deform.model_copy(update=automatic)}
     )

@@ -32,7 +32,7 @@ def test_they_are_faint_and_lie_in_the_box(
     optimizer = GaussianOptimizer(gaussians, OptimConfig())
     for x in optimizer.parameters.tensors().values():
         x.grad = torch.ones_like(x)
-    optimizer.step(1, 0.1, dense=True)
+    optimizer.step(1, 0.1)
     before = optimizer.parameters.detach()
     moments = tensors_of(optimizer.state())
     optimizer.apply(with_gaussians(before, [drawn(before, num_added, 2.0, seed)]))

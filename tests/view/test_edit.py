@@ -59,12 +59,6 @@ def test_a_ray_meets_the_wall_where_geometry_says(
     np.testing.assert_allclose(found, aim, atol=error)
 
 
-def test_rays_that_meet_nothing(wall: Opened) -> None:
-    for direction in ((-1.0, 0.0, 0.5), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), (np.nan, 0.0, 1.0)):
-        assert picked(wall, np.array([-0.5, 0.0, 0.0]), np.array(direction), 0.002, SHOT) is None
-    assert picked(wall, np.zeros(3), np.array([0.0, 0, 1]), 0.0, SHOT) is None
-
-
 def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
     opened = open_run(write_moving_run(tmp_path))
     for time in (0.0, 1.0):
