@@ -22,6 +22,7 @@ from dyngs.core.state import tensors_of
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.export.camera_paths.path import CameraPath, write_path
+from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass
@@ -30,7 +31,6 @@ from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.io.tensor_file import write_tensors
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.training.new_trainer import restored_scene
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 

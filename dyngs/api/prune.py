@@ -32,9 +32,8 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER, require_empty
+from dyngs.runs.folder import EXPORT_FOLDER, LOG_NAME, require_empty
 from dyngs.runs.frame import FRAME_NAME
-from dyngs.runs.log import LOG_NAME
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise

@@ -51,6 +51,7 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import (
+    LOG_NAME,
     asked_for,
     begin,
     default_folder,
@@ -62,7 +63,6 @@ from dyngs.runs.folder import (
     was_only_begun,
 )
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.log import RunLog
 from dyngs.training.clock import SaveTimer, Stopwatch
 from dyngs.training.events import (
     Evaluated,
@@ -79,6 +79,7 @@ from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.new_trainer import build
 from dyngs.training.plan import RunPlan
 from dyngs.training.processes import Processes
+from dyngs.training.run_log import RunLog
 from dyngs.training.trainer import Trainer
 
 _COUNT = "budget.count"  # Name of the limit's state in a checkpoint
@@ -294,7 +295,10 @@ class _Run:
         done = loop.trainer.done
         with (
             RunLog(
-                self.folder, done, every=options.log_every, tensorboard=options.tensorboard
+                self.folder / LOG_NAME,
+                done,
+                every=options.log_every,
+                tensorboard=options.tensorboard,
             ) as log,
             Interrupts() as interrupts,
         ):

@@ -15,13 +15,13 @@ from dyngs.compress.storage.precision import GREY_LEVELS, Precision, mean_square
 from dyngs.compress.storage.tensors import FIELD, drawable
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
+from dyngs.gaussians.restored import restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.frame import read_frame, write_frame
 from dyngs.runs.inputs import inputs_of
-from dyngs.training.new_trainer import restored_model
 
 MISSED = 1.05
 """A file whose images change by so many times what is allowed is not written; less is rounding of

@@ -9,8 +9,8 @@ import pytest
 from dyngs.runs.progress import Progress
 from steps import step_done
 
-from dyngs.runs.log import LogRecord
 from dyngs.training.events import Evaluated, Message, TotalChanged
+from dyngs.training.run_log import LogRecord
 
 
 def _record(step: int, psnr: float | None = 20.0) -> LogRecord:

@@ -38,9 +38,10 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.time_window import FRONTIER_VIEWS, TimeWindow
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import render
+from dyngs.gaussians.restored import restored_scene
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.static.scene import StaticScene
-from dyngs.training.new_trainer import assemble, restored_scene
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 LONG = 10_000

@@ -20,11 +20,12 @@ from dyngs.core.state import Role, part_of, tensors_of
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.training.new_trainer import assemble, restored_scene
+from dyngs.training.new_trainer import assemble
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 

@@ -21,6 +21,7 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
+from dyngs.gaussians.restored import restored_scene
 from dyngs.io import tensor_file
 from dyngs.io.tensor_file import write_tensors
 from dyngs.runs import checkpoint
@@ -34,7 +35,6 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.training.new_trainer import restored_scene
 
 
 def _checkpoint(step: int) -> Checkpoint:

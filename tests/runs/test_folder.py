@@ -32,8 +32,8 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
 )
 from dyngs.runs.folder import default_folder, require_empty, tidy
-from dyngs.runs.log import RunLog
 from dyngs.runs.opened import open_run
+from dyngs.training.run_log import RunLog
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

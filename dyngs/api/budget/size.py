@@ -17,6 +17,7 @@ from dyngs.compress.storage.measure import storage_plan
 from dyngs.compress.storage.tensors import drawable, step_below
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.errors import DyngsError, counted
+from dyngs.gaussians.restored import restored_model
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.renderable import Renderable
@@ -24,7 +25,6 @@ from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
-from dyngs.training.new_trainer import restored_model
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7

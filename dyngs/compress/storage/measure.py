@@ -27,11 +27,11 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.gaussians.rendering import contributions
+from dyngs.gaussians.restored import restored_model, restored_scene
 from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
-from dyngs.training.new_trainer import restored_model, restored_scene
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""

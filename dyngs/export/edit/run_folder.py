@@ -27,9 +27,8 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import require_empty
+from dyngs.runs.folder import LOG_NAME, require_empty
 from dyngs.runs.frame import RunFrame, write_frame
-from dyngs.runs.log import LOG_NAME
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 

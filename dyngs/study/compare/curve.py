@@ -19,10 +19,11 @@ from dyngs.evaluate.view_scores import Drawing
 from dyngs.io.limits import read_limited
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.log import LOG_NAME, MOST_LOG_BYTES
+from dyngs.runs.folder import LOG_NAME
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.study.stored import AS_STORED
 from dyngs.training.events import Evaluated, Event, StepDone
+from dyngs.training.run_log import MOST_LOG_BYTES
 from dyngs.training.trainer import Trainer
 
 VIEWS = 6

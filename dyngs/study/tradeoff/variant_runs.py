@@ -18,6 +18,7 @@ from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.export.scene_file import num_bytes_exact, write_scene_file
+from dyngs.gaussians.restored import restored_model
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -34,7 +35,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.study.runs import finished
 from dyngs.study.tradeoff.measure import with_render_settings
 from dyngs.study.tradeoff.variants import Settings, Value, Variant
-from dyngs.training.new_trainer import assemble, restored_model
+from dyngs.training.new_trainer import assemble
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width"}
 """The key that sets the size of a field, by its kind; free primitives have none."""

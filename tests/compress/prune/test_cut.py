@@ -14,9 +14,10 @@ from dyngs.compress.prune.cut import Cut, FieldSize, apply_cut, cut_config, fiel
 from dyngs.config import Config, DynamicModel
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.scene import DynamicScene
+from dyngs.gaussians.restored import restored_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.views import background_colour
-from dyngs.training.new_trainer import assemble, restored_scene
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -37,7 +37,8 @@ from dyngs.gaussians.colour.training import (
     rate_factor,
 )
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.training.new_trainer import GaussianTrainer, assemble, restored_scene
+from dyngs.gaussians.restored import restored_scene
+from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 
 def gaussians() -> Gaussians:

@@ -28,13 +28,14 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.restored import restored_scene
 from dyngs.human.avatar import pose_refit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.runs.opened import open_run
-from dyngs.training.new_trainer import assemble, restored_scene
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.895)

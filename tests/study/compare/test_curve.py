@@ -11,8 +11,8 @@ import pytest
 import dyngs
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.runs.log import LOG_NAME
 from dyngs.study.compare.curve import CurvePoint, QualityCurve, read_curve
+from dyngs.training.run_log import LOG_NAME
 
 
 def test_lines_that_are_damaged_are_passed_over(tmp_path: Path) -> None:

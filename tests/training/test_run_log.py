@@ -12,8 +12,8 @@ import pytest
 from steps import step_done
 
 from dyngs.core.errors import DyngsError
-from dyngs.runs.log import LogRecord, RunLog, record_of
 from dyngs.training.events import Evaluated, Message
+from dyngs.training.run_log import LogRecord, RunLog, record_of
 
 
 def _record(step: int, psnr: float | None = 20.0) -> LogRecord:
