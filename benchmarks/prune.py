@@ -23,8 +23,6 @@ from statistics import median
 import torch
 
 from dyngs.api.prune import file_of, prune_run, prune_within
-from dyngs.compress.storage.file import read_scene
-from dyngs.compress.storage.tensors import drawable
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.comparison import Cost, compared
@@ -32,6 +30,8 @@ from dyngs.evaluate.report import evaluate_run, scene_of_split, split_views
 from dyngs.export.scene_file import write_scene_file
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.scene_file import read_scene
+from dyngs.runs.scene_tensors import drawable
 
 ONCE = "prune.steps=1"
 NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.fraction=0"

@@ -14,7 +14,6 @@ from synthetic_bodies import model, write_npz, write_obj, write_pickle
 from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
-from dyngs.compress.storage.file import encoded
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.camera import Cameras
@@ -31,6 +30,7 @@ from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.io.tensor_file import write_tensors
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.runs.scene_file import encoded
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 

@@ -14,16 +14,6 @@ from moving_scene import camera
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.compress.storage.file import (
-    _DTYPES,
-    MAGIC,
-    MAX_HEADER,
-    _Header,
-    _Info,
-    _stored,
-    compressed,
-)
-from dyngs.compress.storage.tensors import Coding, TensorKind
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.core.state import prefixed, tensors_of
 from dyngs.deform.fields import field_state
@@ -32,6 +22,16 @@ from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.runs.scene_file import (
+    _DTYPES,
+    MAGIC,
+    MAX_HEADER,
+    _Header,
+    _Info,
+    _stored,
+    compressed,
+)
+from dyngs.runs.scene_tensors import Coding, TensorKind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

@@ -16,7 +16,6 @@ import pytest
 
 import dyngs
 from dyngs.cli.arguments import print_notes
-from dyngs.compress.storage.file import read_scene
 from dyngs.core.errors import (
     DyngsError,
     as_word,
@@ -31,6 +30,7 @@ from dyngs.core.errors import (
 from dyngs.io.fields import read_json_object
 from dyngs.io.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
+from dyngs.runs.scene_file import read_scene
 
 
 @pytest.mark.parametrize(

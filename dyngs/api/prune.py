@@ -11,7 +11,6 @@ from pathlib import Path
 
 from dyngs.api.train import num_cores, train
 from dyngs.compress.prune.search import MOST_HELD_OUT, Promise, Search
-from dyngs.compress.storage.file import write_scene
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, show
@@ -34,6 +33,7 @@ from dyngs.runs.checkpoint import (
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, LOG_NAME, require_empty
 from dyngs.runs.frame import FRAME_NAME
+from dyngs.runs.scene_file import write_scene
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise

@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from dyngs.compress.storage.file import read_scene
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.conventions import RasterizeMode
@@ -30,6 +29,7 @@ from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.renderable import Renderable
+from dyngs.runs.scene_file import read_scene
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"

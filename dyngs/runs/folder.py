@@ -186,7 +186,7 @@ def _about_other(folder: Path, config: Config) -> str:
     train = config.train.model_copy(update={"steps": asked.train.steps})
     is_longer = config.train.steps > done
     longer = is_longer and _is_same_run(asked, config.model_copy(update={"train": train}))
-    go_on = f", or go on to so many steps with `dyngs train --resume {as_word(folder)} train.steps={config.train.steps}`"
+    go_on = f", or go on to that with `dyngs train --resume {as_word(folder)} train.steps={config.train.steps}`"
     return f"{folder} already holds another run; give another run.dir to keep both{go_on if longer else ''}"
 
 

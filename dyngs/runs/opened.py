@@ -16,8 +16,8 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, HumanModel, StaticModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
+from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
-from dyngs.export.camera_paths.aim import up_direction
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.body_reader import load_template

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.export.camera_paths.aim import world_from_cam
+from dyngs.data.aim import world_from_cam
 
 _NEAREST_TURN, _NEAREST_TIME = 0.5, 2.0
 """Distances, relative to the size of the scene, that weigh as much as a radian between viewing

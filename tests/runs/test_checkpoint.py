@@ -15,7 +15,6 @@ import torch
 from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
-from dyngs.compress.storage.tensors import drawable
 from dyngs.config import Config, DataConfig, RunConfig, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
@@ -35,6 +34,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
+from dyngs.runs.scene_tensors import drawable
 
 
 def _checkpoint(step: int) -> Checkpoint:

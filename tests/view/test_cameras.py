@@ -6,7 +6,7 @@ import torch
 from moving_scene import camera
 
 from dyngs.core.camera import Cameras
-from dyngs.export.camera_paths.aim import look_at
+from dyngs.data.aim import look_at
 from dyngs.view.cameras import camera_at, fitting_fov, look_point, nearest_camera, pose_of
 
 

@@ -11,7 +11,6 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from dyngs.compress.storage.file import decoded, encoded
 from dyngs.compress.storage.precision import (
     GREY_LEVELS,
     Precision,
@@ -20,7 +19,6 @@ from dyngs.compress.storage.precision import (
     measured_precision,
     rounded,
 )
-from dyngs.compress.storage.tensors import COARSENESS, TRIANGLES, completed, drawable, step_below
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -32,6 +30,8 @@ from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
+from dyngs.runs.scene_file import decoded, encoded
+from dyngs.runs.scene_tensors import COARSENESS, TRIANGLES, completed, drawable, step_below
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.compress.storage.tensors import (
+from dyngs.gaussians import Gaussians
+from dyngs.runs.scene_tensors import (
     COARSENESS,
     LIMIT,
     MAX_COARSENESS,
@@ -26,7 +27,6 @@ from dyngs.compress.storage.tensors import (
     restored,
     step_below,
 )
-from dyngs.gaussians import Gaussians
 
 GREY_LEVELS = 255.0
 TRIALS = 4  # number of steps tried per group

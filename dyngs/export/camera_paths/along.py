@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dyngs.core.camera import Cameras
-from dyngs.export.camera_paths.aim import look_at_point, unit, with_poses, world_from_cam
+from dyngs.data.aim import look_at_point, unit, with_poses, world_from_cam
 from dyngs.export.camera_paths.path import CameraPath
 
 _SMOOTHED_CAMERAS = 2.0

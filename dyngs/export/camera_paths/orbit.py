@@ -10,8 +10,7 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.geometry import fraction_in_front
-from dyngs.export.camera_paths.aim import (
+from dyngs.data.aim import (
     look_at,
     look_at_point,
     perpendicular,
@@ -20,6 +19,7 @@ from dyngs.export.camera_paths.aim import (
     with_poses,
     world_from_cam,
 )
+from dyngs.data.geometry import fraction_in_front
 
 _WIDEST_GAP = math.radians(100)
 """Where no camera stands for more than this, nobody has seen the scene from there."""

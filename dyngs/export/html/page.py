@@ -14,10 +14,10 @@ from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
+from dyngs.data.aim import look_at_point
 from dyngs.data.capture import Capture, View
 from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
-from dyngs.export.camera_paths.aim import look_at_point
 from dyngs.export.chosen_path import front_of, orbit_around, points_at, view_to_show
 from dyngs.export.html.element import element_script, text_of
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files

@@ -10,7 +10,6 @@ from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores
 from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.compress.prune.stage import pruning
-from dyngs.compress.storage.file import write_scene
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.schema import section_class
@@ -32,6 +31,7 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.config_file import write_config
+from dyngs.runs.scene_file import write_scene
 from dyngs.study.runs import finished
 from dyngs.study.tradeoff.measure import with_render_settings
 from dyngs.study.tradeoff.variants import Settings, Value, Variant

@@ -9,7 +9,6 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
-from dyngs.compress.storage.file import decoded
 from dyngs.compress.storage.measure import (
     COMPARED,
     FACTORS,
@@ -23,6 +22,7 @@ from dyngs.config.io import load_resolved
 from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.runs.scene_file import decoded
 
 
 def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:

@@ -17,7 +17,10 @@ from dyngs.compress.storage.precision import (
     coarseness_of,
     measured_precision,
 )
-from dyngs.compress.storage.tensors import (
+from dyngs.core.state import part_of
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import render
+from dyngs.runs.scene_tensors import (
     MAX_COARSENESS,
     TensorKind,
     coding_of,
@@ -25,9 +28,6 @@ from dyngs.compress.storage.tensors import (
     drawable,
     restored,
 )
-from dyngs.core.state import part_of
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import render
 from dyngs.static.scene import StaticScene
 
 

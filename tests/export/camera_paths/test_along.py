@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from camera_rings import UP, assert_rigid, cameras_at, ring_of
 
-from dyngs.export.camera_paths.aim import look_at
+from dyngs.data.aim import look_at
 from dyngs.export.camera_paths.along import path_along
 
 

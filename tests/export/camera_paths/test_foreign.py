@@ -12,7 +12,7 @@ import pytest
 from camera_rings import UP
 
 from dyngs.core.errors import DyngsError
-from dyngs.export.camera_paths.aim import look_at
+from dyngs.data.aim import look_at
 from dyngs.export.camera_paths.path import read_path
 from dyngs.io.limits import VARIABLE
 

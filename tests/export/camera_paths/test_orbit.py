@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.export.camera_paths.aim import look_at
+from dyngs.data.aim import look_at
 from dyngs.export.camera_paths.orbit import (
     frame_orbit_for_points,
     orbit_of,

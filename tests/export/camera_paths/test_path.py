@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.export.camera_paths.aim import look_at
+from dyngs.data.aim import look_at
 from dyngs.export.camera_paths.path import (
     CameraPath,
     parse_times,

@@ -20,11 +20,11 @@ from dyngs.api.train import train
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
+from dyngs.data.aim import look_at
 from dyngs.data.loader import ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.camera_paths.aim import look_at
 from dyngs.human.predict.gps.learner import learner, predictor
 from dyngs.human.predict.gps.pairs import neighbours
 from dyngs.human.synthetic.people import PeopleOptions, write_people

@@ -13,7 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
-from dyngs.compress.storage.file import (
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import part_of
+from dyngs.gaussians import Gaussians
+from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.runs.scene_file import (
     MAGIC,
     MAX_HEADER,
     Packing,
@@ -26,11 +30,7 @@ from dyngs.compress.storage.file import (
     unpacked,
     write_scene,
 )
-from dyngs.compress.storage.tensors import COARSENESS
-from dyngs.core.errors import DyngsError
-from dyngs.core.state import part_of
-from dyngs.gaussians import Gaussians
-from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.runs.scene_tensors import COARSENESS
 from dyngs.static.scene import StaticScene
 
 INFO = CheckpointInfo(7, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic")

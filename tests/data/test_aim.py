@@ -8,7 +8,7 @@ from camera_rings import UP, cameras_at, forward_facing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.export.camera_paths.aim import look_at, look_at_point, up_direction
+from dyngs.data.aim import look_at, look_at_point, up_direction
 
 
 def test_parallel_cameras_look_forward() -> None:

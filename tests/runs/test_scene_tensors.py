@@ -15,8 +15,20 @@ from moving_scene import camera
 from scipy.spatial.transform import Rotation
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 
-from dyngs.compress.storage.file import packed, unpacked
-from dyngs.compress.storage.tensors import (
+from dyngs.config import DynamicModel
+from dyngs.core.errors import DyngsError
+from dyngs.core.state import Role, part_of
+from dyngs.deform.scene import DynamicScene
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.avatar.corrections import new_corrections
+from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.motion.motion import MotionClip
+from dyngs.runs.scene_file import packed, unpacked
+from dyngs.runs.scene_tensors import (
     COARSENESS,
     FIXED_STEPS,
     LARGEST_HALF,
@@ -47,18 +59,6 @@ from dyngs.compress.storage.tensors import (
     to_grid,
     to_whole,
 )
-from dyngs.config import DynamicModel
-from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, part_of
-from dyngs.deform.scene import DynamicScene
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.avatar.corrections import new_corrections
-from dyngs.human.avatar.posing import Skeleton
-from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.motion import MotionClip
 from dyngs.static.scene import StaticScene
 
 

@@ -25,7 +25,12 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from dyngs.compress.storage.tensors import (
+from dyngs.core.errors import DyngsError, printable, require_regular
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.write import atomic_file
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.renderable import Renderable
+from dyngs.runs.scene_tensors import (
     COARSENESS,
     Coding,
     TensorKind,
@@ -39,11 +44,6 @@ from dyngs.compress.storage.tensors import (
     stored_edit,
     to_whole,
 )
-from dyngs.core.errors import DyngsError, printable, require_regular
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.write import atomic_file
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
-from dyngs.models.renderable import Renderable
 
 _SAMPLE = 2**15  # number of values by which the layout of an array is chosen
 _FEW = 512  # number of values below which the layout is not changed
