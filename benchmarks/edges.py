@@ -1,6 +1,6 @@
 """Errors of runs at the stored size of their images: whole, near true edges, and in close-ups.
 
-    dyngs data synth polyhedra FOLDER --size 200
+    python benchmarks/polyhedra.py FOLDER --size 200
     dyngs train bg_triangle data.root=FOLDER run.dir=RUN
     python benchmarks/edges.py RUN [RUN ...]
 

@@ -31,7 +31,7 @@ from torch import Tensor
 from dyngs.api.compat import rasterization
 from dyngs.cli.kernel_bench import Workload, garden_workload, random_workload
 from dyngs.core.camera import Cameras
-from dyngs.export.camera_paths.orbit import frame_orbit_for_points
+from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.io.formats.formats import read_splats
 from dyngs.io.formats.similarity import axis_of
 from dyngs.ops.device import why_no_gpu

@@ -26,7 +26,7 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Lens
 from dyngs.data.geometry import pinhole_matrix
 from dyngs.data.images.lens import undistorted_points
-from dyngs.data.synthetic import raytrace
+from dyngs.data.synthetic.raytrace import f32, trace
 from dyngs.data.synthetic.scenes import scene_at
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.write import write_image, write_text
@@ -59,7 +59,9 @@ def image(pose: np.ndarray, lens: Lens, focal: float, size: tuple[int, int]) -> 
             directions(lens, focal, size, ((a + 0.5) / SAMPLES, (b + 0.5) / SAMPLES))
             @ pose[:3, :3].T
         )
-        total += raytrace.colours_along(scene, pose[:3, 3], rays)
+        lamps = np.broadcast_to(f32(scene.lamp), rays.shape)
+        hit, colours = trace(scene, f32(pose[:3, 3]), f32(rays), lamps)
+        total[hit] += colours
     return (255 * total / SAMPLES**2 + 0.5).astype(np.uint8).reshape(size[1], size[0], 3)
 
 

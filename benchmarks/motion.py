@@ -1,14 +1,14 @@
 """Gap between what is learned and what could be, if the motion were known, on the synthetic scenes
 that move.
 
-    python benchmarks/motion.py FOLDER [--scenes spin,wave,room] [--size 200] [--views 48] [--style
+    python benchmarks/motion.py FOLDER [--scenes spin,room] [--size 200] [--views 48] [--style
     moving]
         [key=value ...]
 
 For each scene two models are trained for the same number of steps and measured on the test split:
 the preset (configs/dynamic.yaml with the overrides), and an oracle. The oracle's Gaussians begin on
 the true surfaces, with labels of what they belong to, and a field moves them by the scene's own
-description: each rigid body and the cloth. The rasterizer, the strategy, the learning rates and the
+description of each rigid body. The rasterizer, the strategy, the learning rates and the
 harmonics are the preset's, the base colours of what moves may change over time, and images have
 their full size from the start. The gap is what it costs to find the motion; shading and shadows
 hold back both. FOLDER keeps captures and runs of the preset, which are reused.
@@ -42,7 +42,7 @@ from dyngs.data.synthetic.captures import (
     is_in_image,
     write_dynamic_capture,
 )
-from dyngs.data.synthetic.raytrace import Primitive, Sheet, is_seen
+from dyngs.data.synthetic.raytrace import Primitive, is_seen
 from dyngs.data.synthetic.raytrace import Scene as TrueScene
 from dyngs.data.synthetic.scenes import SceneName, scene_at
 from dyngs.data.times import evenly_spaced
@@ -60,11 +60,11 @@ from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.static.training import StaticTraining
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
@@ -153,10 +153,6 @@ class TrueMotion(DeformationField):
             rest = self.rest[label]
             if label >= len(now):
                 opacities[own] = GONE
-            elif isinstance(rest, Sheet):
-                bent, turned = _bent(rest, now[label], means[own].detach())
-                moved = moved.index_add(0, own, bent)
-                quats[own] = turned
             else:
                 motion = Motion.between(rest, now[label])
                 moved = moved.index_copy(0, own, means[own] @ motion.matrix.T + motion.shift)
@@ -169,18 +165,6 @@ class TrueMotion(DeformationField):
         field = self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
         field.labels = self.labels[edit.source]
         return field
-
-
-def _bent(rest: Sheet, now: Primitive, means: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how far a cloth has moved at ``means`` (R, 3), and the (R, 4) quaternions that turn
-    its normals."""
-    points = means.double().numpy()
-    local = rest.local(points)
-    shift = now.placed(local) - rest.placed(local)
-    before, after = (torch.from_numpy(p.normals(points).astype(np.float32)) for p in (rest, now))
-    axis = torch.linalg.cross(before, after)
-    quats = torch.cat([1 + (before * after).sum(1, keepdim=True), axis], dim=1)
-    return torch.from_numpy(shift.astype(np.float32)), torch.nn.functional.normalize(quats, dim=1)
 
 
 class OracleTraining(StaticTraining):

@@ -133,11 +133,11 @@ MUTATIONS = (
     ("data/times.py", "len({known.get(view.name) for view in seen} - {None}) == len(seen)", "True", "data/test_times.py"),
     ("data/images/lens.py", "k1, k2, _, _, k3", "k1, k2, k3, _, _", "data/images/test_lens.py"),
     ("data/readers/colmap.py", "fy = values[num_focal - 1]", "fy = values[0]", "data/readers/test_colmap.py"),
-    ("export/camera_paths/keyframes.py", "slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]", "slopes[:-1] * steps[:-1] + slopes[1:] * steps[1:]", "export/camera_paths/test_keyframes.py"),
-    ("export/camera_paths/keyframes.py", "np.log(keys.intrinsics[index, axis, axis])", "(keys.intrinsics[index, axis, axis])", "export/camera_paths/test_keyframes.py"),
-    ("data/aim.py", "values[0] < _LEVEL**2", "values[0] < 9", "data/test_aim.py export/camera_paths/test_orbit.py"),
-    ("export/camera_paths/orbit.py", "-np.sin(turns * phase)", "np.sin(turns * phase)", "export/camera_paths/test_orbit.py"),
-    ("export/camera_paths/along.py", "order = np.argsort(np.asarray(times, np.float64))", "order = np.arange(len(times))", "export/camera_paths/test_along.py"),
+    ("export/camera_paths.py", "slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]", "slopes[:-1] * steps[:-1] + slopes[1:] * steps[1:]", "export/test_camera_paths.py"),
+    ("export/camera_paths.py", "np.log(keys.intrinsics[index, axis, axis])", "(keys.intrinsics[index, axis, axis])", "export/test_camera_paths.py"),
+    ("data/aim.py", "values[0] < 0.2**2", "values[0] < 9", "export/test_orbits.py"),
+    ("export/orbits.py", "-np.sin(2 * phase)", "np.sin(2 * phase)", "export/test_orbits.py"),
+    ("export/orbits.py", "order = np.argsort(seconds)", "order = np.arange(len(seconds))", "export/test_orbits.py"),
 )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Meshes of runs against the true surface of the synthetic scene of polyhedra.
 
-    dyngs data synth polyhedra FOLDER --size 200
+    python benchmarks/polyhedra.py FOLDER --size 200
     dyngs train static data.root=FOLDER run.dir=RUN
     python benchmarks/surface.py RUN [RUN ...]
 
@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from polyhedra import polyhedra
 from scipy.spatial import cKDTree
 
 from dyngs.data.geometry import inverse_rigid
-from dyngs.data.synthetic.polyhedra import polyhedra
 from dyngs.data.synthetic.raytrace import nearest_things, sampled_rays
 from dyngs.export.surface_file import write_surface
 from dyngs.runs.opened import Opened, open_run

@@ -282,7 +282,7 @@ def read_override_lines(root: Path) -> object:
 
 def read_a_path(root: Path) -> object:
     """Read a camera path."""
-    from dyngs.export.camera_paths.path import read_path
+    from dyngs.export.camera_paths import read_path
 
     path = read_path(only(root))
     return path.cameras, path.fps, path.times
@@ -300,7 +300,7 @@ def read_a_point(root: Path) -> object:
 def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
-    from dyngs.export.camera_paths.path import parse_times
+    from dyngs.export.camera_paths import parse_times
     from dyngs.study.tradeoff.table import parse_requirements
     from dyngs.study.tradeoff.variants import parse_variations
 

@@ -20,7 +20,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import tensors_of
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
-from dyngs.export.camera_paths.path import CameraPath, write_path
+from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.body.joints import JOINT_NAMES

@@ -36,6 +36,7 @@ from smpl_like import write_smpl_like
 from tiny_captures import random_pixels, write_colmap, write_frames, write_image
 from tiny_fields import write_tiny_capture
 
+from dyngs.cli.output import print_messages
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.human.fit import fitted_capture
 from dyngs.human.fit.capture_fit import FitEffort
@@ -136,6 +137,12 @@ def empty_folder(numbered_folders: Iterator[Path], monkeypatch: pytest.MonkeyPat
     user's cache is another empty folder."""
     monkeypatch.chdir(next(numbered_folders))
     monkeypatch.setenv("DYNGS_CACHE_DIR", str(next(numbered_folders)))
+
+
+@pytest.fixture(autouse=True)
+def printed_messages() -> None:
+    """Messages of the package are printed, as by the command line."""
+    print_messages()
 
 
 @pytest.fixture(autouse=True)

@@ -5,8 +5,9 @@ few pixels. Gradients come from autograd. Sources: Zwicker et al. 2001, Kerbl et
 2024 (compensation).
 """
 
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false,
-# reportUnknownArgumentType=false The stubs of torch leave parts of these functions untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
 

@@ -16,6 +16,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
@@ -27,7 +28,6 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
-from dyngs.static.scene import StaticScene
 
 KINDS = ("static", *FIELDS, "windowed", "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])

@@ -23,11 +23,11 @@ from splat_scenes import cloud
 
 from dyngs.core.camera import Cameras
 from dyngs.export.html.page import ELEMENT, PAGE, WrittenPage, write_folder, write_page
+from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import opened_scene
-from dyngs.static.levels import LevelScene
-from dyngs.static.scene import StaticScene
 
 Failure = Literal["cut", "404", "503", "silent", "damaged"]
 

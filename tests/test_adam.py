@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, tensors_of
+from dyngs.core.state import tensors_of
 from dyngs.gaussians.adam import AdamState
 from dyngs.ops.adam import Count
 
@@ -58,54 +58,6 @@ def test_it_is_adam(along_last_axis: bool) -> None:
         assert mine[name].grad is None
 
 
-def test_without_gradients_nothing_is_done() -> None:
-    adam, tensors = stepped(2)
-    before = {name: x.clone() for name, x in (tensors | tensors_of(adam.state())).items()}
-    for name, x in tensors.items():
-        assert adam.step_(name, x, lr=0.1, step=3) == stepped_along(True, adam, name, x, 3) == 0
-    assert all(
-        torch.equal(x, before[name]) for name, x in (tensors | tensors_of(adam.state())).items()
-    )
-
-
-def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
-    """A row is all that belongs to one Gaussian, or, of arrays for all of them, the values along
-    the last axis."""
-    for along_last_axis, left_out in ((False, 1), (True, 2)):
-        x = start_values()["planes"]
-        adam = AdamState.zero({"planes": x})
-        before = x.detach().clone()
-        x.grad = random(SHAPES["planes"], 1)
-        x.grad[1, 2, 3, 0], x.grad[1, 0, 0, 1] = float("nan"), float("inf")
-        assert stepped_along(along_last_axis, adam, "planes", x, 1) == left_out
-        stays = x.detach() == before
-        assert stays[1, 2, 3].all()
-        assert stays[1, 0, 0].all()
-        assert int(stays.sum()) == (4 if along_last_axis else 24)
-        assert all(m.isfinite().all() for m in (*adam.exp_avg.values(), *adam.exp_avg_sq.values()))
-
-
-def test_of_chosen_rows_only_those_are_updated() -> None:
-    x = start_values()["weight"]
-    rows = torch.tensor([True, False, False, True])
-    adam = AdamState.zero({"weight": x})
-    before = x.detach().clone()
-    x.grad = torch.ones_like(x)
-    adam.step_("weight", x, lr=0.1, step=1, rows=rows)
-    assert torch.equal((x.detach() != before).all(1), rows)
-    assert torch.equal(adam.exp_avg["weight"].any(1), rows)
-
-
-def test_each_value_of_a_row_may_have_its_rate() -> None:
-    x = start_values()["weight"]
-    adam = AdamState.zero({"weight": x})
-    before = x.detach().clone()
-    x.grad = torch.ones_like(x)
-    rates = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
-    adam.step_("weight", x, lr=rates, step=1)
-    torch.testing.assert_close(before - x.detach(), rates.expand(4, 5), rtol=0, atol=1e-6)
-
-
 def test_mapped_changes_both_moments_of_what_is_named() -> None:
     adam, _ = stepped(2)
     some, everything, nothing = (
@@ -134,13 +86,6 @@ def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
     for name, x in tensors_of(adam.state()).items():
         assert torch.equal(x, tensors_of(other.state())[name])
         assert torch.equal(x, tensors_of(other.to("cpu").state())[name])
-
-
-def test_its_state_is_for_training_alone() -> None:
-    adam, _ = stepped(1)
-    state = adam.state()
-    assert set(state) == {f"{part}.{name}" for part in ("exp_avg", "exp_avg_sq") for name in SHAPES}
-    assert {x.role for x in state.values()} == {Role.TRAINING}
 
 
 @pytest.mark.parametrize("part", ["exp_avg", "exp_avg_sq"])

@@ -42,7 +42,6 @@ VERBS = (
     "compare",
     "config",
     "docs",
-    "completion",
 )
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
     "PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])

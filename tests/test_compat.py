@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
-import dyngs
 from dyngs.api.compat import rasterization
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -175,10 +174,6 @@ def test_parameters_are_those_of_gsplat() -> None:
 # ----------------------------------------------------------------------------------------------------
 
 
-def test_is_public() -> None:
-    assert dyngs.rasterization is rasterization
-
-
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("render_mode", MODES)
@@ -202,29 +197,6 @@ def test_equals_render(render_mode: str, rasterize_mode: str, packed: bool) -> N
     # 1e-9, not bitwise: render() gets scales and opacities through log and logit
     torch.testing.assert_close(image, torch.cat(parts, -1), rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(alpha, truth.alpha[..., None], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3, 7, 32, 33, 100])
-@pytest.mark.parametrize("per_camera", [False, True])
-def test_any_number_of_channels(channels: int, per_camera: bool) -> None:
-    """Channels do not know of each other: each equals an image of its own."""
-    scene = random_scene(n=10)
-    shape = (2, 10, channels) if per_camera else (10, channels)
-    colors = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    backgrounds = torch.rand(2, channels, dtype=torch.float64)
-    image, alpha, _ = call(scene, colors=colors, backgrounds=backgrounds)
-    assert image.shape == (2, 29, 37, channels)
-    assert alpha.shape == (2, 29, 37, 1)
-    last = slice(channels - 1, channels)
-    alone, _, _ = call(scene, colors=colors[..., last], backgrounds=backgrounds[:, last])
-    torch.testing.assert_close(image[..., last], alone, rtol=1e-12, atol=1e-14)
-
-
-def test_coefficients_per_camera() -> None:
-    scene = near_scene()
-    shared, _, _ = call(scene, colors=scene.sh, sh_degree=2)
-    each, _, _ = call(scene, colors=scene.sh.expand(3, *scene.sh.shape), sh_degree=2)
-    assert torch.equal(shared, each)
 
 
 def test_meta_unpacked() -> None:
@@ -300,28 +272,6 @@ def rasterize_with_probe(scene: Scene, projection: Projection, probe: Tensor) ->
     options = BlendOptions(alpha_max=0.999, absgrad=True)
     opacities = scene.opacities.expand(3, 60)
     return rasterize(projection, opacities, colors, scene.size, probe=probe, options=options).color
-
-
-@pytest.mark.parametrize("packed", [True, False])
-def test_gradcheck(packed: bool) -> None:
-    scene = random_scene(n=3, views=2, size=(4, 3), degree=1)
-    scene = replace(scene, scales=5 * scene.scales)  # alpha well above the threshold everywhere
-    names = ("means", "quats", "scales", "opacities", "sh", "cam_from_world", "background")
-
-    def run(*tensors: Tensor) -> tuple[Tensor, Tensor]:
-        moved = replace(scene, **dict(zip(names, tensors, strict=True)))
-        image, alpha, _ = call(
-            moved,
-            colors=moved.sh,
-            sh_degree=1,
-            backgrounds=moved.background,
-            render_mode="RGB+ED",
-            packed=packed,
-        )
-        return image, alpha
-
-    inputs = [getattr(scene, name).detach().clone().requires_grad_() for name in names]
-    assert torch.autograd.gradcheck(run, inputs)
 
 
 UNSUPPORTED: dict[str, Any] = {
@@ -402,25 +352,6 @@ def test_numbers_out_of_range_are_refused_by_name(name: str, value: Any) -> None
         )
 
 
-@pytest.mark.parametrize("factors", [(1.0, 1.0, -1.0), (2.0, 2.0, 2.0), (0.0, 0.0, 0.0)])
-def test_poses_are_rigid(factors: tuple[float, float, float], scene: Scene) -> None:
-    poses = scene.cam_from_world.clone()
-    poses[1, :3, :3] @= torch.diag(torch.tensor(factors)).to(poses)
-    with pytest.raises(
-        DyngsError, match=r"viewmats: the matrix of camera 1 (is mirrored|differs from a rotation)"
-    ):
-        call(replace(scene, cam_from_world=poses))
-
-
-@pytest.mark.parametrize("position", [(0, 0), (1, 1)])
-@pytest.mark.parametrize("focal", [0.0, -0.0, -30.0])
-def test_focal_lengths_are_positive(position: tuple[int, int], focal: float, scene: Scene) -> None:
-    intrinsics = scene.intrinsics.clone()
-    intrinsics[1][position] = focal
-    with pytest.raises(DyngsError, match=r"Ks: focal lengths must be positive.*camera 1 has"):
-        call(replace(scene, intrinsics=intrinsics))
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(
     "name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds"]
@@ -434,26 +365,6 @@ def test_what_is_not_finite_is_named(name: str, bad: float, scene: Scene) -> Non
     options |= {name: x} if name in options else {}
     with pytest.raises(DyngsError, match=f"^{name} holds 1 NaN or infinite"):
         call(replace(scene, **changed), **options)
-
-
-@pytest.mark.parametrize(
-    "backgrounds", [torch.zeros(3), torch.zeros(2, 2), torch.zeros(1, 3), torch.zeros(2, 4)]
-)
-def test_backgrounds_fit_cameras_and_channels(backgrounds: Tensor, scene: Scene) -> None:
-    for mode in ("RGB", "RGB+D"):
-        with pytest.raises(DyngsError, match=r"backgrounds must be \(2, 3\)"):
-            call(scene, backgrounds=backgrounds.double(), render_mode=mode)
-    image, _, _ = call(scene, backgrounds=backgrounds.double(), render_mode="D")
-    assert torch.equal(image, call(scene, render_mode="D")[0])
-
-
-def test_what_is_no_tensor_is_named(scene: Scene) -> None:
-    with pytest.raises(DyngsError, match="colors must be a torch tensor, got ndarray"):
-        call(scene, colors=scene.sh[:, 0].numpy())
-    with pytest.raises(DyngsError, match=r"colors is torch.float32, but means is torch.float64"):
-        call(scene, colors=scene.sh[:, 0].float())
-    with pytest.raises(DyngsError, match=r"colors must be \(20, D\)"):
-        call(scene, colors=scene.sh[:, 0, :0])
 
 
 EXTREMES: dict[str, list[float]] = {
@@ -507,43 +418,3 @@ def test_extreme_numbers_give_finite_images_or_one_line(
     for name in ("means", "quats", "scales", "opacities"):
         grad = getattr(leaves, name).grad
         assert grad is None or bool(grad.isfinite().all()), name
-
-
-@pytest.mark.parametrize(
-    "name", ["means", "quats", "scales", "opacities", "cam_from_world", "intrinsics"]
-)
-def test_wrong_shapes_and_dtypes_are_named(name: str, scene: Scene) -> None:
-    shown = {"cam_from_world": "viewmats", "intrinsics": "Ks"}.get(name, name)
-    x = getattr(scene, name)
-    with pytest.raises(
-        DyngsError, match=rf"(?s)^rasterization: .*{'' if name == 'means' else shown}"
-    ):
-        call(replace(scene, **{name: x[..., None]}), colors=scene.sh[:, 0])
-    if name != "means":
-        with pytest.raises(
-            DyngsError, match=f"{shown} is torch.float32, but means is torch.float64"
-        ):
-            call(replace(scene, **{name: x.float()}))
-
-
-def test_no_gaussians() -> None:
-    scene = random_scene(n=0)
-    colors = torch.zeros(0, 3, dtype=torch.float64)
-    for packed in (True, False):
-        image, alpha, meta = call(scene, colors=colors, backgrounds=scene.background, packed=packed)
-        assert torch.equal(image, scene.background[:, None, None].expand(2, 29, 37, 3))
-        assert not alpha.any()
-        assert meta["flatten_ids"].numel() == 0
-
-
-def test_opaque_layers_follow_gsplats_largest_alpha() -> None:
-    scene = random_scene(n=1, views=1)
-    scene = replace(
-        scene,
-        means=torch.zeros(1, 3).double(),
-        scales=torch.full((1, 3), 1e4, dtype=torch.float64),
-        opacities=torch.ones(1).double(),
-    )
-    _, alpha, _ = call(scene)
-    assert float(alpha.max()) == pytest.approx(0.999)
-    assert math.isclose(float(alpha.min()), 0.999, rel_tol=1e-6)

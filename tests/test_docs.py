@@ -184,7 +184,7 @@ def require_overrides(*overrides: str) -> None:
 def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times,
     presets."""
-    from dyngs.export.camera_paths.path import parse_times, path_file
+    from dyngs.export.camera_paths import parse_times, path_file
     from dyngs.study.tradeoff.table import parse_goal, parse_requirements
     from dyngs.study.tradeoff.variants import parse_variations
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import dyngs
-from dyngs.cli.arguments import print_notes
+from dyngs.cli.output import print_messages, print_notes
 from dyngs.core.errors import (
     DyngsError,
     as_word,
@@ -98,7 +98,7 @@ def test_no_message_can_steer_a_terminal() -> None:
 @pytest.mark.parametrize("text", ["x" * 5000, "9" * 5000, "\x07" * 300, "prune=" + "1" * 5000])
 def test_what_the_command_line_quotes_is_short(text: str) -> None:
     from dyngs.data.times import parse_frames
-    from dyngs.export.camera_paths.path import parse_times
+    from dyngs.export.camera_paths import parse_times
     from dyngs.study.tradeoff.table import parse_requirements
     from dyngs.study.tradeoff.variants import parse_variations
 
@@ -210,7 +210,7 @@ def test_lines_and_warnings_cannot_steer_a_terminal(capsys: pytest.CaptureFixtur
 
 
 def test_warnings_of_the_package_are_escaped() -> None:
-    """No other place prints one, nor passes ``print`` on for lines that may quote names."""
+    """One place prints them, and none passes ``print`` on for lines that may quote names."""
     package = Path(dyngs.__file__).parent
     found = [
         f"{file.name}: {line.strip()}"
@@ -218,6 +218,15 @@ def test_warnings_of_the_package_are_escaped() -> None:
         for line in file.read_text(encoding="utf-8").splitlines()
         if re.search(r"dyngs: warning|= print\b|, print\)|lambda line: print", line)
     ]
-    assert found == [
-        'errors.py: print(f"dyngs: warning: {printable(text)}", file=sys.stderr, flush=True)'
-    ]
+    assert len(found) == 1
+    assert found[0].startswith("output.py: ")
+
+
+def test_messages_are_logged_and_can_be_silenced(capsys: pytest.CaptureFixture[str]) -> None:
+    print_messages(quiet=True)
+    show("one")
+    warn("two")
+    assert capsys.readouterr() == ("", "")
+    code = "from dyngs.core.errors import show, warn; show('three'); warn('four')"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("", "four\n")

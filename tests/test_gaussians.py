@@ -10,23 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import random_scene
 
-from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians, TopologyEdit
 
 
 def five() -> Gaussians:
     return random_scene(n=5, degree=2).gaussians
-
-
-def test_activations() -> None:
-    scene = random_scene(n=5)
-    torch.testing.assert_close(scene.gaussians.scales, scene.scales)
-    torch.testing.assert_close(scene.gaussians.opacities, scene.opacities)
-    torch.testing.assert_close(scene.gaussians.base_rgb, scene.sh[:, 0] * SH_C0 + 0.5)
-
-
-def test_sh_degree() -> None:
-    assert [random_scene(n=2, degree=d).gaussians.sh_degree for d in range(5)] == [0, 1, 2, 3, 4]
 
 
 def test_opacities_are_the_sigmoid_and_do_not_depend_on_the_number_of_threads(
@@ -59,22 +47,6 @@ def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
         five().replace(**{name: torch.zeros(shape)})
 
 
-def test_select_takes_rows_of_everything() -> None:
-    gaussians = five()
-    picked = gaussians.select(torch.tensor([3, 1, 3]))
-    assert len(picked) == 3
-    for name, x in picked.tensors().items():
-        assert torch.equal(x, gaussians.tensors()[name][[3, 1, 3]])
-    mask = torch.tensor([True, False, False, False, True])
-    assert torch.equal(gaussians.select(mask).means, gaussians.means[mask])
-
-
-def test_detach_cuts_the_graph() -> None:
-    gaussians = five().replace(means=five().means.requires_grad_())
-    assert gaussians.means.requires_grad
-    assert not gaussians.detach().means.requires_grad
-
-
 def test_to_moves_and_converts_every_tensor() -> None:
     gaussians = five()
     moved = gaussians.to(device="meta", dtype=torch.float32)
@@ -85,22 +57,6 @@ def test_to_moves_and_converts_every_tensor() -> None:
             gaussians.to().tensors().values(), gaussians.tensors().values(), strict=True
         )
     )
-
-
-def test_replace_leaves_the_rest() -> None:
-    gaussians = five()
-    other = gaussians.replace(means=gaussians.means + 1)
-    assert other.quats is gaussians.quats
-    assert torch.equal(other.means, gaussians.means + 1)
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.lists(st.booleans(), min_size=5, max_size=5))
-def test_keep_is_the_mask(mask: list[bool]) -> None:
-    edit = TopologyEdit.select(torch.tensor(mask))
-    x = torch.arange(10).view(5, 2)
-    assert torch.equal(edit.apply(x), x[torch.tensor(mask)])
-    assert torch.equal(edit.apply_moments(x), edit.apply(x))
 
 
 @settings(max_examples=20, deadline=None)
@@ -124,11 +80,3 @@ def test_stored_sizes_beyond_float32_are_refused() -> None:
     tensors["log_scales"][2, 1] = 88.5
     with pytest.raises(ValueError, match=r"'log_scales' holds sizes beyond e\^88"):
         Gaussians.stored(tensors)
-
-
-def test_joined_parts_follow_each_other() -> None:
-    whole = five()
-    first = torch.tensor([0, 1])
-    rest = torch.tensor([2, 3, 4])
-    both = Gaussians.joined([whole.select(first), whole.select(rest)])
-    assert all(torch.equal(x, both.tensors()[name]) for name, x in whole.tensors().items())

@@ -42,9 +42,9 @@ from dyngs.deform.training import DynamicTraining
 from dyngs.gaussians.densify import DefaultDensifier, Densifier
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.mcmc import McmcDensifier
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
 from dyngs.models.views import resolved_background, training_cameras, training_times
-from dyngs.static.scene import StaticScene
 from dyngs.training.losses import SilhouetteLoss
 from dyngs.training.new_trainer import assemble, with_points
 
@@ -52,9 +52,7 @@ from dyngs.training.new_trainer import assemble, with_points
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(
-        folder, StillOptions(size=16, num_train=5, num_test=1, samples=1, distance=4.0)
-    )
+    write_still_capture(folder, StillOptions(size=16, num_train=5, num_test=1, samples=1))
     return folder
 
 

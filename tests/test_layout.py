@@ -224,7 +224,7 @@ def test_import_is_cheap_and_leaves_heavy_packages_alone() -> None:
         "import sys, time, torch, numpy; before = set(sys.modules); t = time.process_time(); import dyngs\n"
         "print(time.process_time() - t); import dyngs.gaussians.rendering\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules and m not in before])\n"
-        "import dyngs.evaluate.report, dyngs.export.images, dyngs.export.chosen_path\n"
+        "import dyngs.evaluate.report, dyngs.export.images, dyngs.export.choose_path\n"
         f"print([m for m in {FOR_FEW_SCENES!r} if m in sys.modules])"
     )
     for _ in range(3):

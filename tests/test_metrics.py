@@ -23,15 +23,6 @@ def noisy(truth: torch.Tensor, sigma: float, seed: int = 1) -> torch.Tensor:
     return (truth + sigma * noise).clamp(0, 1)
 
 
-def test_psnr_known_answers() -> None:
-    grey = torch.full((4, 5, 3), 0.5)
-    assert psnr(grey + 0.1, grey) == pytest.approx(20.0, abs=1e-5)  # float32 images
-    assert psnr(torch.zeros(4, 5, 3), torch.ones(4, 5, 3)) == 0.0
-    assert psnr(grey, grey) == MAX_PSNR
-    assert psnr(grey * 6, torch.ones(4, 5, 3)) == MAX_PSNR  # values above 1 are clamped
-    assert math.isnan(psnr(grey * math.nan, grey))
-
-
 def test_psnr_is_that_of_skimage() -> None:
     skimage = pytest.importorskip("skimage.metrics")
     a = image()
@@ -131,13 +122,6 @@ def test_ssim_pads_with_zeros() -> None:
     np.testing.assert_allclose(ssim_map(a, b)[0, 0].numpy(), wanted, rtol=1e-5)
 
 
-def test_ssim_bounds() -> None:
-    a = image()
-    assert ssim(a, a) == pytest.approx(1.0, abs=1e-6)
-    assert -1 <= ssim(1 - a, a) < ssim(noisy(a, 0.1), a) < 1
-    assert ssim(a[:1, :1], a[:1, :1]) == pytest.approx(1.0, abs=1e-6)
-
-
 def test_flip() -> None:
     pytest.importorskip("flip_evaluator")
     a = image()
@@ -153,14 +137,6 @@ def test_flip() -> None:
     assert flip(lower_differs, a, mask).value == 0.0
     # Black against white is the largest error there is.
     assert flip(torch.zeros(8, 8, 3), torch.ones(8, 8, 3)).value == pytest.approx(1.0, abs=0.05)
-
-
-def test_flip_is_the_packages_own_default() -> None:
-    package = pytest.importorskip("flip_evaluator")
-    a = image()
-    b = noisy(image(), 0.1)
-    _, mean, _ = package.evaluate(a.numpy(), b.numpy(), "LDR", applyMagma=False, parameters={})
-    assert flip(b, a).value == pytest.approx(mean, rel=1e-5)
 
 
 def test_missing_packages_give_a_reason(monkeypatch) -> None:
@@ -195,12 +171,3 @@ def test_lpips_scales_and_masks_its_input() -> None:
     white = torch.ones(4, 6, 3)
     assert lpips(black, white).value == 2.0  # [0, 1] becomes [-1, 1]
     assert lpips(black, white, torch.zeros(4, 6)).value == 0.0
-
-
-def test_lpips_of_tiny_images_has_a_reason() -> None:
-    def too_small(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        raise RuntimeError("output size is too small")
-
-    assert "4x6 are too small" in str(
-        Lpips("vgg", None, too_small)(torch.zeros(6, 4, 3), torch.zeros(6, 4, 3)).reason
-    )

@@ -87,7 +87,7 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
 
     That learns at the same rates: its own, for so short a run, would favour it.
     """
-    captured = Captured.of(tmp_path, "wave", "--size", "32", "--views", "32")
+    captured = Captured.of(tmp_path, "spin", "--size", "32", "--views", "32")
     keys = (
         "train.steps=800",
         "init.num_random=1000",
@@ -96,16 +96,15 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
     )
     moving = captured.report("dynamic", *keys, "model.choose=false", "optim.rate_factor=1")
     static = captured.report("static", *keys, "optim.rate_factor=1")
-    assert moving.moving_fraction > 0.9
-    # 22.86 to 23.06 by instruction set; after 600 steps too little is learned to tell
-    assert moving.psnr > 22.5
-    assert moving.psnr > static.psnr  # 22.37 to 22.42
+    assert moving.moving_fraction > 0.7  # 0.81
+    assert moving.psnr > 23.5  # 24.44
+    assert moving.psnr > static.psnr + 0.7  # 22.70
     assert moving.psnr_moving is not None
     assert static.psnr_moving is not None
-    assert moving.psnr_moving > max(17.0, static.psnr_moving + 1)  # 17.34 to 17.80, 15.90 to 15.94
+    assert moving.psnr_moving > max(19.0, static.psnr_moving + 2)  # 19.86, 16.08
     assert moving.track_error_px is not None
     assert moving.track_motion_px is not None
-    assert moving.track_error_px < 0.7 * moving.track_motion_px  # 0.541 to 0.586, 0.972
+    assert moving.track_error_px < 0.93 * moving.track_motion_px  # 2.06, 2.42
 
 
 def test_a_ball_that_rolls_is_followed_as_a_body(

@@ -43,12 +43,6 @@ def test_a_prefix_is_put_before_and_taken_away(
     }
 
 
-def test_a_part_has_the_whole_prefix() -> None:
-    x = torch.zeros(1)
-    y = torch.ones(1)
-    assert part_of({"a.x": x, "ab.x": y, "x": y, "a": y, "b.a.x": y}, "a") == {"x": x}
-
-
 @dataclass(frozen=True)
 class Plain:
     """Has no ``to``."""
@@ -98,19 +92,6 @@ def test_what_is_moved_keeps_its_shape() -> None:
     )
     assert moved_to(Role.SHARED, "meta") is Role.SHARED
     assert moved_to(Plain, "meta") is Plain
-
-
-def test_on_its_own_device_nothing_is_copied() -> None:
-    x = torch.arange(3.0)
-    assert moved_to(x, "cpu") is x
-    assert moved_to(Plain(x), "cpu").x is x
-    assert fields_moved_to(Own(x, x), "cpu") == Own(x, x)
-
-
-def test_fields_are_moved_one_by_one() -> None:
-    """For a ``to`` that is made of it."""
-    x = torch.arange(3.0)
-    assert devices(vars(fields_moved_to(Own(x, x), "meta")).values()) == ["meta", "meta"]
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from dyngs.config import Config, SceneInit
 from dyngs.core.errors import DyngsError, counted, warn
 from dyngs.data.capture import Capture
 from dyngs.gaussians.start import FirstGaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.io.formats.splat_file import with_degree
 from dyngs.runs.opened import open_scene
-from dyngs.static.scene import StaticScene
 
 
 def first_of(config: Config, capture: Capture) -> FirstGaussians | None:

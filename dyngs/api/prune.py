@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import num_cores, train
 from dyngs.compress.prune.search import MOST_HELD_OUT, Promise, Search
 from dyngs.config import Config, PruneConfig
@@ -17,7 +18,6 @@ from dyngs.core.errors import DyngsError, show
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import require_folder
 from dyngs.data.times import evenly_spaced
-from dyngs.export.scene_file import write_scene_file
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory

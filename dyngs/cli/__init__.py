@@ -6,7 +6,7 @@ int``. What is heavy (torch, the native core, readers) is imported inside ``run`
 
 Exit codes: 0 done; 2 bad input or usage, after one line on stderr; 130 interrupted. Anything
 unexpected keeps its traceback, because it is a bug. With ``--debug`` the traceback of any error
-comes before its line.
+comes before its line, with ``--quiet`` results and errors alone are printed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from dyngs import __version__
 from dyngs.cli import (
     bench,
     compare,
-    completion,
     config,
     convert,
     data,
@@ -44,6 +43,7 @@ from dyngs.cli import (
     view,
 )
 from dyngs.cli.arguments import follows_links, require_outputs_apart
+from dyngs.cli.output import print_messages
 from dyngs.core.errors import DyngsError, NoCaptureError, printable, quoted, require_name
 from dyngs.io.containment import following_links_of_runs
 
@@ -74,7 +74,6 @@ _COMMANDS = {
     "bench": bench,
     "config": config,
     "docs": docs,
-    "completion": completion,
     "doctor": doctor,
 }
 """The module of each command, in the order in which they are listed."""
@@ -98,12 +97,14 @@ dyngs {__version__}: Gaussian splatting of what stands, what moves, and people, 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (default: ``sys.argv``) and return the exit code."""
     if "_ARGCOMPLETE" in os.environ:  # a shell asks, at the Tab key
-        parser = make_parser()
-        completion.finder(parser)(parser, always_complete_options=False)
-    arguments, debug = _without_debug(list(sys.argv[1:] if argv is None else argv))
+        from argcomplete import autocomplete
+
+        autocomplete(make_parser(), always_complete_options=False)
+    words, flags = _without_flags(list(sys.argv[1:] if argv is None else argv))
+    print_messages(quiet="--quiet" in flags)
     _show_any_name()
     try:
-        code = _dispatch(arguments)
+        code = _dispatch(words)
         sys.stdout.flush()
         return code
     except (DyngsError, MemoryError, RuntimeError) as error:
@@ -114,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             and _TORCH_OUT_OF_MEMORY not in str(error)
         ):
             raise
-        if debug:
+        if "--debug" in flags:
             traceback.print_exception(error)
         return _fail(str(error) if isinstance(error, DyngsError) else full)
     except KeyboardInterrupt as interrupt:
@@ -127,17 +128,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     except OSError as error:
         _abandon_if_broken(sys.stdout)
-        if debug:
+        if "--debug" in flags:
             traceback.print_exception(error)
         return _fail(_describe_os_error(error))
 
 
-def _without_debug(arguments: list[str]) -> tuple[list[str], bool]:
-    """Return the arguments without ``--debug``, which may stand anywhere before ``--``, and whether
-    it was given."""
+def _without_flags(arguments: list[str]) -> tuple[list[str], set[str]]:
+    """Return the arguments without ``--debug`` and ``--quiet``, which may stand anywhere before
+    ``--``, and those of the two that were given."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
-    kept = [word for word in arguments[:end] if word != "--debug"]
-    return kept + arguments[end:], len(kept) < end
+    flags = {"--debug", "--quiet"} & set(arguments[:end])
+    return [word for word in arguments[:end] if word not in flags] + arguments[end:], flags
 
 
 def _show_any_name() -> None:
@@ -221,6 +222,8 @@ def make_parser(only: str = "") -> argparse.ArgumentParser:
         prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU."
     )
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
+    about = "print results and errors alone, no notes and warnings"
+    parser.add_argument("--quiet", action="store_true", help=about)
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for module in [_COMMANDS[only]] if only in _COMMANDS else _COMMANDS.values():

@@ -1,4 +1,4 @@
-"""Arguments and their types, and notes printed by several commands."""
+"""Arguments and their types that several commands share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from dyngs.core.errors import DyngsError, show, warn
+from dyngs.cli.output import print_notes
+from dyngs.core.errors import DyngsError
 
 if TYPE_CHECKING:
     import torch
@@ -316,18 +317,3 @@ def run_of_scene_file(path: Path) -> Path:
     if checkpoint_paths(path.parent):
         print_notes((f"{path.parent} has checkpoints: the newest one is drawn, not {SCENE_FILE}",))
     return path.parent
-
-
-def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
-    """Print notes to stdout and warnings to stderr."""
-    for note in notes:
-        show(f"note: {note}")
-    for warning in warnings:
-        warn(warning)
-
-
-def print_written(*paths: Path) -> None:
-    """Print where files, or a folder of them, are and how large."""
-    files = [file for path in paths for file in ((path,) if path.is_file() else path.rglob("*"))]
-    where = paths[0] if len(paths) == 1 else f"{len(paths)} files, {paths[0]} to {paths[-1].name}"
-    print(f"written: {where} ({sum(file.stat().st_size for file in files) / 1e6:.1f} MB)")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.cli.tables import numbers_table, print_tables
+from dyngs.cli.output import numbers_table, print_lines, print_notes, print_tables
 from dyngs.core.errors import DyngsError, counted, show
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     plan = planned(bench, arguments.models)
     for entry in plan.entries:
         inputs_of(entry.config).require_output(bench.out)
-    args.print_notes(plan.notes)
+    print_notes(plan.notes)
     with writing(bench.out):
         require_same_comparison(bench, plan)
         was_finished = is_finished(bench, plan)
@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
         files = write_report(bench, results, left_out)
     print_tables(numbers_table(about(bench, results), *table_cells(table_rows(results))))
     for name, problem in left_out.items():
-        show(f"left out: {name}: {problem}")
+        print_lines(f"left out: {name}: {problem}")
     if was_finished:
         print(
             f"{arguments.out or bench.out}: holds just this comparison, finished: nothing was trained"

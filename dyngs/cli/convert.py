@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    input_path,
-    output_path,
-    print_notes,
-    print_written,
-)
+from dyngs.cli.arguments import Commands, add_command, input_path, output_path
+from dyngs.cli.output import print_notes, print_written
 from dyngs.cli.splats import add_axes, print_redrawn
 from dyngs.core.errors import counted
 

@@ -4,21 +4,19 @@ synthetic capture."""
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.cli.progress_bar import ProgressBar
-from dyngs.core.errors import DyngsError, as_word, counted, show
+from dyngs.cli.output import ProgressBar, print_lines, print_notes
+from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
-SYNTHETIC_SCENES = ("still", "polyhedra", "spin", "wave", "room", "roll", "human", "people")
+SYNTHETIC_SCENES = ("still", "spin", "room", "roll", "human", "people")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
-_STILL = "still", "polyhedra"
 _OF_A_FIT = {
     "keypoints": ("PATH", "key points: a folder of OpenPose files, or a COCO file"),
     "masks": ("DIR", "masks of the person (white), named as the images"),
@@ -199,33 +197,30 @@ def _add_synth(verbs: args.Commands) -> None:
         run_synth,
         "write a small synthetic scene as a capture",
         "Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it moves. still: a "
-        "still life. polyhedra: flat faces and letters, with true edges and close-ups. spin: a turning die and a "
-        "rolling ball. wave: a rippling cloth. room: videos of a static room with one hopping ball, from fixed "
-        "cameras. roll: a striped ball rolls alone. human: a walking person from all around, with exact body "
-        "parameters; with --style teleport one image per time, as in D-NeRF, without them. people: many people, a "
-        "capture each, with depth maps and key points, for networks that predict people.",
+        "still life. spin: a turning die and a rolling ball. room: videos of a static room with one hopping ball, "
+        "from fixed cameras. roll: a striped ball rolls alone. human: a walking person from all around, with exact "
+        "body parameters. people: many people, a capture each, with depth maps and key points, for networks that "
+        "predict people.",
     )
     parser.add_argument(
         "scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES)
     )
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    size = "width and height (default 128, for people 256)"
-    parser.add_argument("--size", type=int, metavar="PX", help=size)
-    views = "training views; for fixed cameras, human and people: times (default 48, for human 12, for people 1)"
-    parser.add_argument("--views", type=int, metavar="N", help=views)
+    number = args.whole("a number", 1, 10**6)
+    for name, about in (
+        ("size", "width and height in pixels (default 128, for people 256)"),
+        ("views", "training views; for fixed cameras, human and people: times (48, 12 and 1)"),
+        (
+            "cameras",
+            "training cameras for human and people, fixed ones of scenes that move (8, 24, 8)",
+        ),
+        ("people", "for people: how many (default 100)"),
+    ):
+        parser.add_argument(f"--{name}", type=number, metavar="N", help=about)
     style = "of scenes that move: another camera at each time (default), one on a smooth arc, or fixed ones (room)"
     parser.add_argument("--style", choices=("teleport", "moving", "fixed"), help=style)
-    cameras = "training cameras for human and people, or fixed ones of any scene that moves (default 8; for people 24)"
-    parser.add_argument("--cameras", type=int, metavar="N", help=cameras)
-    parser.add_argument(
-        "--people", type=int, metavar="N", help="for people: how many (default 100)"
-    )
     seed = "random seed of cameras, for human of the clothes, for people of everything (default 0)"
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help=seed)
-    varied = "for human: the seed is also that of body shape, light and clip"
-    parser.add_argument("--varied", action="store_true", help=varied)
-    usual = "for human: left mostly as right, back as front, bare hands, instead of clothes that differ everywhere"
-    parser.add_argument("--usual-clothes", action="store_true", help=usual)
+    parser.add_argument("--seed", type=args.whole("a seed", 0, 10**9), metavar="N", help=seed)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
@@ -243,9 +238,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
-            show(f"also: {problem}")
+            print_lines(f"also: {problem}")
         raise DyngsError(report.problems[0])
-    show(format_report(report))
+    print_lines(format_report(report))
     if arguments.image is not None:
         from dyngs.capture.inspection.report import draw_cameras
 
@@ -263,7 +258,7 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
             f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first"
         )
     with images_up_to(args.data_section(arguments.overrides).max_megapixels):
-        show(video_report(arguments.path))
+        print_lines(video_report(arguments.path))
     return 0
 
 
@@ -298,7 +293,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
             said = poses_of_videos(images, out, options, report)
         else:
             said = estimate_poses(images, out, options, report).summary()
-    show(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
+    print_lines(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
     print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
     return 0
 
@@ -347,7 +342,9 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
+    print_lines(
+        f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}"
+    )
     return 0
 
 
@@ -362,7 +359,7 @@ def run_people(arguments: argparse.Namespace) -> int:
         result = write_found_person(
             options, arguments.out, detector, report, number=arguments.person
         )
-    show(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    print_lines(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
 
@@ -396,7 +393,7 @@ def run_motion(arguments: argparse.Namespace) -> int:
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
     write_amass(motion, out)
     print(f"written: {out}\n         {_summary(motion)}")
-    args.print_notes(motion.notes)
+    print_notes(motion.notes)
     return 0
 
 
@@ -413,89 +410,50 @@ def _summary(motion: Motion) -> str:
 def run_synth(arguments: argparse.Namespace) -> int:
     """Write the capture and print the command that trains on it."""
     from dyngs.data.synthetic import captures as synthetic
+    from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+    from dyngs.human.synthetic.people import PeopleOptions, write_people
     from dyngs.io.outputs import require_new_folder
 
-    if arguments.scene == "people":
-        return _synth_people(arguments)
-    if arguments.people is not None:
-        raise DyngsError("--people is for the scene people only; leave it out")
-    out = arguments.out
     scene = arguments.scene
-    size = arguments.size or 128
-    seed = arguments.seed
-    by_poses = scene == "human" and arguments.style is None
-    views = (12 if by_poses else 48) if arguments.views is None else arguments.views
-    cameras = 8 if arguments.cameras is None else arguments.cameras
-    if (arguments.size is not None and arguments.size < 1) or views < 1 or seed < 0:
-        raise DyngsError("--size and --views must be at least 1, --seed at least 0")
-    style = arguments.style or ("fixed" if arguments.cameras is not None else None)
-    if arguments.cameras is not None and (cameras < 1 or scene in _STILL or style != "fixed"):
-        raise DyngsError(
-            "--cameras must be at least 1, and is for scenes that move, with fixed cameras"
-        )
-    if arguments.style is not None and (
-        scene in _STILL or (scene == "human" and style != "teleport")
+    out = arguments.out
+    is_moving = scene in ("spin", "room", "roll")
+    if arguments.people is not None and scene != "people":
+        raise DyngsError("--people is for the scene people only; leave it out")
+    if arguments.style is not None and not is_moving:
+        raise DyngsError("--style is for scenes that move: spin, room and roll")
+    if arguments.cameras is not None and (
+        scene == "still" or arguments.style not in (None, "fixed")
     ):
-        raise DyngsError("--style is for scenes that move; for human only teleport")
-    if (arguments.varied and not by_poses) or (arguments.usual_clothes and scene != "human"):
-        raise DyngsError(
-            "--varied and --usual-clothes are for the scene human only, --varied without --style"
-        )
+        raise DyngsError("--cameras is for people, and for fixed cameras of scenes that move")
+    given = {
+        name: getattr(arguments, name)
+        for name in ("size", "cameras", "seed")
+        if getattr(arguments, name) is not None
+    }
+    views = arguments.views
+    if scene == "people":
+        given |= {} if views is None else {"frames": views}
+        given |= {} if arguments.people is None else {"people": arguments.people}
+        with ProgressBar() as report:
+            write_people(out, PeopleOptions(**given), report)
+        return _print_synth(out, "gps")
     require_new_folder(out)
+    cameras = given.pop("cameras", None)
+    if scene == "still":
+        given |= {} if views is None else {"num_train": views}
+        synthetic.write_still_capture(out, synthetic.StillOptions(**given))
+        return _print_synth(out, "static")
+    given |= {} if cameras is None else {"num_cameras": cameras}
     if scene == "human":
-        from dyngs.human.synthetic.capture import (
-            HumanOptions,
-            varied,
-            write_human_capture,
-            write_walking_capture,
-        )
-
-        options = HumanOptions(
-            size, views, num_cameras=cameras, seed=seed, usual_clothes=arguments.usual_clothes
-        )
-        if by_poses:
-            write_human_capture(out, varied(options, seed) if arguments.varied else options)
-        else:
-            write_walking_capture(out, replace(options, num_test=min(12, views - 1)))
-    elif scene == "still":
-        synthetic.write_still_capture(
-            out, synthetic.StillOptions(size=size, num_train=views, seed=seed)
-        )
-    elif scene == "polyhedra":
-        synthetic.write_polyhedra_capture(
-            out, synthetic.StillOptions(size=size, num_train=views, seed=seed)
-        )
-    else:
-        moving = synthetic.DynamicOptions(
-            size=size, num_times=views, num_cameras=cameras, seed=seed, style=style
-        )
-        synthetic.write_dynamic_capture(scene, out, moving)
-    preset = (
-        "human"
-        if by_poses
-        else {"still": "static", "polyhedra": "bg_triangle"}.get(scene, "dynamic")
-    )
-    print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")
-    return 0
+        given |= {} if views is None else {"num_frames": views}
+        write_human_capture(out, HumanOptions(**given))
+        return _print_synth(out, "human")
+    given |= {} if views is None else {"num_times": views}
+    style = arguments.style or ("fixed" if cameras is not None else None)
+    synthetic.write_dynamic_capture(scene, out, synthetic.DynamicOptions(**given, style=style))
+    return _print_synth(out, "dynamic")
 
 
-def _synth_people(arguments: argparse.Namespace) -> int:
-    """Write many people and print the commands that train on them."""
-    from dyngs.human.synthetic.people import PeopleOptions, write_people
-
-    if arguments.style is not None or arguments.varied or arguments.usual_clothes:
-        raise DyngsError(
-            "--style, --varied and --usual-clothes are not for people, who all differ; leave them out"
-        )
-    given = {name: getattr(arguments, name) for name in ("people", "size", "cameras", "seed")}
-    given["frames"] = arguments.views
-    options = replace(
-        PeopleOptions(), **{name: value for name, value in given.items() if value is not None}
-    )
-    with ProgressBar() as report:
-        write_people(arguments.out, options, report)
-    word = as_word(arguments.out)
-    print(
-        f"written: {arguments.out}, {counted(options.people, 'capture')}\nnext:    dyngs train gps data.root={word}"
-    )
+def _print_synth(out: Path, preset: str) -> int:
+    print(f"written: {out}\nnext:    dyngs train {preset} data.root={as_word(out)}")
     return 0

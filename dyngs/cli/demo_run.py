@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.splat_files import write_run_splats
 from dyngs.io.lock import LOCK_NAME, InUseError, writing
@@ -69,14 +69,14 @@ def run_demo(
         capture, run_dir, images, video = (
             folder / name for name in ("capture", "run", "images", "orbit.mp4")
         )
-        print(f"[1/4] ray tracing the images of the demo scene into {capture}", flush=True)
+        show(f"[1/4] ray tracing the images of the demo scene into {capture}")
         moving = DynamicOptions(size=options.size, num_times=options.num_times, samples=3)
         write_dynamic_capture("spin", capture, moving)
         print(f"[2/4] training {counted(options.steps, 'step')} into {run_dir}", flush=True)
         train(demo_config(capture, run_dir, options), listeners=listeners)
         print("[3/4] evaluating on held-out views", flush=True)
         report = evaluate_run(run_dir, threads=options.threads)
-        print("[4/4] rendering the test views and an orbit around the moving scene", flush=True)
+        show("[4/4] rendering the test views and an orbit around the moving scene")
         opened = open_run(run_dir)
         write_split_images(opened, "test", images)
         path = choose_path(opened, PathOptions("orbit", options.num_frames))

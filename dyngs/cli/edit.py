@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
+from dyngs.cli.output import print_written
 from dyngs.core.errors import DyngsError, as_word, show
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"written: {written.path}")
     else:
         print_redrawn(written.notes, [written.redrawn])
-        args.print_written(written.path)
+        print_written(written.path)
     if written.redrawn is None or written.path.suffix.lower() == ".ply":
         print(f"next:    dyngs view {as_word(written.path)}")
     return 0

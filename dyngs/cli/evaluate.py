@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
+from dyngs.cli.output import print_notes
 from dyngs.core.errors import counted, escaped
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         data_root=args.data_root(arguments),
     )
     Console().print(report_table(report))
-    args.print_notes(report.notes, report.warnings)
+    print_notes(report.notes, report.warnings)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
+from dyngs.cli.output import print_notes, print_written
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_redrawn
 from dyngs.core.errors import DyngsError, as_word, counted
 
@@ -188,14 +189,14 @@ def run(arguments: argparse.Namespace) -> int:
     opened = _moved(arguments, open_scene(arguments.run_dir, data_root=args.data_root(arguments)))
     times = opened.scene.times if arguments.motion is not None and times is None else times
     if opened.scene.is_static and times is not None:
-        args.print_notes(("nothing moves in this run: it is the same at all times",))
+        print_notes(("nothing moves in this run: it is the same at all times",))
     if kind == "tracks":
         files = _export_tracks(arguments, opened, times)
     elif kind == MOVING:
         files = _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
     else:
         files = _export_splats(arguments, opened, times, kind)
-    args.print_written(*files)
+    print_written(*files)
     return 0
 
 
@@ -263,21 +264,21 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
 def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
     if getattr(opened.scene, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
-        args.print_notes((line,))
+        print_notes((line,))
     return args.in_motion(arguments, opened)
 
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
     from dyngs.evaluate.temporal import clamped_times
-    from dyngs.export.camera_paths.path import parse_times
+    from dyngs.export.camera_paths import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
     inside, warnings = clamped_times(
         (arguments.time,) if arguments.times is None else parse_times(arguments.times)
     )
-    args.print_notes((), warnings)
+    print_notes((), warnings)
     return inside
 
 
@@ -305,7 +306,7 @@ def _export_splats(
     suffix = own.suffixes[0]
     scene = scene_part(opened.scene, part)
     if opened.scene.colour is not None:
-        args.print_notes(
+        print_notes(
             (
                 "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",
             )
@@ -320,7 +321,7 @@ def _export_splats(
         raise DyngsError(
             f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file"
         )
-    args.print_notes((line,))
+    print_notes((line,))
     if arguments.folder:
         if is_file or is_sequence:
             raise DyngsError(
@@ -329,7 +330,7 @@ def _export_splats(
         path = out or arguments.run_dir / "sog"
         counts, notes = write_run_levels(opened, path, (times or (0.0,))[0], part, how)
         levels = f"levels of {', '.join(f'{count:,}' for count in counts)} Gaussians"
-        args.print_notes((*notes, f"{levels}; viewers open its lod-meta.json"))
+        print_notes((*notes, f"{levels}; viewers open its lod-meta.json"))
         return [path]
     if is_sequence and not arguments.static:
         moments = times or ()
@@ -340,7 +341,7 @@ def _export_splats(
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
-            args.print_notes(
+            print_notes(
                 (
                     "this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",
                 )
@@ -380,7 +381,7 @@ def _export_moving(
             f"--sh-degree does not go with --format {MOVING}, which holds no harmonics"
         )
     how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
-    args.print_notes((line,))
+    print_notes((line,))
     part = _part(arguments)
     scene = scene_part(opened.scene, _part(arguments))
     out = arguments.out or arguments.run_dir
@@ -408,14 +409,14 @@ def _export_tracks(
     tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.world, part=part)
     count, moments, _ = tracks.positions.shape
     moving = f"{int(tracks.moving.sum()):,} of them moving"
-    args.print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
+    print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
     return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]
 
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
     """Write the run as a .dyngs file and print how much its images change."""
+    from dyngs.api.scene_file import write_scene_file
     from dyngs.compress.storage.measure import SMALLEST_CHANGE
-    from dyngs.export.scene_file import write_scene_file
 
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
@@ -436,9 +437,9 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
             "the capture cannot be read: quantisation steps are fixed, and the change of images is not measured; if it "
             "was moved, add data.root=FOLDER"
         )
-        args.print_notes((), (warning,))
+        print_notes((), (warning,))
     else:
-        args.print_notes(
+        print_notes(
             (f"images change by {change:.2f} grey levels of 255 (rms over some training views)",)
         )
     ratio = written.num_bytes_exact / written.num_bytes
@@ -453,7 +454,7 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
     from dyngs.runs.opened import open_run
 
     path = arguments.out or arguments.run_dir / "avatar.safetensors"
-    args.print_written(write_avatar(open_run(arguments.run_dir).in_own_frame(), path))
+    print_written(write_avatar(open_run(arguments.run_dir).in_own_frame(), path))
     return 0
 
 
@@ -464,7 +465,7 @@ def _export_network(arguments: argparse.Namespace) -> int:
 
     run: Path = arguments.run_dir
     out = arguments.out or run / f"network{SUFFIX}"
-    args.print_written(write_network(run, network_config(run), latest_checkpoint(run), out))
+    print_written(write_network(run, network_config(run), latest_checkpoint(run), out))
     return 0
 
 
@@ -486,10 +487,10 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
     time = (_times(arguments) or (0.0,))[0]
     how, line = writing_of(opened, format_named("glb").up, arguments.up, arguments.from_up)
     written = write_bodies(opened, out, time, how)
-    args.print_notes((line,))
+    print_notes((line,))
     found = compare_run(opened, opened.scene, time, written.splat, read_splats(written.path))
     print_redrawn(written.notes, [found])
-    args.print_written(written.path)
+    print_written(written.path)
     return 0
 
 
@@ -523,8 +524,8 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         else None
     )
     written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
-    args.print_notes(written.notes)
-    args.print_written(written.path)
+    print_notes(written.notes)
+    print_written(written.path)
     return 0
 
 
@@ -557,15 +558,15 @@ def _export_surface(arguments: argparse.Namespace) -> int:
     how, line = upright_surface(
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )
-    args.print_notes((line,))
+    print_notes((line,))
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, cut=cut, how=how)
         holes = num_holes(surface)
         closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
         faces = counted(len(surface.faces), "triangle")
-        args.print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
-        args.print_written(path)
+        print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
+        print_written(path)
     return 0
 
 
@@ -600,7 +601,7 @@ def _export_page(arguments: argparse.Namespace) -> int:
         else write_page(opened, out, time=time)
     )
     served = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
-    args.print_notes(written.notes)
+    print_notes(written.notes)
     where = served if folder else "it plays in any browser with WebGL 2, offline"
     print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); {where}")
     return 0
@@ -633,14 +634,14 @@ def _export_cameras(arguments: argparse.Namespace) -> int:
         name: views for name, views in capture.splits.items() if name != "pose"
     }
     if found is None:
-        args.print_notes(
+        print_notes(
             ("camera.refine was not used in this run: these are the cameras of the capture",)
         )
     else:
         splits = {
             name: [found.corrected_view(view) for view in views] for name, views in splits.items()
         }
-        args.print_notes(
+        print_notes(
             (
                 "training cameras as training found them; others have the capture's poses, and known lenses",
             )

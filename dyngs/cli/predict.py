@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
-from dyngs.cli.progress_bar import ProgressBar
-from dyngs.core.errors import as_word, counted, show
+from dyngs.cli.output import ProgressBar, print_lines
+from dyngs.core.errors import as_word, counted
 
 _EPILOG = """\
 examples:
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     word = as_word(out)
     # fields are not trained
     refine = f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""
-    show(
+    print_lines(
         f"predicted: {what} from {', '.join(made.views)}\n"
         f"time:      {made.seconds:.2f} s{trained}\n"
         f"written:   {out}\nnext:      dyngs eval {word}{refine}"

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.cli.progress_bar import ProgressBar
+from dyngs.cli.output import ProgressBar, print_notes
 from dyngs.core.errors import DyngsError, counted
 from dyngs.io.wrong_place import command_for
 
 if TYPE_CHECKING:
-    from dyngs.export.chosen_path import PathOptions
+    from dyngs.export.choose_path import PathOptions
     from dyngs.runs.opened import Opened
 
 _EPILOG = """\
@@ -143,7 +143,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     with heavy_imports():
         import torch
 
-        from dyngs.export.chosen_path import choose_path
+        from dyngs.export.choose_path import choose_path
         from dyngs.export.images import OutputOptions, write_path_images, write_split_images
         from dyngs.runs.opened import open_run
 
@@ -162,7 +162,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
             )
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
-    args.print_notes((*opened.notes, *path.notes), path.warnings)
+    print_notes((*opened.notes, *path.notes), path.warnings)
     if not arguments.fps:
         output = replace(output, fps=path.fps)
     with ProgressBar() as report:
@@ -193,15 +193,15 @@ def _before(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:
     """Return the scene with levels of detail, if they are asked for."""
-    from dyngs.static.levels import LevelScene
+    from dyngs.gaussians.levels import LevelScene
 
     most: int | None = arguments.max_gaussians_drawn
     return opened if most is None else opened.showing(LevelScene.of(opened.renderable, most))
 
 
 def _path_options(arguments: argparse.Namespace) -> PathOptions:
-    from dyngs.export.camera_paths.path import parse_times
-    from dyngs.export.chosen_path import PathOptions
+    from dyngs.export.camera_paths import parse_times
+    from dyngs.export.choose_path import PathOptions
 
     times = None if arguments.time is None else (arguments.time,)
     num_frames = arguments.frames

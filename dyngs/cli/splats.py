@@ -7,7 +7,8 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import AXES, print_notes
+from dyngs.cli.arguments import AXES
+from dyngs.cli.output import print_notes
 
 if TYPE_CHECKING:
     from dyngs.export.redrawn import Redrawn

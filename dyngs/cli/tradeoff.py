@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.cli.tables import numbers_table, print_tables
+from dyngs.cli.output import numbers_table, print_tables
 from dyngs.core.errors import DyngsError, counted, show
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.cli.progress_bar import ProgressBar
+from dyngs.cli.output import ProgressBar, print_lines
 from dyngs.cli.view import add_serving_arguments
-from dyngs.core.errors import DyngsError, as_word, counted, show
+from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -115,7 +115,7 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.server import Serving
     from dyngs.view.training import TrainingView
 
-    return TrainingView(config, Serving(arguments.host, arguments.port), show)
+    return TrainingView(config, Serving(arguments.host, arguments.port), print_lines)
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:

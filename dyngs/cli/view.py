@@ -7,7 +7,8 @@ import threading
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.core.errors import DyngsError, show
+from dyngs.cli.output import print_lines, print_notes
+from dyngs.core.errors import DyngsError
 
 _EPILOG = """\
 examples:
@@ -78,10 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise DyngsError(
             f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out"
         )
-    args.print_notes(first.notes)
+    print_notes(first.notes)
     serving = Serving(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
-        show(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it")
+        print_lines(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it")
         wait_for_interrupt()
     print("\nended")
     return 0

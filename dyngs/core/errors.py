@@ -1,8 +1,9 @@
-"""The one exception type that users see as a single line, and the boundary at which a reader's
-faults become it."""
+"""The exception type that users see as a single line, the boundary at which a reader's faults
+become it, and messages to users."""
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import shlex
@@ -11,6 +12,8 @@ import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 
+LOGGER = logging.getLogger("dyngs")
+"""Messages of the library; the command line prints them."""
 _MAX_REASON = 160
 
 
@@ -138,13 +141,13 @@ def printable(text: str, length: int | None = None) -> str:
 
 
 def show(text: str) -> None:
-    """Print lines that may quote names of others, without anything that a terminal would obey."""
-    print("\n".join(map(escaped, text.split("\n"))), flush=True)
+    """Log lines as information, without anything that a terminal would obey."""
+    LOGGER.info("\n".join(map(escaped, text.split("\n"))))
 
 
 def warn(text: str) -> None:
-    """Print a warning of one line to stderr."""
-    print(f"dyngs: warning: {printable(text)}", file=sys.stderr, flush=True)
+    """Log a warning of one line."""
+    LOGGER.warning(printable(text))
 
 
 def escaped(line: str) -> str:

@@ -8,13 +8,6 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.data.geometry import focus_point, fraction_in_front
 
-_LEVEL = 0.2
-"""Largest root-mean-square cosine between right axes and up of cameras that are held level: 11.5
-degrees."""
-_DETERMINED = 0.005
-"""Smallest second eigenvalue of the mean of right axes' outer products at which they determine a
-plane: a turn by about 15 degrees in all. It must be four times the smallest eigenvalue, too."""
-
 
 def look_at_point(cameras: Cameras) -> np.ndarray:
     """Return the point (3,) float64 nearest to all optical axes in the least-squares sense, in
@@ -26,16 +19,15 @@ def look_at_point(cameras: Cameras) -> np.ndarray:
     poses = world_from_cam(cameras)
     centers = poses[:, :3, 3]
     axes = poses[:, :3, 2]
-    middle = centers.mean(axis=0)
-    spread = float(np.linalg.norm(centers - middle, axis=1).mean())
     point = focus_point(poses)
     if point is not None and fraction_in_front(poses, point) > 0.5:
         return point
+    middle = centers.mean(axis=0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).mean())
+    if spread <= 1e-6 * float(np.abs(centers).max()):  # rounding of float32 poses
+        spread = 1.0
     mean_axis = axes.mean(axis=0)
-    forward = unit(mean_axis) if np.linalg.norm(mean_axis) > 1e-6 else axes[0]
-    # more than poses in float32 are rounded by
-    apart = spread > 1e-6 * float(np.abs(centers).max())
-    return middle + 3.0 * (spread if apart else 1.0) * forward
+    return middle + 3.0 * spread * unit(mean_axis if np.linalg.norm(mean_axis) > 1e-6 else axes[0])
 
 
 def up_direction(cameras: Cameras) -> np.ndarray:
@@ -46,42 +38,28 @@ def up_direction(cameras: Cameras) -> np.ndarray:
     it is the mean of their own up directions.
     """
     poses = world_from_cam(cameras)
-    mean = _mean_up(poses)
+    ups = -poses[:, :3, 1]
+    mean = ups.mean(axis=0)
+    mean = unit(mean) if np.linalg.norm(mean) > 1e-3 else ups[0]
     rights = poses[:, :3, 0]
     values, vectors = np.linalg.eigh(rights.T @ rights / len(rights))
     normal = vectors[:, 0] * (1.0 if vectors[:, 0] @ mean >= 0 else -1.0)
-    determined = values[1] > max(_DETERMINED, 4 * values[0]) and values[0] < _LEVEL**2
-    return normal if determined and normal @ mean > 0.3 else mean
-
-
-def _mean_up(poses: np.ndarray) -> np.ndarray:
-    """Return the mean up direction (minus y) of poses (V, 4, 4); that of the first one if they
-    cancel."""
-    ups = -poses[:, :3, 1]
-    total = ups.mean(axis=0)
-    return unit(total) if np.linalg.norm(total) > 1e-3 else ups[0]
+    # The right axes turn by about 15 degrees in all, and lie within 11.5 degrees of the plane.
+    is_determined = values[1] > max(0.005, 4 * values[0]) and values[0] < 0.2**2
+    return normal if is_determined and normal @ mean > 0.3 else mean
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return the OpenCV camera-to-world pose (4, 4) at ``eye``, z towards ``target``, y away from
     ``up``."""
     forward = target - eye
-    forward = (
-        unit(forward)
-        if np.linalg.norm(forward) > 1e-12 * np.linalg.norm(eye)
-        else perpendicular(up)
-    )
+    has_length = np.linalg.norm(forward) > 1e-12 * np.linalg.norm(eye)
+    forward = unit(forward) if has_length else perpendicular(up)
     right = np.cross(forward, up)
-    right = (
-        unit(right) if np.linalg.norm(right) > 1e-6 * np.linalg.norm(up) else perpendicular(forward)
-    )
+    has_length = np.linalg.norm(right) > 1e-6 * np.linalg.norm(up)
+    right = unit(right) if has_length else perpendicular(forward)
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = (
-        right,
-        np.cross(forward, right),
-        forward,
-        eye,
-    )
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
     return pose
 
 
@@ -107,5 +85,4 @@ def unit(a: np.ndarray) -> np.ndarray:
 
 def perpendicular(a: np.ndarray) -> np.ndarray:
     """Return a unit vector perpendicular to ``a`` (3,)."""
-    other = np.eye(3)[np.abs(a).argmin()]
-    return unit(np.cross(a, other))
+    return unit(np.cross(a, np.eye(3)[np.abs(a).argmin()]))

@@ -26,11 +26,11 @@ from dyngs.gaussians.rendering import Shader
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.gaussians.static_training import start as start_static
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
-from dyngs.static.training import start as start_static
 
 MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most

@@ -4,7 +4,6 @@ time."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,10 @@ from dyngs.core.errors import DyngsError
 from dyngs.deform.bodies.field import BodyField, bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, splats_at
+from dyngs.io.formats.formats import Written
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.formats.splat_file import (
-    SplatFile,
     header_comments,
     offset_notes,
     require_writable,
@@ -32,21 +31,10 @@ from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 
 SUFFIX = ".glb"
-_MOST_DEGREE = 3  # of harmonics in the file
-_STEPS_PER_TIME = 2  # poses in the file per training time: rotations are interpolated between them
-
-
-@dataclass(frozen=True)
-class BodiesFile:
-    """A file that was written."""
-
-    path: Path
-    splat: SplatFile  # what it holds at the requested time
-    notes: tuple[str, ...]  # a line about each thing that the format could not hold
 
 
 @torch.no_grad()
-def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY_ARE) -> BodiesFile:
+def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY_ARE) -> Written:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 
@@ -60,17 +48,17 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
         raise DyngsError(
             "--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N"
         )
-    scene = replace(scene, masks=None)  # the rows of the labels
+    scene = scene.unmasked()  # the rows of the labels
     splat = splats_at(opened, scene, time, how)
     require_writable(path, splat.gaussians)
     gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
-    gaussians = with_degree(gaussians, min(gaussians.sh_degree, _MOST_DEGREE))
-    labels = torch.full((len(scene),), -1, device=scene.moving.device).index_copy(
-        0, scene.moving, field.rest.labels
-    )
-    moments = np.linspace(0.0, 1.0, _STEPS_PER_TIME * max(len(scene.times) - 1, 1) + 1)
-    here = _poses(field, [time], splat.frame)
-    there = _poses(field, moments, splat.frame)
+    gaussians = with_degree(gaussians, min(gaussians.sh_degree, 3))
+    labels = torch.full((len(scene),), -1, device=scene.moving.device)
+    labels[scene.moving] = field.rest.labels
+    # Twice as many poses as training times: rotations are interpolated between them.
+    moments = np.linspace(0.0, 1.0, 2 * max(len(scene.times) - 1, 1) + 1)
+    here_places, here_turns = _poses(field, [time], splat.frame)
+    there_places, there_turns = _poses(field, moments, splat.frame)
     document = GlbDocument()
     nodes = []
     meshes = []
@@ -79,18 +67,17 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
         own = gaussians.picked(torch.nonzero(labels == body)[:, 0])
         if not len(own):
             continue
-        node: dict[str, object] = {
-            "name": "rest" if body < 0 else f"body {body}",
-            "mesh": len(meshes),
-        }
+        name = "rest" if body < 0 else f"body {body}"
+        node: dict[str, object] = {"name": name, "mesh": len(meshes)}
         if body >= 0:
-            place = here.places[0, body]
+            place = here_places[0, body]
             own = own.replace(means=(own.means.double() - torch.from_numpy(place)).float())
             node["translation"] = place.tolist()
-            turns = there.turns(body) * here.turns(body)[0].inv()
-            channels.append((len(nodes), "translation", there.places[:, body]))
+            turn_back = Rotation.from_quat(here_turns[0, body]).inv()
+            turns = Rotation.from_quat(there_turns[:, body]) * turn_back
+            channels.append((len(nodes), "translation", there_places[:, body]))
             channels.append((len(nodes), "rotation", shorter_ways(turns.as_quat())))
-        meshes.append({"name": node["name"], "primitives": [add_gaussians(document, own)]})
+        meshes.append({"name": name, "primitives": [add_gaussians(document, own)]})
         nodes.append(node)
     document.add_animation("motion", moments * opened.seconds, channels)
     document.json["asset"]["extras"] = header_comments(splat)
@@ -103,28 +90,21 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     }
     with atomic_file(path) as temporary:
         document.write(temporary)
-    notes = [
-        f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}"
-    ]
-    notes.append(f"all else and shadows stand as at time {time:g}; a sequence has their motion")
-    return BodiesFile(path, splat, (*notes, *offset_notes(splat, "the file states it")))
+    notes = (
+        f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}",
+        f"all else and shadows stand as at time {time:g}; a sequence has their motion",
+        *offset_notes(splat, "the file states it"),
+    )
+    return Written(path, splat, notes)
 
 
-@dataclass(frozen=True)
-class _Poses:
-    """Poses of B bodies at T times, in the axes of the file."""
-
-    places: np.ndarray  # (T, B, 3) of their centres
-    quats: np.ndarray  # (T, B, 4) xyzw
-
-    def turns(self, body: int) -> Rotation:
-        return Rotation.from_quat(self.quats[:, body])
-
-
-def _poses(field: BodyField, times: Sequence[float] | np.ndarray, frame: Similarity) -> _Poses:
+def _poses(
+    field: BodyField, times: Sequence[float] | np.ndarray, frame: Similarity
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return centres (T, B, 3) of B bodies at T times, in the axes of the file, and their rotations
+    (T, B, 4) xyzw."""
     axes = Rotation.from_quat(np.asarray(frame.turn)[[1, 2, 3, 0]])
-    found = [field.poses(float(time)) for time in times]
-    places = torch.stack([place for place, _ in found]).double().numpy()
-    quats = unit_quats(torch.stack([quat for _, quat in found])).double().numpy()[..., [1, 2, 3, 0]]
-    turned = (axes * Rotation.from_quat(quats.reshape(-1, 4))).as_quat()
-    return _Poses(frame.points(places), turned.reshape(quats.shape))
+    places, quats = zip(*(field.poses(float(time)) for time in times), strict=True)
+    unit = unit_quats(torch.stack(quats)).double().numpy()[..., [1, 2, 3, 0]]
+    turned = (axes * Rotation.from_quat(unit.reshape(-1, 4))).as_quat()
+    return frame.points(torch.stack(places).double().numpy()), turned.reshape(unit.shape)

@@ -16,11 +16,10 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
+from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.loader import ImageLoader
-from dyngs.export.camera_paths.path import CameraPath
-from dyngs.export.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.export.camera_paths import CameraPath, pick_cameras
 from dyngs.export.video import VideoWriter
-from dyngs.io.outputs import Inputs
 from dyngs.io.write import to_uint8, write_image
 from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.ops.device import CPU
@@ -30,7 +29,12 @@ from dyngs.runs.opened import Opened, split_views
 # Windows opens no file of these names
 _DEVICE = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9¹²³]", re.IGNORECASE)
 _SHEET_ROWS = 12
-_DEPTH_SAMPLES = 8
+_DEPTH_SAMPLES = 8  # frames of a path from which the range of its depth colours is taken
+# Of contact sheets, px
+_GAP = 6
+_LABEL_HEIGHT = 22
+_PANEL_WIDTH = 480
+_BACKGROUND = 32  # grey level
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ def path_frames(
         if moment is None or time != moment_time:
             with torch.no_grad():
                 moment = scene.time_step(time)
-                moment_time = time
+            moment_time = time
         yield render_frame(scene, path.cameras.select(i), moment, options)
 
 
@@ -110,20 +114,26 @@ def write_path_images(
         raise DyngsError("the camera path has no cameras")
     if out_dir is None and output.video is None:
         raise DyngsError("nothing to write: give a folder for the images or a video file")
-    options = _with_depth(opened.renderable, output)
+    scene = opened.renderable
+    options = _with_depth(scene, output)
     limits = None
     if output.depth and out_dir is not None:
-        seen = [
-            (x.depth, x.alpha)
-            for x in path_frames(opened.renderable, _sample(path), options)
-            if x.depth is not None
-        ]
-        limits = depth_limits(
-            *(np.concatenate([x.ravel() for x in part]) for part in zip(*seen, strict=True))
+        count = min(len(path), _DEPTH_SAMPLES)
+        rows = np.linspace(0, len(path) - 1, count, dtype=np.float32).round().astype(int)
+        sample = CameraPath(
+            pick_cameras(path.cameras, rows),
+            times=path.times and tuple(path.times[i] for i in rows),
         )
+        depths = []
+        alphas = []
+        for frame in path_frames(scene, sample, options):
+            if frame.depth is not None:
+                depths.append(frame.depth)
+                alphas.append(frame.alpha)
+        limits = _depth_limits(np.stack(depths), np.stack(alphas))
     digits = max(4, len(str(len(path) - 1)))
-    with _FrameWriter(out_dir, output, inputs_of(opened), opened.frame.scale, limits) as writer:
-        for i, frame in enumerate(path_frames(opened.renderable, path, options)):
+    with _FrameWriter(opened, out_dir, output, limits) as writer:
+        for i, frame in enumerate(path_frames(scene, path, options)):
             writer.write(f"frame_{i:0{digits}d}", frame)
             report("frames", i + 1, len(path))
     return writer.written
@@ -144,31 +154,31 @@ def write_split_images(
     background is that of ``opened``, behind truth and render. Raises DyngsError: no such split,
     unreadable images, or a video of several sizes.
     """
-    inputs = inputs_of(opened)
-    inputs.require_output(out_dir)
     views = split_views(opened.capture, split)
     loader = ImageLoader(views, opened.config.data)
-    background = opened.background
     scene = opened.of_split(split).renderable.to(device)
     options = _with_depth(scene, output)
-    shown = set(
-        np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist()
-    )
-    rows: list[SheetRow] = []
-    with _FrameWriter(out_dir, output, inputs, opened.frame.scale) as writer:
+    shown = np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int)
+    rows: list[tuple[str, np.ndarray, np.ndarray]] = []
+    with _FrameWriter(opened, out_dir, output) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             image = loader[i]
             frame = render_frame(scene, image.cameras, image.time, options)
             writer.write(stem, frame)
             report("views", i + 1, len(views))
             if i in shown:
-                both = image.composite(background), torch.from_numpy(frame.rgb)
-                label = f"{psnr(both[1], both[0], image.mask):.2f} dB  {image.name}"
+                truth = image.composite(opened.background)
+                rendered = torch.from_numpy(frame.rgb)
+                label = f"{psnr(rendered, truth, image.mask):.2f} dB  {image.name}"
                 # masked pixels show no error
                 counts = 1.0 if image.mask is None else image.mask[..., None]
-                rows.append(SheetRow(label, *(to_uint8((x * counts).cpu().numpy()) for x in both)))
+                rows.append((label, (truth * counts).numpy(), (rendered * counts).numpy()))
     writer.write_image(out_dir / "sheet.png", contact_sheet(rows))
     return writer.written
+
+
+def _with_depth(scene: Renderable, output: OutputOptions) -> DrawOptions:
+    return replace(scene.options, depth="expected" if output.depth else "none")
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
@@ -178,24 +188,29 @@ def file_stems(names: Sequence[str]) -> list[str]:
     ``left_0001``). Parts such as ``..`` and special characters are replaced, so that no name leaves
     the output folder.
     """
-    parts = [
-        [_safe(part) for part in name.replace("\\", "/").split("/") if part.strip(". ")]
-        for name in names
-    ]
-    parts = [p or ["view"] for p in parts]
+    parts = []
+    for name in names:
+        pieces = [part for part in re.split(r"[/\\]", name) if part.strip(". ")]
+        parts.append([_safe(piece) for piece in pieces] or ["view"])
     while all(len(p) > 1 for p in parts) and len({p[0] for p in parts}) == 1:
         parts = [p[1:] for p in parts]
-    taken: set[str] = {"sheet"}
+    taken = {"sheet"}
     stems = []
-    for p in parts:
-        stem = base = "_".join(p)
+    for part in parts:
+        stem = base = "_".join(part)
         number = 1
-        while taken & _files(stem):
+        # in lower case because some file systems ignore case
+        while taken & {f"{stem}{suffix}".lower() for suffix in ("", "_depth", "_alpha")}:
             number += 1
             stem = f"{base}_{number}"
-        taken |= _files(stem)
+        taken |= {f"{stem}{suffix}".lower() for suffix in ("", "_depth", "_alpha")}
         stems.append(stem)
     return stems
+
+
+def _safe(part: str) -> str:
+    name = re.sub(r"[^\w.-]", "_", part).lstrip(".") or "_"
+    return f"{name}_" if _DEVICE.fullmatch(name.split(".")[0]) else name
 
 
 class _FrameWriter:
@@ -203,28 +218,25 @@ class _FrameWriter:
 
     def __init__(
         self,
+        opened: Opened,
         out_dir: Path | None,
         output: OutputOptions,
-        inputs: Inputs,
-        depth_unit: float,
         limits: tuple[float, float] | None = None,
     ) -> None:
         self.written: list[Path] = []
-        self._inputs = inputs
+        self._inputs = inputs_of(opened)
         self._out_dir, self._output, self._limits = out_dir, output, limits
-        self._depth_unit = np.float32(depth_unit)
+        self._depth_unit = np.float32(opened.frame.scale)
         self._stack = ExitStack()
         self._video: VideoWriter | None = None
-        self._size: tuple[int, ...] | None = None
 
     def __enter__(self) -> _FrameWriter:
-        for out in (self._out_dir, self._output.video):
+        path = self._output.video
+        for out in (self._out_dir, path):
             if out is not None:
                 self._inputs.require_output(out)
-        if self._output.video is not None:
-            self._video = self._stack.enter_context(
-                VideoWriter(self._output.video, fps=self._output.fps)
-            )
+        if path is not None:
+            self._video = self._stack.enter_context(VideoWriter(path, fps=self._output.fps))
         return self
 
     def __exit__(self, *problem: object) -> None:
@@ -235,22 +247,18 @@ class _FrameWriter:
     def write(self, stem: str, frame: DrawnImage) -> None:
         rgb = to_uint8(frame.rgb)
         if self._video is not None:
-            self._size = self._size or rgb.shape
-            if rgb.shape != self._size:
-                raise DyngsError(
-                    f"{self._output.video}: a video needs views of one size, {stem} differs"
-                )
-            self._video.add(rgb)
+            try:
+                self._video.add(rgb)
+            except ValueError as error:
+                raise DyngsError(f"{self._output.video}: {stem} differs: {error}") from error
         if self._out_dir is None:
             return
         self.write_image(self._out_dir / f"{stem}.png", rgb)
         if self._output.alpha:
             self.write_image(self._out_dir / f"{stem}_alpha.png", frame.alpha)
         if self._output.depth and frame.depth is not None:
-            self.write_image(
-                self._out_dir / f"{stem}_depth.png",
-                depth_to_rgb(frame.depth, frame.alpha, self._limits),
-            )
+            colours = depth_to_rgb(frame.depth, frame.alpha, self._limits)
+            self.write_image(self._out_dir / f"{stem}_depth.png", colours)
             self.write_image(self._out_dir / f"{stem}_depth.exr", frame.depth * self._depth_unit)
 
     def write_image(self, path: Path, pixels: np.ndarray) -> None:
@@ -259,28 +267,99 @@ class _FrameWriter:
         self.written.append(path)
 
 
-def _with_depth(scene: Renderable, output: OutputOptions) -> DrawOptions:
-    return replace(scene.options, depth="expected" if output.depth else "none")
+def contact_sheet(rows: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return a sheet (H', W', 3) uint8 with truth, render and error side by side, one view per row.
+
+    ``rows``: a label, truth and render, (H, W, 3) of the same size, uint8 or float in [0, 1]. The
+    error is the mean absolute difference of the channels times 5, in magma colours (black = equal).
+    Images wider than 480 pixels are shrunk, after the difference was taken.
+    """
+    bands = []
+    for label, *images in rows:
+        truth, rendered = (to_uint8(image) for image in images)
+        difference = np.abs(truth.astype(np.float32) - rendered.astype(np.float32)).mean(axis=2)
+        panels = {
+            f"truth  {label}": truth,
+            "render": rendered,
+            "error x5": color_map(5.0 * (difference / 255.0), "magma"),
+        }
+        cells = [_captioned(text, panel) for text, panel in panels.items()]
+        bands.append(np.concatenate(cells, axis=1))
+    width = max(band.shape[1] for band in bands)
+    padded = [
+        np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=_BACKGROUND)
+        for b in bands
+    ]
+    margins = ((0, _GAP), (_GAP, 0), (0, 0))
+    return np.pad(np.concatenate(padded), margins, constant_values=_BACKGROUND)
 
 
-def _sample(path: CameraPath) -> CameraPath:
-    """Return at most 8 of the frames, evenly spread."""
-    count = min(len(path), _DEPTH_SAMPLES)
-    device = path.cameras.cam_from_world.device
-    index = torch.linspace(0, len(path) - 1, count, device=device).round().long()
-    poses = path.cameras.cam_from_world[index]
-    intrinsics = path.cameras.intrinsics[index]
-    cameras = replace(path.cameras, cam_from_world=poses, intrinsics=intrinsics)
-    return replace(
-        path, cameras=cameras, times=path.times and tuple(path.times[i] for i in index.tolist())
-    )
+def _captioned(text: str, panel: np.ndarray) -> np.ndarray:
+    """Return an image (H, W, 3) uint8, shrunk to the width of panels, below a caption, with a gap on
+    its right.
+
+    The text is made smaller to fit, down to a limit at which it is cut off; there is none if no
+    font is installed.
+    """
+    import OpenImageIO as oiio
+    from skimage.transform import resize_local_mean
+
+    if panel.shape[1] > _PANEL_WIDTH:
+        height = max(round(panel.shape[0] * _PANEL_WIDTH / panel.shape[1]), 1)
+        panel = to_uint8(
+            resize_local_mean(panel.astype(np.float32) / 255.0, (height, _PANEL_WIDTH))
+        )
+    width = panel.shape[1]
+    strip = np.full((_LABEL_HEIGHT, width, 3), _BACKGROUND, np.uint8)
+    image = oiio.ImageBuf(strip)
+    size = 14
+    while size > 9 and oiio.ImageBufAlgo.text_size(text, size).width > width - 4:
+        size -= 1
+    ink = (0.85, 0.85, 0.85)
+    if oiio.ImageBufAlgo.render_text(image, 2, _LABEL_HEIGHT - 7, text, size, textcolor=ink):
+        strip = np.asarray(image.get_pixels(oiio.UINT8))
+    cell = np.concatenate([strip, panel])
+    return np.pad(cell, ((0, 0), (0, _GAP), (0, 0)), constant_values=_BACKGROUND)
 
 
-def _files(stem: str) -> set[str]:
-    """Return the file names of a view, in lower case because some file systems ignore case."""
-    return {f"{stem}{suffix}".lower() for suffix in ("", "_depth", "_alpha")}
+def _depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
+    """Return near and far for ``depth_to_rgb``: the 1st and 99th percentile of depth where alpha is
+    at least 0.5.
+
+    Any equal shapes, so that the frames of a video can share limits. (0, 1) if nothing is opaque.
+    """
+    seen = depth[(alpha >= 0.5) & np.isfinite(depth)]
+    if not seen.size:
+        return 0.0, 1.0
+    near, far = np.percentile(seen, [1.0, 99.0])
+    return float(near), float(far)
 
 
-def _safe(part: str) -> str:
-    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in part).lstrip(".") or "_"
-    return f"{name}_" if _DEVICE.fullmatch(name.split(".")[0]) else name
+def depth_to_rgb(
+    depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None
+) -> np.ndarray:
+    """Return depth as colours (H, W, 3) uint8: near is red, far is blue (turbo), darkened to black
+    where alpha is 0.
+
+    ``depth``: (H, W) expected depth in world units; non-finite values count as far. ``alpha``: (H,
+    W) in [0, 1]. ``limits``: near and far; None: those of this image.
+    """
+    near, far = limits or _depth_limits(depth, alpha)
+    finite = np.nan_to_num(depth, nan=far, posinf=far, neginf=near)
+    fraction = (far - finite) / max(far - near, 1e-12)
+    colors = color_map(fraction, "turbo").astype(np.float32)
+    return (colors * np.clip(alpha, 0.0, 1.0)[..., None] + 0.5).astype(np.uint8)
+
+
+def color_map(values: np.ndarray, name: str) -> np.ndarray:
+    """Return colours (H, W, 3) uint8 of values (H, W) in [0, 1], by a colour map of OpenImageIO
+    (magma, turbo...)."""
+    import OpenImageIO as oiio
+
+    clipped = np.clip(values, 0.0, 1.0)[..., None]
+    source = oiio.ImageBuf(np.ascontiguousarray(clipped, dtype=np.float32))
+    colored = oiio.ImageBufAlgo.color_map(source, 0, name)
+    if colored.has_error:
+        raise ValueError(f"no colour map '{name}': {colored.geterror()}")
+    linear = np.asarray(colored.get_pixels(oiio.FLOAT))[..., :3]  # tables are in linear light
+    return to_uint8(srgb_encoded(np.clip(linear, 0.0, 1.0)))

@@ -11,8 +11,8 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
 from dyngs.core.metrics import psnr
-from dyngs.export.camera_paths.orbit import frame_orbit_for_points
-from dyngs.export.camera_paths.path import resize_cameras
+from dyngs.export.camera_paths import pick_cameras
+from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import Written, read_splats
@@ -24,7 +24,6 @@ VIEWS = 4
 _LONGEST_SIDE = 240
 # cameras that see the scene in fewer pixels than this are replaced by an orbit
 _LEAST_FRACTION = 0.002
-FAINT = 30.0  # dB, below which a line about the difference is a warning
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Redrawn:
     @property
     def is_faint(self) -> bool:
         """Return whether the file shows something visibly different."""
-        return self.psnr < FAINT
+        return self.psnr < 30.0
 
 
 def compare_run(
@@ -55,17 +54,17 @@ def compare_run(
     ``time``: in [0, 1]. ``meant``: what the file is meant to hold, turned from the axes of the
     scene. Raises DyngsError: no camera sees anything.
     """
+    frame = meant.frame.after(opened.file_unit)
     with torch.no_grad():
         moment = scene.time_step(time)
-        frame = meant.frame.after(opened.file_unit)
-        for cameras in (capture_cameras(opened), frame.inverse().cameras(around(meant))):
+        black = torch.zeros_like(moment.gaussians.means[0])
+        for cameras in (_capture_cameras(opened), frame.inverse().cameras(_around(meant))):
             if cameras is None:
                 continue
-            drawn = scene.render(cameras, moment, background=_black(moment.gaussians.means))
+            drawn = scene.render(cameras, moment, background=black)
             if float((drawn.alpha > 0.1).float().mean()) >= _LEAST_FRACTION:
-                return compare(
-                    drawn.rgb, frame.cameras(cameras), read, scene.options.near * frame.scale
-                )
+                near = scene.options.near * frame.scale
+                return _compare(drawn.rgb, frame.cameras(cameras), read, near)
     raise DyngsError(
         "nothing of the scene is seen by the cameras of the capture, or from an orbit around it"
     )
@@ -76,51 +75,38 @@ def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
 
     Raises DyngsError: the file cannot be read.
     """
-    cameras = around(splat)
+    cameras = _around(splat)
     moved = written.splat.frame.after(splat.frame.inverse())
     options = drawing_options(splat)
+    black = torch.zeros_like(splat.gaussians.means[0])
     with torch.no_grad():
-        wanted = render(
-            splat.gaussians, cameras, options, background=_black(splat.gaussians.means)
-        ).rgb
-    return compare(
-        wanted, moved.cameras(cameras), read_splats(written.path), options.near * moved.scale
-    )
+        wanted = render(splat.gaussians, cameras, options, background=black).rgb
+    near = options.near * moved.scale
+    return _compare(wanted, moved.cameras(cameras), read_splats(written.path), near)
 
 
-def compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> Redrawn:
+def _compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> Redrawn:
     """Return how what a file holds, seen by cameras in its axes, differs from images (V, H, W,
     3)."""
     options = replace(splat_options(splat), near=near)
     with torch.no_grad():
-        drawn = render(splat.gaussians, cameras, options, background=_black(wanted)).rgb
+        drawn = render(splat.gaussians, cameras, options, background=wanted.new_zeros(3)).rgb
     values = [psnr(a, b) for a, b in zip(drawn, wanted, strict=True)]
     return Redrawn(float(np.mean(values)), len(values))
 
 
-def capture_cameras(opened: Opened) -> Cameras | None:
+def _capture_cameras(opened: Opened) -> Cameras | None:
     """Return a few training cameras, in images of modest size; None where no capture can be
     read."""
     cameras = opened.cameras
     if cameras is None:
         return None
     rows = np.unique(np.linspace(0, len(cameras) - 1, VIEWS).round().astype(int))
-    few = replace(
-        cameras, cam_from_world=cameras.cam_from_world[rows], intrinsics=cameras.intrinsics[rows]
-    )
-    fraction = min(1.0, _LONGEST_SIDE / max(few.width, few.height))
-    return resize_cameras(
-        few, max(1, round(fraction * few.width)), max(1, round(fraction * few.height))
-    )
+    fraction = min(1.0, _LONGEST_SIDE / max(cameras.width, cameras.height))
+    return pick_cameras(cameras, rows).scaled(fraction)
 
 
-def around(splat: SplatFile) -> Cameras:
+def _around(splat: SplatFile) -> Cameras:
     """Return an orbit around Gaussians, in their own axes."""
-    means = splat.gaussians.means.numpy()
-    return frame_orbit_for_points(
-        means, VIEWS, (_LONGEST_SIDE, _LONGEST_SIDE * 3 // 4), AXES[splat.up or "z"]
-    )
-
-
-def _black(like: Tensor) -> Tensor:
-    return torch.zeros(3, dtype=torch.float32, device=like.device)
+    size = (_LONGEST_SIDE, _LONGEST_SIDE * 3 // 4)
+    return frame_orbit_for_points(splat.gaussians.means.numpy(), VIEWS, size, AXES[splat.up or "z"])

@@ -4,7 +4,6 @@ as tracks."""
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -45,7 +44,7 @@ from dyngs.io.formats.splat_file import (
     offset_notes,
     unit_rotations,
 )
-from dyngs.io.temporary import temporary_folder_beside
+from dyngs.io.temporary import remove_quietly, temporary_folder_beside
 from dyngs.io.write import atomic_file
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
@@ -84,25 +83,22 @@ def writing_of(
     Raises DyngsError: no such axis.
     """
     edited = opened.edited
+    frame = "capture" if edited is None else "edited run"
     if up == "keep" or (edited is not None and edited.fixed and up is None):
-        if edited is None:
-            return Writing(sh_degree=sh_degree), "axes are those of the capture"
-        said = f", {edited.up} up" if edited.up is not None else ""
-        return Writing(up=edited.up, sh_degree=sh_degree), f"axes are those of the edit{said}"
-    found = (axis_of(from_up), "--from-up") if from_up is not None else up_of(opened)
-    wanted = target if up is None else up
+        own = None if edited is None else edited.up
+        known = "" if own is None else f", {own} up"
+        return Writing(
+            up=own, sh_degree=sh_degree
+        ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
+    found = up_of(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
         return Writing(sh_degree=sh_degree), line
     direction, who = found
-    name = nearest_axis(direction)
-    here = name if name is not None and AXES[name] == tuple(direction) else "a slanted direction"
-    frame = "capture" if edited is None else "edited run"
-    turned = (
-        f"the axes of the {frame} are kept"
-        if here == wanted
-        else f"turned, it was {here} in the {frame}"
-    )
+    wanted = target if up is None else up
+    here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
+    turned = f"turned, it was {here} in the {frame}"
+    turned = f"the axes of the {frame} are kept" if here == wanted else turned
     how = Writing(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
@@ -118,8 +114,9 @@ def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
     found, who = opened.up
     if opened.edited is not None:
         found = opened.frame.rotation @ found
-    name = nearest_axis(tuple(found.tolist()))
-    return (tuple(found.tolist()) if name is None else AXES[name]), who
+    direction = tuple(found.tolist())
+    name = nearest_axis(direction)
+    return (direction if name is None else AXES[name]), who
 
 
 def write_run_splats(
@@ -150,31 +147,38 @@ def write_run_sequence(
     other such files, or they cannot be written.
     """
     scene = scene_part(opened.scene, part)
-    names = frame_names(len(times), suffix)
+    digits = max(4, len(str(len(times) - 1)))
+    names = [f"frame_{i:0{digits}d}{suffix}" for i in range(len(times))]
     inputs = inputs_of(opened)
     for path in (folder, *(folder / name for name in names)):
         inputs.require_output(path)
-    _require_no_others(folder, names, suffix)
+    if folder.exists() and not folder.is_dir():
+        raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")
+    others = sorted(file.name for file in folder.glob(f"[!.]*{suffix}") if file.name not in names)
+    if others:
+        raise DyngsError(
+            f"{folder}: holds other {suffix} files ({others[0]}), which players would take for frames; give an empty "
+            "folder"
+        )
     is_new = not folder.exists()
     staging = temporary_folder_beside(folder / "frames")
     try:
-        written = [
-            _write(opened, scene, staging / name, time, how)
-            for name, time in zip(names, times, strict=True)
-        ]
+        written = []
+        for name, time in zip(names, times, strict=True):
+            one = _write(opened, scene, staging / name, time, how)
+            written.append(replace(one, path=folder / name))
         for name in names:
             os.replace(staging / name, folder / name)
-        staging.rmdir()
     except OSError as error:
         raise DyngsError(
             f"cannot write the sequence {folder}: {error.strerror or error}"
         ) from error
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        remove_quietly(staging)
         if is_new:
             with suppress(OSError):
                 folder.rmdir()  # only succeeds while it is empty
-    return [replace(one, path=folder / name) for one, name in zip(written, names, strict=True)]
+    return written
 
 
 def write_run_levels(
@@ -191,23 +195,14 @@ def write_run_levels(
     return write_sog_levels(folder, whole), notes
 
 
-def frame_names(count: int, suffix: str = ".ply") -> list[str]:
-    """Return ``frame_0000.ply`` and so on, with at least four digits and names in the order of the
-    frames."""
-    digits = max(4, len(str(count - 1)))
-    return [f"frame_{i:0{digits}d}{suffix}" for i in range(count)]
-
-
 def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
     """Return a part of a scene. Raises DyngsError if it is empty."""
     if part == "all":
         return scene
     found = scene.part(part)
     if not len(found):
-        empty = "every Gaussian of this run moves: it has no still part"
-        raise DyngsError(
-            "nothing moves in this run: it has no dynamic part" if part == "moving" else empty
-        )
+        what = "the whole scene moves" if part == "still" else "nothing moves in this run"
+        raise DyngsError(f"{what}: it has no {'static' if part == 'still' else 'dynamic'} part")
     return found
 
 
@@ -224,11 +219,9 @@ def splats_at(
         moment = scene.time_step(time)
     gaussians = moment.gaussians
     shader = scene.shader(moment)
-    comments = (
-        [f"step: {opened.step}"]
-        if scene.is_static
-        else [f"step: {opened.step}", f"dyngs time {time!r}"]
-    )
+    comments = [f"step: {opened.step}"]
+    if not scene.is_static:
+        comments.append(f"dyngs time {time!r}")
     if shader is not None:
         baked = with_harmonics(gaussians, shader)
         gaussians = baked.gaussians
@@ -248,21 +241,6 @@ def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: W
     return write_splats(
         path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree, own=how.own
     )
-
-
-def _require_no_others(folder: Path, names: Sequence[str], suffix: str) -> None:
-    """Check that the folder holds no files that players would take for frames.
-
-    Raises DyngsError: there is a file that is not among ``names``, or the folder is a file.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")
-    others = sorted(f.name for f in folder.glob(f"[!.]*{suffix}") if f.name not in names)
-    if others:
-        raise DyngsError(
-            f"{folder}: holds other {suffix} files ({others[0]}), which players would take for frames; give an empty "
-            "folder"
-        )
 
 
 MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in memory
@@ -291,13 +269,12 @@ def tracks_of(
 
     Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
     """
-    device = scene.gaussians.means.device
-    moves = torch.zeros(len(scene), dtype=torch.bool, device=device)
+    moves = torch.zeros(len(scene), dtype=torch.bool, device="cpu")
     moves[scene.rows] = not scene.is_static
-    moving = scene_part(scene, "moving") if part == "moving" or not scene.is_static else None
-    ids = (
-        torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
-    )
+    if part == "moving":
+        scene_part(scene, "moving")
+    rows = torch.arange(len(scene), device="cpu")
+    ids = rows[moves] if part == "moving" else rows
     kind = np.float32 if frame == UNMOVED else np.float64
     size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
     if size > MAX_BYTES:
@@ -306,11 +283,9 @@ def tracks_of(
             f"{MAX_BYTES / 1e9:.0f} GB; give fewer --times, or --dynamic for only those that move"
         )
     positions = np.empty((len(ids), len(times), 3), kind)
-    positions[:] = scene.gaussians.means[ids].numpy()[:, None]
-    if moving is not None:
-        rows = moves[ids].numpy()
-        for k, time in enumerate(times):
-            positions[rows, k] = moving.at(time).means.numpy()
+    whole = scene.unmasked()
+    for k, time in enumerate(times):
+        positions[:, k] = whole.at(time).means[ids].numpy()
     if frame != UNMOVED:
         positions = frame.points(positions)
     return Tracks(positions, np.array(times, np.float64), moves[ids].numpy(), ids.numpy())
@@ -332,8 +307,6 @@ def write_tracks(path: Path, tracks: Tracks) -> Path:
 SUFFIX = ".4dgs"
 UP = "-y"
 FPS = 30.0
-_KEYFRAME_EVERY = 8
-_FOREVER = 1e4  # standard deviation in time, in lengths of the clip: a Gaussian never fades
 
 
 @dataclass(frozen=True)
@@ -357,14 +330,30 @@ def write_moving(
     Raises DyngsError: the package is missing, the part is empty, or the file cannot be written.
     """
     inputs_of(opened).require_output(path)
-    model, delta = _packages(path)
+    model, delta, files = _fourdgs(path)
     scene = scene_part(opened.scene, part)
     splats = tuple(splats_at(opened, scene, time, how) for time in times)
     duration = len(times) / FPS
-    samples = [_sample(splat, i / FPS, duration, model, delta) for i, splat in enumerate(splats)]
-    options = delta.KeyframeDeltaOptions(keyframe_every=_KEYFRAME_EVERY)
-    writer = import_module("fourdgs.keyframe_delta_file")
-    data = writer.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
+    samples = []
+    for i, splat in enumerate(splats):
+        gaussians = splat.gaussians
+        n = len(gaussians)
+        rgba = torch.cat([gaussians.base_rgb.clamp(0, 1), gaussians.opacities[:, None]], dim=1)
+        states = model.GaussianSet(
+            positions=gaussians.means.numpy(),
+            scales=gaussians.scales.numpy(),
+            rotations=unit_rotations(gaussians.quats).numpy()[:, [1, 2, 3, 0]],
+            colors=rgba.numpy(),
+            motions=np.zeros((n, 3), np.float32),
+            mu_t=np.full(n, i / FPS, np.float32),
+            # standard deviation in time: a Gaussian never fades
+            sigma_t=np.full(n, 1e4 * duration, np.float32),
+            win_lo=np.zeros(n, np.float32),
+            win_hi=np.full(n, duration, np.float32),
+        )
+        samples.append(delta.Sample(t0=i / FPS, ids=np.arange(n), gaussians=states))
+    options = delta.KeyframeDeltaOptions(keyframe_every=8)
+    data = files.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
     notes = (
@@ -372,10 +361,8 @@ def write_moving(
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
-        notes = (
-            *notes,
-            "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians",
-        )
+        left_out = "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians"
+        notes = (*notes, left_out)
     return MovingFile(path, splats, notes)
 
 
@@ -385,39 +372,20 @@ def read_moment(path: Path, index: int) -> SplatFile:
 
     Raises DyngsError: the package is missing, or values that are not finite.
     """
-    _packages(path)
-    reader = import_module("fourdgs.keyframe_delta_file")
-    found = reader.render_at(reader.decode_streamed(path.read_bytes()), (index + 0.5) / FPS)
+    _, _, files = _fourdgs(path)
+    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FPS)
     sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
-    gaussians = from_linear(
-        found["centers"], found["rotations"][:, [3, 0, 1, 2]], found["scales"], found["opacity"], sh
-    )
+    quats = found["rotations"][:, [3, 0, 1, 2]]
+    gaussians = from_linear(found["centers"], quats, found["scales"], found["opacity"], sh)
     return drawable(SplatFile(gaussians), path, "error")
 
 
-def _sample(splat: SplatFile, start: float, duration: float, model: Any, delta: Any) -> Any:
-    """Return the Gaussians of one time as fourdgs takes them."""
-    gaussians = replace(splat.gaussians, quats=unit_rotations(splat.gaussians.quats))
-    n = len(gaussians)
-    rgba = torch.cat([gaussians.base_rgb.clamp(0, 1), gaussians.opacities[:, None]], dim=1)
-    states = model.GaussianSet(
-        positions=gaussians.means.numpy(),
-        scales=gaussians.scales.numpy(),
-        rotations=gaussians.quats.numpy()[:, [1, 2, 3, 0]],
-        colors=rgba.numpy(),
-        motions=np.zeros((n, 3), np.float32),
-        mu_t=np.full(n, start, np.float32),
-        sigma_t=np.full(n, _FOREVER * duration, np.float32),
-        win_lo=np.zeros(n, np.float32),
-        win_hi=np.full(n, duration, np.float32),
-    )
-    return delta.Sample(t0=start, ids=np.arange(n), gaussians=states)
-
-
-def _packages(path: Path) -> tuple[Any, Any]:
+def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
+    names = ("model", "keyframe_delta_writer", "keyframe_delta_file")
     try:
-        return import_module("fourdgs.model"), import_module("fourdgs.keyframe_delta_writer")
+        model, delta, files = (import_module(f"fourdgs.{name}") for name in names)
     except ImportError:
         raise DyngsError(
             f"{path}: .4dgs files need the package fourdgs: pip install 'dyngs[4dgs]'"
         ) from None
+    return model, delta, files

@@ -87,7 +87,7 @@ class Kind:
 
 
 KINDS: tuple[Kind, ...] = (
-    Kind(StaticModel, "dyngs.static.training"),
+    Kind(StaticModel, "dyngs.gaussians.static_training"),
     Kind(DynamicModel, "dyngs.deform.kind"),
     Kind(HumanModel, "dyngs.human.avatar.kind"),
     Kind(HumanPredictorModel, "dyngs.human.predict.ghg.learner"),

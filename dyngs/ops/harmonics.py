@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -10,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from dyngs.core.conventions import SH_C0
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, empty_like, launch, register
+from dyngs.ops.registration import Backward, differentiable, empty_like, launch
 
 
 def _harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
@@ -19,34 +20,19 @@ def _harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree
     return colors
 
 
-def _harmonics_backward(
-    inputs: list[Tensor], colors: Tensor, grad: Tensor, degree: int, with_centers: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    means, centers, sh, _ = inputs
-    g_means = empty_like(means)
-    g_sh = empty_like(sh)
-    g_centers = centers.new_zeros(centers.shape)
-    results = g_means, g_sh, g_centers if with_centers else None
-    launch(means, "harmonics_backward", *inputs, (colors, grad), results, degree, num_threads())
-    return g_means, g_sh, g_centers
+def _harmonics_backward(x: Backward) -> Sequence[Tensor]:
+    means, centers, sh, radii, degree = x.inputs
+    results = empty_like(means), centers.new_zeros(centers.shape), empty_like(sh)
+    by_means, by_centers, by_sh = results
+    given = means, centers, sh, radii, (*x.outputs, *x.grads)
+    wanted = by_means, by_sh, by_centers if x.needs[1] else None
+    launch(means, "harmonics_backward", *given, wanted, degree, num_threads())
+    return results
 
 
-harmonics_backward_op = register("harmonics_backward", _harmonics_backward)
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    means, centers, sh, radii, ctx.degree = inputs
-    ctx.save_for_backward(means, centers, sh, radii, output)
-
-
-def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    *inputs, colors = ctx.saved_tensors
-    with_centers = ctx.needs_input_grad[1]
-    g_means, g_sh, g_centers = harmonics_backward_op(inputs, colors, grad, ctx.degree, with_centers)
-    return g_means, g_centers if with_centers else None, g_sh, None, None
-
-
-harmonics_op = register("harmonics", _harmonics, gradient=Gradient(_save, _backward))
+harmonics_op = differentiable(
+    "harmonics", _harmonics, _harmonics_backward, "means centers sh", keeps=[0]
+)
 
 
 def evaluate_harmonics(

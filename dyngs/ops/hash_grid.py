@@ -9,15 +9,15 @@ of their index.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, empty_like, launch, register
+from dyngs.ops.registration import Backward, differentiable, empty_like, launch
 
 WIDTHS = 1, 2, 4, 8  # Features of a level that there are kernels for
 
@@ -69,49 +69,15 @@ def _hash_grid(
     return features
 
 
-def _hash_grid_backward(
-    coords: Tensor,
-    table: Tensor,
-    grad: Tensor,
-    scales: list[float],
-    sizes: list[int],
-    rows: list[int],
-) -> Tensor:
-    g_table = empty_like(table)
-    launch(
-        coords,
-        "hash_grid_backward",
-        coords,
-        _sizes(scales, sizes, rows),
-        grad,
-        g_table,
-        num_threads(),
-    )
-    return g_table
+def _hash_grid_backward(x: Backward) -> Sequence[Tensor]:
+    coords, table, scales, sizes, rows = x.inputs
+    by_table = empty_like(table)
+    levels = _sizes(scales, sizes, rows)
+    launch(coords, "hash_grid_backward", coords, levels, *x.grads, by_table, num_threads())
+    return [by_table]
 
 
-hash_grid_backward_op = register("hash_grid_backward", _hash_grid_backward)
-"""The gradient by the table."""
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    coords, table, *ctx.levels = inputs
-    ctx.save_for_backward(coords, table)
-
-
-def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    coords, table = ctx.saved_tensors
-    scales, sizes, rows = ctx.levels
-    return (
-        None,
-        hash_grid_backward_op(coords, table, grad.contiguous(), scales, sizes, rows),
-        None,
-        None,
-        None,
-    )
-
-
-hash_grid_op = register("hash_grid", _hash_grid, gradient=Gradient(_save, _backward))
+hash_grid_op = differentiable("hash_grid", _hash_grid, _hash_grid_backward, "table")
 """Features (M, L * F)."""
 
 
@@ -153,18 +119,11 @@ def _known(
     return features.index_select(0, which)
 
 
-def _save_known(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    _, _, coords, table, *ctx.levels = inputs
-    ctx.save_for_backward(coords, table)
+def _known_backward(x: Backward) -> Sequence[Tensor]:
+    return _hash_grid_backward(x._replace(inputs=x.inputs[2:]))
 
 
-def _backward_known(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    return None, None, *_backward(ctx, grad)
-
-
-known_features_op = register(
-    "known_features", _known, gradient=Gradient(_save_known, _backward_known)
-)
+known_features_op = differentiable("known_features", _known, _known_backward, "table")
 
 
 def known_features(

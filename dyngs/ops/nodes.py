@@ -6,13 +6,13 @@ S nodes, P control points, B neighbours of a node.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, empty_like, launch, register
+from dyngs.ops.registration import Backward, differentiable, empty_like, launch
 
 T = TypeVar("T", float, Tensor)
 
@@ -58,52 +58,17 @@ def _nodes_at(
     return motion, values
 
 
-def _nodes_at_backward(
-    means: Tensor,
-    quats: Tensor | None,
-    log_scales: Tensor | None,
-    logit_opacities: Tensor | None,
-    colors: Tensor | None,
-    grads: list[Tensor],
-    time: float,
-) -> list[Tensor]:
-    heads = means, quats, log_scales, logit_opacities, colors
-    results = [None if x is None else empty_like(x) for x in heads]
-    launch(
-        means,
-        "nodes_at_backward",
-        heads,
-        _place(means.shape[1], time),
-        *grads,
-        results,
-        num_threads(),
-    )
-    return [x for x in results if x is not None]
+def _nodes_at_backward(x: Backward) -> Sequence[Tensor | None]:
+    *heads, time = x.inputs
+    results = [None if head is None else empty_like(head) for head in heads]
+    place = _place(heads[0].shape[1], time)
+    launch(heads[0], "nodes_at_backward", heads, place, *x.grads, results, num_threads())
+    return results
 
 
-nodes_at_backward_op = register("nodes_at_backward", _nodes_at_backward)
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    *heads, ctx.time = inputs
-    ctx.there = [x is not None for x in heads]
-    ctx.save_for_backward(*(x for x in heads if x is not None))
-
-
-def _backward(ctx: Any, g_motion: Tensor, g_values: Tensor) -> tuple[Tensor | None, ...]:
-    saved = iter(ctx.saved_tensors)
-    means, *others = (next(saved) if there else None for there in ctx.there)
-    assert means is not None
-    quats, log_scales, logits, colors = others
-    found = iter(
-        nodes_at_backward_op(
-            means, quats, log_scales, logits, colors, [g_motion, g_values], ctx.time
-        )
-    )
-    return *(next(found) if there else None for there in ctx.there), None
-
-
-nodes_at_op = register("nodes_at", _nodes_at, gradient=Gradient(_save, _backward))
+nodes_at_op = differentiable(
+    "nodes_at", _nodes_at, _nodes_at_backward, "means quats log_scales logit_opacities colors"
+)
 
 
 def spline_motion(heads: Sequence[Tensor | None], time: float) -> tuple[Tensor, Tensor]:
@@ -139,20 +104,19 @@ def _node_penalties(
     return penalties.to(motion.dtype), by_motion, by_paths
 
 
-def _save_penalties(
-    ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]
-) -> None:
-    ctx.mark_non_differentiable(*output[1:])
-    ctx.save_for_backward(*output[1:])
+def _penalties_backward(x: Backward) -> Sequence[Tensor]:
+    by_motion, by_paths = x.outputs
+    by_acceleration, by_strain = x.grads[0]
+    return by_strain * by_motion, by_acceleration * by_paths
 
 
-def _penalties_backward(ctx: Any, grad: Tensor, *_: Tensor | None) -> tuple[Tensor | None, ...]:
-    by_motion, by_paths = ctx.saved_tensors
-    return None, None, None, grad[1] * by_motion, grad[0] * by_paths
-
-
-node_penalties_op = register(
-    "node_penalties", _node_penalties, gradient=Gradient(_save_penalties, _penalties_backward)
+node_penalties_op = differentiable(
+    "node_penalties",
+    _node_penalties,
+    _penalties_backward,
+    "motion paths",
+    keeps=[1, 2],
+    constant=[1, 2],
 )
 """The penalties (2,), and the gradients of the second by motion and of the first by paths."""
 

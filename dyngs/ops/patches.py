@@ -10,8 +10,9 @@ patches lies an outline, whose place says how much of each the other one covers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import check_number, check_size, check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, empty_like, launch, register
+from dyngs.ops.registration import Backward, differentiable, empty_like, launch, register
 
 NUM_POINTS = 6  # of a quadratic patch
 SEGMENTS = 6  # Of an edge: 36 flat faces (Wu et al. 2025)
@@ -64,28 +65,15 @@ def _values(values: Tensor, ids: Tensor, uv: Tensor, basis: int) -> Tensor:
     return out
 
 
-def _values_backward(like: Tensor, ids: Tensor, uv: Tensor, grad: Tensor, basis: int) -> Tensor:
-    g_values = empty_like(like)
-    launch(grad, "patch_values_backward", uv, ids, grad, basis, g_values, num_threads())
-    return g_values
+def _values_backward(x: Backward) -> Sequence[Tensor]:
+    values, ids, uv, basis = x.inputs
+    (grad,) = x.grads
+    by_values = empty_like(values)
+    launch(grad, "patch_values_backward", uv, ids, grad, basis, by_values, num_threads())
+    return [by_values]
 
 
-patch_values_backward_op = register("patch_values_backward", _values_backward)
-
-
-def _save_values(ctx: Any, inputs: tuple[Any, ...], _: Tensor) -> None:
-    values, ids, uv, ctx.basis = inputs
-    ctx.save_for_backward(values, ids, uv)
-
-
-def _values_gradient(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    values, ids, uv = ctx.saved_tensors
-    return patch_values_backward_op(values, ids, uv, grad.contiguous(), ctx.basis), None, None, None
-
-
-patch_values_op = register(
-    "patch_values", _values, gradient=Gradient(_save_values, _values_gradient)
-)
+patch_values_op = differentiable("patch_values", _values, _values_backward, "values")
 
 
 def patch_values(values: Tensor, ids: Tensor, uv: Tensor, along: Along | None = None) -> Tensor:
@@ -199,38 +187,16 @@ def _blend(
     return out
 
 
-def _blend_backward(inputs: list[Tensor], grads: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    colours, crossings, rows, ids = inputs
+def _blend_backward(x: Backward) -> Sequence[Tensor]:
+    _, colours, crossings, *pixels = x.inputs
     out = colours.new_empty(len(colours), 2), empty_like(colours), empty_like(crossings)
-    launch(
-        colours,
-        "blend_patches_backward",
-        colours,
-        crossings,
-        rows,
-        ids,
-        tuple(grads),
-        out,
-        num_threads(),
-    )
+    given = colours, crossings, *pixels, tuple(x.grads)
+    launch(colours, "blend_patches_backward", *given, out, num_threads())
     return out
 
 
-blend_patches_backward_op = register("blend_patches_backward", _blend_backward)
-"""Gradients by means, colours and crossings; ``inputs`` are the last four of ``blend_patches``."""
-
-
-def _save_blend(ctx: Any, inputs: tuple[Any, ...], _: tuple[Tensor, ...]) -> None:
-    ctx.save_for_backward(*inputs[1:])
-
-
-def _blend_gradient(ctx: Any, image: Tensor, transmittance: Tensor) -> tuple[Tensor | None, ...]:
-    grads = [image.contiguous(), transmittance.contiguous()]
-    return *blend_patches_backward_op(list(ctx.saved_tensors), grads), None, None
-
-
-blend_patches_op = register(
-    "blend_patches", _blend, gradient=Gradient(_save_blend, _blend_gradient)
+blend_patches_op = differentiable(
+    "blend_patches", _blend, _blend_backward, "means colours crossings"
 )
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +17,7 @@ from torch.nn.functional import linear
 
 from dyngs.core.errors import DyngsError
 from dyngs.ops.native import core_for, num_threads
-from dyngs.ops.registration import Gradient, has_kernel, launch, register
+from dyngs.ops.registration import Backward, differentiable, empty_like, has_kernel, launch
 
 KEPT_BYTES = 2**30
 """The backward pass computes activations again where keeping them would take more memory than this,
@@ -54,53 +53,22 @@ def _perceptron(
     return y, kept
 
 
-def _perceptron_backward(
-    inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool
-) -> tuple[Tensor, Tensor]:
-    x, params, kept = inputs
-    grad_x = x.new_empty(x.shape if with_x else (0,))
-    grad_params = params.new_empty(params.shape)
-    results = grad_x if with_x else None, grad_params
-    launch(
-        x,
-        "perceptron_backward",
-        x,
-        params,
-        grad,
-        _or_none(kept),
-        *results,
-        widths,
-        skip,
-        num_threads(),
-    )
-    return grad_x, grad_params
+def _perceptron_backward(given: Backward) -> Sequence[Tensor | None]:
+    x, params, widths, skip, _ = given.inputs
+    (kept,) = given.outputs
+    results = empty_like(x) if given.needs[0] else None, empty_like(params)
+    arrays = x, params, given.grads[0], _or_none(kept), *results
+    launch(x, "perceptron_backward", *arrays, widths, skip, num_threads())
+    return results
 
 
 def _or_none(kept: Tensor) -> Tensor | None:
     return kept if kept.numel() else None
 
 
-perceptron_backward_op = register("perceptron_backward", _perceptron_backward)
-"""Gradients by x, empty unless asked for, and by the parameters; ``inputs`` are x, params and
-kept."""
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    x, params, ctx.widths, ctx.skip, _ = inputs
-    _, kept = output
-    ctx.mark_non_differentiable(kept)
-    ctx.save_for_backward(x, params, kept)
-
-
-def _backward(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
-    with_x = ctx.needs_input_grad[0]
-    grad_x, grad_params = perceptron_backward_op(
-        list(ctx.saved_tensors), grad, ctx.widths, ctx.skip, with_x
-    )
-    return grad_x if with_x else None, grad_params, None, None, None
-
-
-perceptron_op = register("perceptron", _perceptron, gradient=Gradient(_save, _backward))
+perceptron_op = differentiable(
+    "perceptron", _perceptron, _perceptron_backward, "x params", keeps=[1], constant=[1]
+)
 """Outputs (M, out), and the activations between the layers in the kernel's layout or an empty
 tensor. ``params`` holds weight and bias of each layer, flat; ``skip`` 0 means none."""
 

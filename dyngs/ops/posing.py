@@ -6,9 +6,9 @@ N Gaussians, J joints.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, launch, register
+from dyngs.ops.registration import Backward, differentiable, launch
 
 _KEPT = 12  # numbers per Gaussian that the forward pass keeps for the backward pass
 
@@ -39,53 +39,26 @@ def _posing(
     return *moved, blended, kept
 
 
-def _posing_backward(
-    rest: list[Tensor],
-    weights: Tensor,
-    transforms: Tensor,
-    posed: list[Tensor],
-    grads: list[Tensor],
-    g_blended: Tensor | None,
-    with_weights: bool,
-) -> _Results:
-    means, quats, log_scales = by_rest = [x.new_empty(x.shape) for x in rest]
-    by_weights = weights.new_empty(weights.shape if with_weights else (0,))
+def _posing_backward(x: Backward) -> Sequence[Tensor | None]:
+    *rest, weights, transforms = x.inputs
+    *by_moved, by_blended = x.grads
+    by_rest = [y.new_empty(y.shape) for y in rest]
+    by_weights = weights.new_empty(weights.shape) if x.needs[3] else None
     by_transforms = transforms.new_empty(transforms.shape)
-    given = rest, weights, transforms, (posed[:3], *posed[3:]), grads, g_blended
-    results = by_rest, by_weights if with_weights else None, by_transforms
-    launch(weights, "pose_backward", *given, *results, num_threads())
-    return means, quats, log_scales, by_weights, by_transforms
+    posed = x.outputs[:3], *x.outputs[3:]
+    given = rest, weights, transforms, posed, by_moved, by_blended
+    launch(weights, "pose_backward", *given, by_rest, by_weights, by_transforms, num_threads())
+    return *by_rest, by_weights, by_transforms
 
 
-posing_backward_op = register("posing_backward", _posing_backward)
-"""Gradients by means, quaternions and log scales at rest, by the weights, empty unless asked for,
-and by transforms; ``posed`` is what ``posing_op`` returned, ``grads`` are the gradients by the
-first three of it."""
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: _Results) -> None:
-    ctx.set_materialize_grads(False)  # often nobody uses the blended transforms
-    ctx.mark_non_differentiable(output[4])
-    ctx.save_for_backward(*inputs, *output)
-
-
-def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-    saved: tuple[Tensor, ...] = ctx.saved_tensors
-    rest = list(saved[:3])
-    weights = saved[3]
-    transforms = saved[4]
-    posed = list(saved[5:])
-    by_moved = [
-        torch.zeros_like(x) if g is None else g for x, g in zip(posed[:3], grads[:3], strict=True)
-    ]
-    with_weights = ctx.needs_input_grad[3]
-    *by_rest, by_weights, by_transforms = posing_backward_op(
-        rest, weights, transforms, posed, by_moved, grads[3], with_weights
-    )
-    return (*by_rest, by_weights if with_weights else None, by_transforms)
-
-
-posing_op = register("posing", _posing, gradient=Gradient(_save, _backward))
+posing_op = differentiable(
+    "posing",
+    _posing,
+    _posing_backward,
+    "means quats log_scales weights transforms",
+    keeps=range(5),
+    constant=[4],
+)
 """Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs
 (N, 12)."""
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.ops.checks import check_memory, check_near_and_far, check_number, check_size
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register
+from dyngs.ops.registration import Backward, Struct, differentiable, empty_like, launch
 
 
 @dataclass(frozen=True)
@@ -87,52 +87,27 @@ def _project(
     return splats
 
 
-def _project_backward(
-    gaussians: list[Tensor],
-    radii: Tensor,
-    grads: list[Tensor],
-    size: list[int],
-    limits: list[float],
-    antialiased: bool,
-    with_cameras: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    means, quats, scales, _, viewmats, intrinsics = gaussians
-    by_means, by_quats, by_scales = (empty_like(x) for x in (means, quats, scales))
-    of_cameras = viewmats.new_zeros(viewmats.shape), intrinsics.new_zeros(intrinsics.shape)
-    results = by_means, by_quats, by_scales, *(of_cameras if with_cameras else (None, None))
+def _project_backward(x: Backward) -> Sequence[Tensor | None]:
+    *gaussians, size, limits, antialiased = x.inputs
+    means, quats, scales, _, *cameras = gaussians
+    by_gaussians = [empty_like(y) for y in (means, quats, scales)]
+    wanted = x.needs[3] or x.needs[4]
+    by_cameras = [y.new_zeros(y.shape) if wanted else None for y in cameras]
+    results = *by_gaussians, *by_cameras
     settings = _settings(size, limits, antialiased)
-    launch(means, "project_backward", _arrays(*gaussians), settings, radii, tuple(grads), results)
-    return by_means, by_quats, by_scales, *of_cameras
+    given = _arrays(*gaussians), settings, *x.outputs, tuple(x.grads), results
+    launch(means, "project_backward", *given)
+    return results
 
 
-project_backward_op = register("project_backward", _project_backward)
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *tensors, ctx.size, ctx.limits, ctx.antialiased = inputs
-    ctx.save_for_backward(*tensors, output[4])
-    ctx.mark_non_differentiable(output[4])
-
-
-def _backward(
-    ctx: Any,
-    g_means2d: Tensor,
-    g_depths: Tensor,
-    g_factors: Tensor,
-    g_compensations: Tensor,
-    _: Tensor | None,
-) -> tuple[Tensor | None, ...]:
-    *gaussians, radii = ctx.saved_tensors
-    with_cameras = any(ctx.needs_input_grad[4:6])
-    grads = [g_means2d, g_depths, g_factors, g_compensations]
-    *out, g_viewmats, g_intrinsics = project_backward_op(
-        gaussians, radii, grads, ctx.size, ctx.limits, ctx.antialiased, with_cameras
-    )
-    of_cameras = (g_viewmats, g_intrinsics) if with_cameras else (None, None)
-    return *out, None, *of_cameras, None, None, None
-
-
-project_op = register("project", _project, gradient=Gradient(_save, _backward))
+project_op = differentiable(
+    "project",
+    _project,
+    _project_backward,
+    "means quats scales viewmats intrinsics",
+    keeps=[4],
+    constant=[4],
+)
 
 
 def project(

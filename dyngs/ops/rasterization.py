@@ -6,11 +6,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +18,15 @@ from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import REMEDY, check_memory, check_number, check_size
 from dyngs.ops.native import num_threads
 from dyngs.ops.projection import Projection
-from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register, shapes_only
+from dyngs.ops.registration import (
+    Backward,
+    Struct,
+    differentiable,
+    empty_like,
+    launch,
+    register,
+    shapes_only,
+)
 
 TILE = 16
 MAX_CHANNELS = 40
@@ -195,18 +202,11 @@ def _blend(
     return image
 
 
-def _blend_backward(
-    splats: list[Tensor],
-    background: Tensor | None,
-    entries: list[Tensor],
-    image: list[Tensor],
-    grads: list[Tensor],
-    size: list[int],
-    thresholds: list[float],
-    absgrad: bool,
-    with_probe: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    means2d, factors, opacities, colors, radii = splats
+def _blend_backward(x: Backward) -> Sequence[Tensor | None]:
+    means2d, factors, opacities, colors, background, _, radii = x.inputs[:7]
+    *entries, size, thresholds, absgrad = x.inputs[7:]
+    transmittance, stop = x.outputs
+    by_color, by_transmittance = x.grads
     pairs = entries[3].shape[0]
     fields = MOMENTS + colors.shape[2] + 2 * absgrad
     check_memory(
@@ -214,71 +214,27 @@ def _blend_backward(
         f"the gradients of {pairs} (Gaussian, tile) pairs",
         colors,
     )
-    by_means2d, by_factors, by_opacities, by_colors = out = [
-        empty_like(x) for x in (means2d, factors, opacities, colors)
-    ]
-    probe = means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0)
+    out = [empty_like(y) for y in (means2d, factors, opacities, colors)]
+    by_probe = means2d.new_empty(*opacities.shape, 4) if x.needs[5] else None
     given = _arrays(means2d, factors, opacities, radii), colors, background, tuple(entries)
     with _refusals("rasterize, backward"):
         settings = _settings(size, thresholds)
-        results = (*out, probe if with_probe else None)
-        launch(colors, "rasterize_backward", *given, settings, (*grads, *image), results, absgrad)
-    return by_means2d, by_factors, by_opacities, by_colors, probe
+        images = by_color, by_transmittance, transmittance, stop
+        launch(colors, "rasterize_backward", *given, settings, images, (*out, by_probe), absgrad)
+    by_background = None
+    if x.needs[4]:
+        by_background = torch.einsum("vhw,vhwd->vd", transmittance, by_color)
+    return *out, by_background, by_probe
 
 
-blend_backward_op = register("blend_backward", _blend_backward)
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    (
-        means2d,
-        factors,
-        opacities,
-        colors,
-        background,
-        _,
-        radii,
-        *entries,
-        ctx.size,
-        ctx.thresholds,
-        ctx.absgrad,
-    ) = inputs
-    _, transmittance, stop = output
-    ctx.mark_non_differentiable(stop)
-    ctx.has_background = background is not None
-    kept = [background] if ctx.has_background else []
-    ctx.save_for_backward(
-        means2d, factors, opacities, colors, radii, transmittance, stop, *entries, *kept
-    )
-
-
-def _backward(
-    ctx: Any, g_color: Tensor, g_transmittance: Tensor, _: Tensor | None
-) -> tuple[Tensor | None, ...]:
-    saved = ctx.saved_tensors
-    splats = list(saved[:5])
-    image = list(saved[5:7])
-    entries = list(saved[7:11])
-    background = saved[11] if ctx.has_background else None
-    with_probe = ctx.needs_input_grad[5]
-    *out, probe = blend_backward_op(
-        splats,
-        background,
-        entries,
-        image,
-        [g_color, g_transmittance],
-        ctx.size,
-        ctx.thresholds,
-        ctx.absgrad,
-        with_probe,
-    )
-    g_background = None
-    if ctx.needs_input_grad[4]:
-        g_background = torch.einsum("vhw,vhwd->vd", image[0], g_color)
-    return *out, g_background, probe if with_probe else None, *[None] * 8
-
-
-blend_op = register("blend", _blend, gradient=Gradient(_save, _backward))
+blend_op = differentiable(
+    "blend",
+    _blend,
+    _blend_backward,
+    "means2d factors opacities colors background probe",
+    keeps=[1, 2],
+    constant=[2],
+)
 
 
 def _tally(

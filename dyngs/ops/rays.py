@@ -7,6 +7,7 @@ R rays, M samples. The samples of a ray lie next to each other, from ``offsets[r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, empty_like, launch, register
+from dyngs.ops.registration import Backward, differentiable, empty_like, launch, register
 
 TRANSMITTANCE_MIN = 1e-4  # A ray ends when less than this is left (Müller et al. 2022)
 
@@ -244,45 +245,18 @@ def _composite(
     return out
 
 
-def _composite_backward(
-    samples: list[Tensor], grads: list[Tensor], transmittance_min: float
-) -> tuple[Tensor, Tensor]:
-    g_densities = empty_like(samples[0])
-    g_colours = empty_like(samples[1])
-    results = g_densities, g_colours
-    launch(
-        samples[0],
-        "composite_backward",
-        *samples,
-        transmittance_min,
-        tuple(grads),
-        *results,
-        num_threads(),
-    )
-    return g_densities, g_colours
+def _composite_backward(x: Backward) -> Sequence[Tensor]:
+    *samples, transmittance_min = x.inputs
+    densities, colours, *_ = samples
+    results = empty_like(densities), empty_like(colours)
+    given = *samples, transmittance_min, tuple(x.grads)
+    launch(densities, "composite_backward", *given, *results, num_threads())
+    return results
 
 
-composite_backward_op = register("composite_backward", _composite_backward)
-"""Gradients by densities and colours; ``samples`` are the first five inputs of ``composite``."""
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *samples, ctx.transmittance_min = inputs
-    ctx.mark_non_differentiable(output[3])
-    ctx.save_for_backward(*samples)
-
-
-def _backward(
-    ctx: Any, colour: Tensor, transmittance: Tensor, depth: Tensor, _: Tensor
-) -> tuple[Tensor | None, ...]:
-    grads = [x.contiguous() for x in (colour, transmittance, depth)]
-    by_densities, by_colours = composite_backward_op(
-        list(ctx.saved_tensors), grads, ctx.transmittance_min
-    )
-    return by_densities, by_colours, None, None, None, None
-
-
-composite_op = register("composite", _composite, gradient=Gradient(_save, _backward))
+composite_op = differentiable(
+    "composite", _composite, _composite_backward, "densities colours", constant=[3]
+)
 """Colour (R, 3), transmittance (R,), sum of weight times distance (R,), and weights (M,)."""
 
 

@@ -1,7 +1,7 @@
 """Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
 
-``register`` takes an implementation, whose type hints are the schema, and the formula of its
-gradient. An implementation allocates its results and has them filled by ``launch``, which does
+``register`` takes an implementation, whose type hints are the schema; ``differentiable`` takes that
+of the gradient, too. An implementation allocates its results and has them filled by ``launch``, which does
 nothing where only shapes are needed (``torch.compile``). The compiled cores for CPU and CUDA have
 the same functions, so that one implementation serves both. ``torch.library.custom_op`` would do the
 same, but imports ``torch._dynamo`` when the first op is made: 2 s.
@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from types import ModuleType
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -61,27 +62,99 @@ def register(
     ``mutates``: arguments that it writes to.
     """
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
-    qualified = f"{NAMESPACE}::{name}"
-    _LIBRARY.define(name + schema)
-    torch.library.register_fake(qualified, _shapes_of(kernel), lib=_LIBRARY)
-    # for every device that has none of its own
-    _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")
-    _kernels[name] = {"meta"}
-    for device in devices:
-        if device != "cuda" or has_cuda_core():
-            implement(name, device, kernel)
-    op = getattr(getattr(torch.ops, NAMESPACE), name).default
+    op = _defined(name, schema, kernel, devices)
     if gradient is not None:
-        formula = _first_order(qualified, gradient.backward)
+        formula = _first_order(f"{NAMESPACE}::{name}", gradient.backward)
         if re.search(r"Tensor\??\[\]", schema):  # lists of tensors, which autograd has no place for
             torch.library.register_autograd(
-                qualified, formula, setup_context=gradient.save, lib=_LIBRARY
+                f"{NAMESPACE}::{name}", formula, setup_context=gradient.save, lib=_LIBRARY
             )
         else:
             _LIBRARY.impl(
                 name, _with_gradient(op, gradient.save, formula), "Autograd", with_keyset=True
             )
     return cast(Callable[P, R], op)
+
+
+def _defined(
+    name: str, schema: str, kernel: Callable[..., object], devices: tuple[str, ...]
+) -> Any:
+    """Return the new op with an implementation for ``devices``, and an error elsewhere."""
+    _LIBRARY.define(name + schema)
+    torch.library.register_fake(f"{NAMESPACE}::{name}", _shapes_of(kernel), lib=_LIBRARY)
+    # for every device that has none of its own
+    _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")
+    _kernels[name] = {"meta"}
+    for device in devices:
+        if device != "cuda" or has_cuda_core():
+            implement(name, device, kernel)
+    return getattr(getattr(torch.ops, NAMESPACE), name).default
+
+
+class Backward(NamedTuple):
+    """What the implementation of a gradient computes from."""
+
+    inputs: Sequence[Any]  # of the forward pass
+    outputs: Sequence[Tensor]  # those of the forward pass that ``differentiable`` keeps
+    grads: Sequence[Tensor]  # by the differentiable outputs
+    needs: Sequence[bool]  # whether each of the gradients is asked for
+
+
+def differentiable(
+    name: str,
+    kernel: Callable[P, R],
+    backward: Callable[[Backward], Sequence[Tensor | None]],
+    by: str,
+    *,
+    keeps: Sequence[int] = (),
+    constant: Sequence[int] = (),
+) -> Callable[P, R]:
+    """Return the op ``NAME`` as ``register`` does; its gradient is the op ``NAME_backward``.
+
+    Args:
+        kernel: takes no lists of tensors.
+        backward: implementation that returns the gradients by the inputs named in ``by``, in this
+            order; what is not asked for may be None.
+        keeps: outputs that ``backward`` needs.
+        constant: outputs without a gradient.
+    """
+    schema = torch.library.infer_schema(kernel, mutates_args=())
+    arguments = schema[1 : schema.index(") ->")]
+    names = list(signature(kernel).parameters)
+    places = [names.index(one) for one in by.split()]
+
+    def run(*given: Any) -> list[Tensor]:
+        *inputs, outputs, grads, needs = given
+        found = backward(Backward(inputs, outputs, grads, needs))
+        return [x for x, wanted in zip(found, needs, strict=True) if wanted and x is not None]
+
+    extra = "Tensor[] outputs, Tensor[] grads, bool[] needs"
+    backward_op = _defined(
+        f"{name}_backward", f"({arguments}, {extra}) -> Tensor[]", run, ("cpu", "cuda")
+    )
+
+    def save(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        outputs = cast("tuple[Tensor, ...]", output if isinstance(output, tuple) else (output,))
+        ctx.mark_non_differentiable(*(outputs[i] for i in constant))
+        ctx.tensors = [i for i, x in enumerate(inputs) if isinstance(x, Tensor)]
+        ctx.others = [None if isinstance(x, Tensor) else x for x in inputs]
+        kept = [outputs[i] for i in keeps]
+        ctx.save_for_backward(*(inputs[i] for i in ctx.tensors), *kept)
+
+    def gradient(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        saved = list(ctx.saved_tensors)
+        inputs = list(ctx.others)
+        for i in ctx.tensors:
+            inputs[i] = saved.pop(0)
+        by_outputs = [g for i, g in enumerate(grads) if i not in constant]
+        needs = [ctx.needs_input_grad[i] for i in places]
+        found = iter(backward_op(*inputs, saved, by_outputs, needs))
+        results: list[Tensor | None] = [None] * len(inputs)
+        for i, wanted in zip(places, needs, strict=True):
+            results[i] = next(found) if wanted else None
+        return tuple(results)
+
+    return register(name, kernel, gradient=Gradient(save, gradient))
 
 
 def _with_gradient(

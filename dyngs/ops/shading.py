@@ -10,13 +10,13 @@ narrow arrays.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, launch, register
+from dyngs.ops.registration import Backward, differentiable, launch
 
 
 @dataclass(frozen=True)
@@ -72,15 +72,12 @@ def _shading(
     return out
 
 
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.begin = 6 + 4 * inputs[-1]
+def _shading_backward(x: Backward) -> Sequence[Tensor]:
+    begin = 6 + 4 * x.inputs[-1]
+    return [x.grads[0][:, begin : begin + 3].clone()]
 
 
-def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    return grad[:, ctx.begin : ctx.begin + 3], *[None] * 10
-
-
-shading_op = register("shading_inputs", _shading, gradient=Gradient(_save, _backward))
+shading_op = differentiable("shading_inputs", _shading, _shading_backward, "base")
 """Inputs (M, K) of a colour network; ``rest`` and ``turn`` are both there or both None."""
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +15,7 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError
 from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, InPlace, launch, register
+from dyngs.ops.registration import Backward, InPlace, differentiable, launch, register
 
 
 def _skinning(
@@ -44,55 +43,19 @@ def _skinning(
     return results
 
 
-def _skinning_backward(
-    nodes: list[Tensor],
-    points: Tensor,
-    followed: Tensor,
-    weights: Tensor,
-    grads: list[Tensor],
-    with_points: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    _, _, motion, values = nodes
-    g_points = points.new_empty(points.shape if with_points else (0,))
-    g_motion = points.new_empty(motion.shape)
-    g_values = points.new_empty(values.shape)
-    results = g_points if with_points else None, g_motion, g_values
-    launch(
-        points,
-        "skinning_backward",
-        nodes,
-        (points, followed),
-        (*grads, weights),
-        *results,
-        num_threads(),
-    )
-    return g_points, g_motion, g_values
+def _skinning_backward(x: Backward) -> Sequence[Tensor | None]:
+    points, positions, radii, followed, motion, values = x.inputs
+    by_points = points.new_empty(points.shape) if x.needs[0] else None
+    results = by_points, points.new_empty(motion.shape), points.new_empty(values.shape)
+    nodes = positions, radii, motion, values
+    given = nodes, (points, followed), (*x.grads, *x.outputs)
+    launch(points, "skinning_backward", *given, *results, num_threads())
+    return results
 
 
-skinning_backward_op = register("skinning_backward", _skinning_backward)
-"""Gradients by the points, empty unless asked for, and by motion and values of the nodes; ``nodes``
-are positions, radii, motion and values, ``grads`` those by offsets and blended values."""
-
-
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    points, positions, radii, followed, motion, values = inputs
-    ctx.mark_non_differentiable(output[2])
-    ctx.save_for_backward(points, positions, radii, followed, motion, values, output[2])
-
-
-def _backward(
-    ctx: Any, g_offset: Tensor, g_blended: Tensor, _: Tensor | None
-) -> tuple[Tensor | None, ...]:
-    points, positions, radii, followed, motion, values, weights = ctx.saved_tensors
-    with_points = ctx.needs_input_grad[0]
-    nodes = [positions, radii, motion, values]
-    g_points, g_motion, g_values = skinning_backward_op(
-        nodes, points, followed, weights, [g_offset, g_blended], with_points
-    )
-    return g_points if with_points else None, None, None, None, g_motion, g_values
-
-
-skinning_op = register("skinning", _skinning, gradient=Gradient(_save, _backward))
+skinning_op = differentiable(
+    "skinning", _skinning, _skinning_backward, "points motion values", keeps=[2], constant=[2]
+)
 """Offsets (M, 3), blended values (M, D), and the weights (M, B) of the nodes."""
 
 

@@ -19,6 +19,7 @@ from dyngs.core.errors import DyngsError, counted
 from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
@@ -33,7 +34,6 @@ from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""

@@ -14,7 +14,7 @@ from dyngs.core.camera import Cameras
 from dyngs.data.aim import look_at_point
 from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader
-from dyngs.export.chosen_path import orbit_around, points_at
+from dyngs.export.choose_path import orbit_around, points_at
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, scene_of_split
 

@@ -13,13 +13,13 @@ from torch.nn import functional
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
-from dyngs.export.camera_paths.path import resize_cameras
-from dyngs.export.contact_sheet import color_map, depth_to_rgb
+from dyngs.export.camera_paths import resize_cameras
+from dyngs.export.images import color_map, depth_to_rgb
+from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
-from dyngs.static.levels import LevelScene
 from dyngs.view.captured_views import views_of
 
 Layer = Literal["colour", "depth", "alpha", "motion", "filled", "error"]

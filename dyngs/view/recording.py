@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.camera import Cameras
-from dyngs.export.camera_paths.keyframes import Keyframes, interpolate_keyframes
-from dyngs.export.camera_paths.path import world_pose
+from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, world_pose
 from dyngs.io.formats.similarity import Similarity
 
 

@@ -7,7 +7,6 @@ import json
 import signal
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,22 +16,18 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
+from dyngs.api.choose import as_static
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig, DynamicModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
-    DynamicOptions,
     StillOptions,
-    write_dynamic_capture,
     write_still_capture,
 )
 from dyngs.gaussians.rendering import render
-from dyngs.runs.folder import CHOICES_NAME
 from dyngs.training.trainer import Trainer
 
 LONG = "train.steps=200_000"
@@ -89,9 +84,7 @@ def test_as_static_is_the_static_preset_with_what_was_requested(
 
 def write_rolling_ball(root: Path) -> None:
     """32 images of 24 px of a ball that goes 1.6 along x, at eight times, from everywhere."""
-    write_still_capture(
-        root, StillOptions(size=24, num_train=32, num_test=1, samples=1, distance=4.0)
-    )
+    write_still_capture(root, StillOptions(size=24, num_train=32, num_test=1, samples=1))
     views = read_capture(DataConfig(root=root)).splits["train"]
     for split, times in (("train", [i % 8 / 7 for i in range(32)]), ("test", [0.5])):
         file = root / f"transforms_{split}.json"
@@ -162,5 +155,3 @@ def test_a_trial_that_is_interrupted_leaves_nothing_and_has_the_same_end_again(
     assert not list(run.glob("*"))
     chosen = [decided(config) for _ in range(2)]
     assert replace(chosen[0][1][0], seconds=0) == replace(chosen[1][1][0], seconds=0)
-
-

@@ -9,7 +9,7 @@ import torch
 
 import dyngs
 from dyngs.api.load import load
-from dyngs.export.scene_file import write_scene_file
+from dyngs.api.scene_file import write_scene_file
 from dyngs.export.splat_files import write_run_splats
 from dyngs.runs.avatar import write_avatar
 from dyngs.runs.checkpoint import load_run

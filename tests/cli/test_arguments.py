@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from dyngs.cli import main, make_parser
-from dyngs.cli.arguments import input_path, input_word, output_path, print_written
+from dyngs.cli.arguments import input_path, input_word, output_path
+from dyngs.cli.output import print_written
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.view.source import open_source
 

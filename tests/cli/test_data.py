@@ -14,7 +14,7 @@ from motion_files import Clip, as_local, glb_of, pelvis_path, random_motion, ske
 from refused import error_line
 from tiny_captures import write_colmap
 
-from dyngs.cli import data, main
+from dyngs.cli import main
 from dyngs.config import DataConfig
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
@@ -189,7 +189,7 @@ def test_a_person_is_synthesised_and_inspected(tmp_path: Path, capsys: PrintedOu
     out = tmp_path / "new"
     words = ["--size", "12", "--views", "2", "--cameras", "3", "--seed", "4"]
     assert main(["data", "synth", "human", str(out), *words]) == 0
-    assert f"dyngs train configs/human.yaml data.root={out}" in capsys.readouterr().out
+    assert f"dyngs train human data.root={out}" in capsys.readouterr().out
     capture = read_capture(DataConfig(root=out))  # type: ignore[call-arg]
     assert {(view.frame, view.camera_id) for view in capture.splits["train"]} == {
         (f, c) for f in (0, 1) for c in range(3)
@@ -210,7 +210,6 @@ def test_people_are_synthesised(tmp_path: Path, capsys: PrintedOutput) -> None:
         people = captures_in(DataConfig(root=out))
         captures = [read_capture(person) for person in people]
         assert [sum(map(len, capture.splits.values())) for capture in captures] == [3] * count
-    assert "leave them out" in error_line(capsys, *words, "2", "--varied")
     assert "other options" in error_line(capsys, *words, "2", "--seed", "5")
     assert "--people" in error_line(
         capsys, "data", "synth", "human", str(tmp_path / "x"), "--people", "2"
@@ -229,33 +228,6 @@ def test_a_person_is_refused_in_one_line(
     assert len(lines) == 1
     assert part in lines[0]
     assert not (tmp_path / "new").exists()
-
-
-def test_a_varied_person_has_a_shape_of_its_own(tmp_path: Path, capsys: PrintedOutput) -> None:
-    words = [
-        "--size",
-        "8",
-        "--views",
-        "1",
-        "--cameras",
-        "2",
-        "--seed",
-        "4",
-        "--varied",
-        "--usual-clothes",
-    ]
-    assert main(["data", "synth", "human", str(tmp_path / "new"), *words]) == 0
-    capture = read_capture(DataConfig(root=tmp_path / "new"))  # type: ignore[call-arg]
-    assert capture.body is not None
-    assert np.abs(capture.body["train"].betas).max() > 0
-    capsys.readouterr()
-    assert "human only" in error_line(
-        capsys, "data", "synth", "still", str(tmp_path / "other"), "--varied"
-    )
-
-
-def test_the_scene_is_listed() -> None:
-    assert "human" in data.SYNTHETIC_SCENES
 
 
 def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> None:

@@ -6,8 +6,8 @@ import io
 
 import pytest
 
-from dyngs.cli import progress_bar
-from dyngs.cli.progress_bar import ProgressBar
+from dyngs.cli import output
+from dyngs.cli.output import ProgressBar
 
 
 class _Terminal(io.StringIO):
@@ -46,7 +46,7 @@ def test_short_work_prints_nothing_where_there_is_no_terminal() -> None:
 
 def test_long_work_prints_lines_with_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(0, 1000, 6))
-    monkeypatch.setattr(progress_bar.time, "monotonic", lambda: float(next(clock)))
+    monkeypatch.setattr(output.time, "monotonic", lambda: float(next(clock)))
     stream = io.StringIO()
     with ProgressBar(stream) as report:
         for i in range(5):

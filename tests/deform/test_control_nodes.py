@@ -7,19 +7,17 @@ import math
 from itertools import pairwise
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
-from tiny_fields import HEADS, cloud, stirred_field, tiny_setup
+from tiny_fields import HEADS, cloud, tiny_setup
 from torch import Tensor
 
 from dyngs.config import ControlNodesField
 from dyngs.core.state import tensors_of
-from dyngs.deform.control_nodes import SMOOTHNESS, ControlNodes
-from dyngs.deform.field import Offsets
+from dyngs.deform.control_nodes import ControlNodes
 from dyngs.gaussians import TopologyEdit
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)
@@ -59,19 +57,6 @@ def hold(field: ControlNodes, name: str, values: Tensor) -> None:
     """Let all nodes keep ``values`` (S, size) of one head at all times: all control points are
     equal."""
     field.parameters[name].data[:] = values[:, None]
-
-
-def outputs(offsets: Offsets) -> Tensor:
-    parts = [x.detach() for x in vars(offsets).values() if x is not None]
-    return torch.cat([x.reshape(len(x), -1) for x in parts], dim=1)
-
-
-@pytest.mark.parametrize(
-    ("num_times", "pieces"), [(2, 1), (5, 2), (10, 3), (100, 30), (10_000, 256)]
-)
-def test_pieces_follow_the_number_of_times(num_times: int, pieces: int) -> None:
-    assert control_nodes(pieces=0, num_times=num_times).num_pieces == pieces
-    assert control_nodes(pieces=7, num_times=num_times).num_pieces == 7
 
 
 @settings(max_examples=40, deadline=None)
@@ -144,19 +129,6 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(
         assert all(len(x) == len(positions) for x in tensors_of(field.parameters.state()).values())
 
 
-def test_an_edited_field_leaves_the_other_as_it_was() -> None:
-    """Also when nodes are placed anew: a scene and its parts may be drawn in turns."""
-    means = cloud().means
-    rows = torch.tensor([2, 5, 5, 7])
-    field = stirred_field("control_nodes")
-    before = outputs(field.offsets(means, 0.3))
-    part = field.edited(TopologyEdit.select(rows))
-    assert torch.equal(outputs(part.offsets(means[rows], 0.3)), before[rows])
-    part.regroup()
-    part.offsets(means[rows], 0.3)
-    assert torch.equal(outputs(field.offsets(means, 0.3)), before)
-
-
 def test_new_nodes_start_with_the_motion_found_there() -> None:
     """A field that moves rigidly moves the newcomers alike, and the others as before."""
     means = cloud(30).means
@@ -196,27 +168,6 @@ def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
     assert not state["exp_avg.means"][1].any()
 
 
-def test_when_nothing_is_left_there_is_nothing_to_move() -> None:
-    """Also after nodes were placed."""
-    nobody = torch.zeros(0, 3)
-    field = control_nodes()
-    assert len(field.offsets(nobody, 0.5).means) == 0
-    field = placed(cloud().means)
-    field = changed(field, torch.zeros(0).long(), torch.zeros(0).bool())
-    offsets = field.offsets(nobody, 0.5)
-    assert offsets.means.shape == (0, 3)
-    assert offsets.quats is not None
-    assert offsets.quats.shape == (0, 4)
-
-
-def test_nodes_stay_while_the_set_does() -> None:
-    means = cloud().means
-    field = placed(means)
-    before = {name: x.clone() for name, x in field.buffers.items()}
-    field.offsets(means + 0.05, 0.7)
-    assert all(torch.equal(x, before[name]) for name, x in field.buffers.items())
-
-
 # --- times not seen yet
 # -----------------------------------------------------------------------------------------------
 
@@ -232,14 +183,6 @@ def test_motion_goes_on_at_constant_velocity() -> None:
     assert points_of(field)[[0, -1]].tolist() == [-4.5, 13.5], (
         "with all times seen the ends are free"
     )
-
-
-def test_of_a_single_moment_there_is_no_velocity() -> None:
-    """Cameras of a rig: the first window may be one time."""
-    field = placed(cloud().means, pieces=4)
-    field.parameters["means"].data[0, :, 0] = torch.tensor([0.0, 0, 0, 3, 0, 0, 0])
-    field.extend((0.5, 0.5), (0.0, 1.0))
-    assert points_of(field).tolist() == [3.0] * 7
 
 
 @example(pieces=1, strays=[0.49999999999999994])  # 0.5 more than this is 1
@@ -265,49 +208,6 @@ def test_uniform_motion_goes_on(pieces: int, strays: list[float]) -> None:
 
 # --- penalties
 # --------------------------------------------------------------------------------------------------------
-
-
-def test_uniform_motion_has_no_acceleration_and_a_shift_no_strain() -> None:
-    field = placed(cloud().means, nodes=4, pieces=3)
-    field.parameters["means"].data[:] = torch.arange(6.0)[None, :, None]
-    penalties = field.penalties(0.3)
-    assert penalties.keys() == {"node acceleration", "node rigidity"}
-    assert float(penalties["node acceleration"].detach()) == pytest.approx(0.0, abs=1e-10)
-    assert float(penalties["node rigidity"].detach()) == pytest.approx(0.0, abs=1e-10)
-
-
-def test_known_penalties() -> None:
-    """Two nodes 2 apart; one control point is 6 farther away: in the middle of the piece 1/6 of
-    that counts."""
-    means = torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
-    field = placed(means, nodes=2, pieces=1, rigidity=1.0)
-    right = int(field.buffers["positions"][:, 0].argmax())
-    field.parameters["means"].data[right, 0, 0] = 6.0
-    assert float(field.penalties(0.0)["node rigidity"].detach()) == pytest.approx(0.25)
-    assert float(field.penalties(1.0)["node rigidity"].detach()) == 0.0
-    acceleration = 3**2 / 12  # second differences 6 / 2 and 0 along one of 2 x 3 coordinates
-    assert float(field.penalties(0.5)["node acceleration"].detach()) == pytest.approx(
-        SMOOTHNESS * acceleration
-    )
-    field.penalties(0.0)["node rigidity"].backward()
-    grad = field.parameters["means"].grad
-    assert grad is not None
-    away = grad[right, :, 0]
-    assert away.tolist() == pytest.approx([0.5 / 6, 0.5 * 4 / 6, 0.5 / 6, 0.0])
-    torch.testing.assert_close(grad[1 - right, :, 0], -away)
-
-
-def test_no_penalties_where_none_are_wanted_or_possible() -> None:
-    assert placed(cloud().means, rigidity=0.0).penalties(0.3).keys() == {"node acceleration"}
-    assert placed(cloud().means, nodes=1).penalties(0.3) == {}
-    assert control_nodes().penalties(0.3) == {}
-
-
-def test_the_place_of_a_gaussian_matters() -> None:
-    field = stirred_field("control_nodes")
-    found = outputs(field.offsets(cloud().means, 0.6))
-    assert not torch.allclose(found[0], found[1])
-    assert not torch.allclose(found, outputs(field.offsets(cloud().means, 0.1)))
 
 
 # --- rigid groups

@@ -29,23 +29,6 @@ def field_of(
     return FreePrimitives(FreeField(), tiny_setup(len(centers)), torch.Generator()).started(start)
 
 
-def opacity(field: FreePrimitives, logit: float, time: float) -> float:
-    window = field.offsets(torch.zeros(1, 3), time).logit_opacities
-    assert window is not None
-    return float((logit + window.detach()).sigmoid())
-
-
-def test_what_is_opaque_is_so_for_most_of_its_window() -> None:
-    """Of opacity 0.98 it is above 0.9 up to 1.8 spans, below 1/255 from 4.4 on; a faint one fades
-    like a Gaussian."""
-    field = field_of([0.5], [0.1], [[0.0, 0.0, 0.0]])
-    assert opacity(field, 4.0, 0.5) == pytest.approx(0.982, abs=1e-3)
-    assert opacity(field, 4.0, 0.5 + 0.18) > 0.9
-    assert opacity(field, 4.0, 0.5 - 0.18) > 0.9
-    assert opacity(field, 4.0, 0.5 + 0.44) < 1 / 255
-    assert opacity(field, -4.0, 0.6) / opacity(field, -4.0, 0.5) == pytest.approx(0.61, abs=0.01)
-
-
 def test_paths_are_straight_and_windows_follow_their_definition() -> None:
     """In float64, next to the formulas written out, and gradients next to finite differences."""
     field = field_of([0.2, 0.8], [0.1, 0.3], [[1.0, 0.0, 0.0], [0.0, -2.0, 0.5]])

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,9 +12,7 @@ from tiny_fields import cloud, stirred_field, tiny_field, tiny_options, tiny_set
 from torch import Tensor
 
 from dyngs.config import HexplaneField
-from dyngs.core.state import tensors_of
-from dyngs.deform.hexplane import Hexplane, time_rows
-from dyngs.gaussians import TopologyEdit
+from dyngs.deform.hexplane import Hexplane
 
 
 def field_with_rows(rows: int) -> Hexplane:
@@ -44,14 +41,6 @@ def outputs_at(field: Hexplane, means: Tensor, time: float) -> Tensor:
     return torch.cat([x.detach().reshape(len(means), -1) for x in offsets if x is not None], dim=1)
 
 
-@pytest.mark.parametrize(
-    ("num_times", "rows"), [(2, 2), (3, 2), (4, 2), (5, 3), (48, 24), (300, 150)]
-)
-def test_half_as_many_rows_as_times_and_at_least_two(num_times: int, rows: int) -> None:
-    assert time_rows(HexplaneField(), num_times) == rows
-    assert time_rows(HexplaneField(time_resolution=25), num_times) == 25
-
-
 def test_planes_start_as_published() -> None:
     """Space uniform in [0.1, 0.5], time at 1; as many rows as the clip asks for."""
     field = tiny_field("hexplane")
@@ -62,26 +51,6 @@ def test_planes_start_as_published() -> None:
         assert (level.time == 1).all()
         assert 0.1 <= level.space.min() < 0.15
         assert 0.45 < level.space.max() <= 0.5
-
-
-def test_outside_the_box_the_field_is_that_of_its_border() -> None:
-    field = stirred_field("hexplane")
-    assert isinstance(field, Hexplane)
-    means = 3 * cloud(20).means
-    inside = means.clamp(-2, 2)  # the box of tiny_setup
-    assert (means != inside).any()
-    torch.testing.assert_close(outputs_at(field, means, 0.4), outputs_at(field, inside, 0.4))
-
-
-def test_the_field_depends_on_place_and_time_smoothly() -> None:
-    field = stirred_field("hexplane")
-    means = cloud().means
-    assert isinstance(field, Hexplane)
-    here = outputs_at(field, means, 0.4)
-    later = outputs_at(field, means, 0.4001)
-    assert 0 < (later - here).abs().max() < 1e-2
-    moved = outputs_at(field, means + 1e-4, 0.4)
-    assert 0 < (moved - here).abs().max() < 1e-2
 
 
 def test_the_last_time_is_the_last_row() -> None:
@@ -99,19 +68,6 @@ def test_the_last_time_is_the_last_row() -> None:
         level.time.data[:, 0] += 1.0
     torch.testing.assert_close(outputs_at(field, means, 1.0), ends[1])
     assert (outputs_at(field, means, 0.0) - ends[0]).abs().max() > 0.01
-
-
-def test_extend_copies_the_outermost_trained_rows_to_the_next() -> None:
-    field = field_with_rows(11)
-    field.extend((0.4, 0.6), (0.2, 0.8))
-    assert rows_of(field) == [0, 1, 4, 4, 4, 5, 6, 6, 6, 9, 10]
-    field = field_with_rows(11)
-    field.extend((0.43, 0.57), (0.29, 0.71))  # rows 4 and 6 took part at 0.43 and 0.57
-    assert rows_of(field) == [0, 1, 4, 4, 4, 5, 6, 6, 6, 9, 10]
-    field = field_with_rows(11)
-    field.extend((0.4, 0.6), (0.4, 0.6))
-    field.extend((0.0, 1.0), (0.0, 1.0))
-    assert rows_of(field) == list(range(11))
 
 
 @settings(max_examples=60, deadline=None)
@@ -134,20 +90,6 @@ def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(
     }
 
 
-def test_extend_makes_the_motion_stand_still_beyond_what_was_seen() -> None:
-    options = tiny_options("hexplane").model_copy(update={"time_resolution": 11})
-    assert isinstance(options, HexplaneField)
-    field = Hexplane(options, tiny_setup(), torch.Generator().manual_seed(0))
-    for x in field.parameters.values().values():
-        x += 0.2 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1))
-    means = cloud().means
-    inside, first, last = (outputs_at(field, means, t) for t in (0.5, 0.4, 0.6))
-    field.extend((0.4, 0.6), (0.0, 1.0))
-    assert torch.equal(outputs_at(field, means, 0.5), inside)
-    for time, border in ((0.31, first), (0.0, first), (0.69, last), (1.0, last)):
-        torch.testing.assert_close(outputs_at(field, means, time), border)
-
-
 def test_penalties_vanish_on_smooth_planes_only() -> None:
     """Second differences of planes that are linear in each axis, and the distance of the planes
     with time from 1."""
@@ -166,22 +108,3 @@ def test_penalties_vanish_on_smooth_planes_only() -> None:
     assert not grad[2].any() or bool((field.parameters["time0"][2] != 1).any())
     field.levels[0].time.data[1, 2] += 0.1
     assert field.penalties(0.3)["plane smoothness"].detach() > rough.detach()
-
-
-def test_select_changes_nothing() -> None:
-    field = stirred_field("hexplane")
-    before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
-    field = field.edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
-    assert all(
-        torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items()
-    )
-
-
-@pytest.mark.parametrize(
-    ("num_times", "keys"),
-    [(0, 2), (1, 2), (2, 2), (5, 3), (48, 24), (511, 256), (513, 256), (10**6, 256)],
-)
-def test_time_is_divided_half_as_finely_but_into_no_more_than_256(
-    num_times: int, keys: int
-) -> None:
-    assert time_rows(HexplaneField(), num_times) == keys

@@ -6,13 +6,11 @@ import math
 
 import pytest
 import torch
-from tiny_fields import TIMES, cloud, stirred_field, tiny_field, tiny_setup
+from tiny_fields import cloud, tiny_setup
 
 from dyngs.config import MlpField
-from dyngs.core.state import tensors_of
 from dyngs.deform.field import Offsets
 from dyngs.deform.mlp import SKIP_LAYER, Mlp, encoded
-from dyngs.gaussians import TopologyEdit
 
 
 def outputs(offsets: Offsets) -> list[torch.Tensor]:
@@ -41,33 +39,3 @@ def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
         expected[SKIP_LAYER] += num_inputs
     assert widths == expected
     assert not any(x.any() for x in outputs(field.offsets(cloud().means, 0.3)))
-
-
-def test_it_depends_on_place_and_time() -> None:
-    field = stirred_field("mlp")
-    means = cloud().means
-    at_times = [
-        torch.cat([x.reshape(9, -1) for x in outputs(field.offsets(means, t))], dim=1)
-        for t in TIMES
-    ]
-    assert not torch.allclose(at_times[0], at_times[1])
-    assert not torch.allclose(at_times[1], at_times[2])
-    assert not torch.allclose(at_times[1][0], at_times[1][1])
-
-
-def test_nothing_moving_is_no_error() -> None:
-    offsets = stirred_field("mlp").offsets(torch.zeros(0, 3), 0.5)
-    assert offsets.means.shape == (0, 3)
-    assert offsets.quats is not None
-    assert offsets.quats.shape == (0, 4)
-
-
-def test_extend_and_select_change_no_weight() -> None:
-    field = tiny_field("mlp")
-    before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
-    field.extend((0.4, 0.6), (0.0, 1.0))
-    field = field.edited(TopologyEdit(torch.tensor([1, 1]), torch.tensor([False, True])))
-    assert all(
-        torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items()
-    )
-    assert field.penalties(0.3) == {}

@@ -12,7 +12,7 @@ from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
 from dyngs.deform.field import DeformationField, Offsets, deformed
-from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion
+from dyngs.deform.motion import PX_PER_OPACITY, bake_, measure_motion
 from dyngs.gaussians.parameters import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))
@@ -44,13 +44,6 @@ def still(means: Tensor) -> Tensor:
     return torch.zeros_like(means)
 
 
-def test_a_displacement_counts_in_pixels() -> None:
-    """From -0.3 to 0.3 along x: 0.3 from the mean, over what a pixel covers."""
-    px_size = torch.tensor([0.01, 0.1, 1.0, 0.3])
-    found = score(lambda means, t: Offsets(filled(len(means), 0.6 * t, 0.0, 0.0)), px_size)
-    torch.testing.assert_close(found, 0.3 / px_size)
-
-
 def test_a_circle_counts_by_its_radius() -> None:
     def circle(means: Tensor, t: float) -> Offsets:
         turn = Rotation.from_rotvec([0, 0, 2 * torch.pi * t]).apply([0.2, 0.0, 0.0])
@@ -59,20 +52,6 @@ def test_a_circle_counts_by_its_radius() -> None:
     even = tuple(i / 16 for i in range(16))
     found = measure_motion(Scripted(circle), cloud(4), even, torch.ones(4)).pixels
     torch.testing.assert_close(found, torch.full((4,), 0.2))
-
-
-def test_a_constant_offset_is_no_motion() -> None:
-    def constant(means: Tensor, t: float) -> Offsets:
-        n = len(means)
-        return Offsets(
-            filled(n, 5.0, -3, 1),
-            filled(n, 0.1, 0.2, 0.3, 0.4),
-            filled(n, 1.0, 1, 1),
-            torch.ones(n),
-            still(means),
-        )
-
-    assert score(constant).abs().max() < 1e-5
 
 
 def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
@@ -108,19 +87,6 @@ def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
     torch.testing.assert_close(score(blush, px_size), torch.full((4,), 0.1 * PX_PER_OPACITY))
 
 
-@pytest.mark.parametrize("count", [2, 10, MAX_SAMPLES, 10_000])
-def test_long_clips_are_sampled_evenly(count: int) -> None:
-    times = tuple(i / (count - 1) for i in range(count))
-    field = Scripted(lambda means, t: Offsets(filled(len(means), t, 0.0, 0.0)))
-    motion = measure_motion(field, cloud(4), times, torch.ones(4))
-    assert len(field.asked) == min(count, MAX_SAMPLES)
-    assert (field.asked[0], field.asked[-1]) == (0.0, 1.0)
-    assert set(field.asked) <= set(times)
-    gaps = [b - a for a, b in zip(field.asked, field.asked[1:], strict=False)]
-    assert max(gaps) < 2 * min(gaps) + 1e-9
-    torch.testing.assert_close(motion.pixels, torch.full((4,), 0.5), rtol=1e-3, atol=0)
-
-
 @pytest.mark.parametrize("everything", [True, False])
 def test_baking_freezes_at_the_mean(everything: bool) -> None:
     """Rows that are baked look as the field shows them on average; the others do not change."""
@@ -142,14 +108,3 @@ def test_baking_freezes_at_the_mean(everything: bool) -> None:
     assert torch.equal(baked.means[others], gaussians.means[others])
     bake_(baked, torch.zeros(0).long(), mean.select(torch.zeros(0).long()))
     assert torch.equal(baked.quats.detach(), expected.quats)
-
-
-def test_an_empty_set_has_no_motion() -> None:
-    motion = measure_motion(
-        Scripted(lambda means, t: Offsets(still(means))),
-        cloud().select(torch.zeros(0).long()),
-        TIMES,
-        torch.zeros(0),
-    )
-    assert motion.pixels.shape == (0,)
-    assert motion.mean.means.shape == (0, 3)

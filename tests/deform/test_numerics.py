@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from moving_scene import write_timed_capture
-from scenes import look_around, weights
+from scenes import weights
 from tiny_fields import (
     ALL_KINDS,
     KINDS,
@@ -24,27 +23,19 @@ from tiny_fields import (
 )
 from torch import Tensor
 
-from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
-from dyngs.core.camera import Cameras
+from dyngs.config import DynamicModel, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets, deformed
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
-from dyngs.deform.hexplane import Hexplane, time_rows
-from dyngs.deform.motion import MAX_SAMPLES, measure_motion
+from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.time_window import FRONTIER_VIEWS, TimeWindow
-from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.rendering import render
+from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.restored import restored_scene
-from dyngs.ops.planes import PlaneLevel, hexplane_features
-from dyngs.static.scene import StaticScene
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
-
-LONG = 10_000
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -89,36 +80,6 @@ def timed(capture: Path, times: list[float]) -> Path:
 # ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("time", [0.0, 1.0])
-def test_the_ends_of_the_clip_are_ordinary_times(kind: str, time: float) -> None:
-    """Continuous up to them, and gradients reach all that takes part."""
-    field = stirred_field(kind)
-    means = cloud().means
-    inside = abs(time - 1e-6)
-    torch.testing.assert_close(
-        values(field.offsets(means, time)), values(field.offsets(means, inside)), atol=1e-3, rtol=0
-    )
-    found = values(field.offsets(means, time))
-    (found * weights(found)).sum().backward()
-    grads = [field.parameters[name].grad for name in field.parameters.values()]
-    assert all(x is not None and x.isfinite().all() and x.any() for x in grads)
-
-
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_times_outside_the_clip_are_clamped(kind: str) -> None:
-    scene = scene_of(torch.arange(9), stirred_field(kind))
-    for outside, inside in ((-1e-9, 0.0), (-1e30, 0.0), (1 + 1e-9, 1.0), (float("inf"), 1.0)):
-        assert torch.equal(scene.at(outside).means, scene.at(inside).means)
-
-
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_a_single_training_time_is_a_static_scene(tmp_path: Path, kind: str) -> None:
-    trainer = assemble(busy_config(timed(tmp_path / "capture", [0.5] * 5), tmp_path, kind))
-    assert isinstance(trainer.model.scene, StaticScene)
-    assert trainer.step().loss > 0
-
-
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_two_training_times(tmp_path: Path, kind: str) -> None:
     """Trained on together from the first step on; planes and keys have the least that there can be,
@@ -138,34 +99,6 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
         assert field.levels[0].time.shape[1] == 2
     if isinstance(field, ControlNodes):
         assert field.num_pieces == 1
-
-
-def test_10000_training_times() -> None:
-    """No more than 256 rows or keys; the window and the measure of motion stay cheap, and
-    neighbours are told apart."""
-    assert time_rows(HexplaneField(), LONG) == MAX_KEY_TIMES
-    assert time_rows(HexplaneField(time_resolution=LONG // 2), LONG) == LONG // 2
-    setup = FieldSetup(torch.zeros(3), torch.ones(3), LONG, 3, 1.0)
-    control_nodes = new_field(ControlNodesField(nodes=2), setup, torch.Generator())
-    assert isinstance(control_nodes, ControlNodes)
-    assert control_nodes.num_pieces == MAX_KEY_TIMES
-    times = tuple(i / (LONG - 1) for i in range(LONG))
-    window = TimeWindow.around_middle(times, 0.1, 1000, 1000, 8000)
-    assert sum(window.holds(time, 1001) for time in times) == pytest.approx(LONG / 10, abs=2)
-    assert 0 < sum(window.holds(time, 1002) for time in times) <= FRONTIER_VIEWS + 1
-    asked: list[float] = []
-    field = stirred_field("control_nodes")
-    real = field.offsets
-    field.offsets = lambda means, time: (asked.append(time), real(means, time))[1]  # type: ignore[method-assign]
-    measure_motion(field, cloud(), times, torch.ones(9))
-    assert len(asked) == MAX_SAMPLES
-    ramp = torch.arange(float(LONG // 2))[None, :, None, None].expand(3, -1, 2, 1).contiguous()
-    level = PlaneLevel(torch.ones(3, 2, 2, 1, dtype=torch.float64), ramp.double())
-    nowhere = torch.zeros(1, 3, dtype=torch.float64)
-    rows = torch.cat([hexplane_features(nowhere, t, [level]) for t in times[-50:]])[:, 0] ** (1 / 3)
-    torch.testing.assert_close(
-        rows, torch.tensor(times[-50:], dtype=torch.float64) * (LONG // 2 - 1), rtol=1e-9, atol=0
-    )
 
 
 # --- sets
@@ -215,15 +148,6 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     assert other.step().loss == trainer.step().loss
 
 
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_one_gaussian(kind: str) -> None:
-    field = stirred_field(kind, 1)
-    gaussian = cloud(1)
-    moved = deformed(gaussian, field.offsets(gaussian.means, 0.8))
-    assert all(x.isfinite().all() for x in moved.tensors().values())
-    assert not torch.equal(moved.means, gaussian.means)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("flat", ["point", "line", "plane"])
 def test_boxes_without_volume(kind: str, flat: str) -> None:
@@ -250,74 +174,8 @@ def test_boxes_without_volume(kind: str, flat: str) -> None:
         torch.testing.assert_close(found, found[:1].expand_as(found))
 
 
-@pytest.mark.parametrize("count", [0, 1, 5])
-def test_a_box_of_nothing_or_of_one_point_has_a_size(count: int) -> None:
-    for logit in (5.0, -20.0):
-        gaussians = cloud(max(count, 1)).select(torch.zeros(count, dtype=torch.long))
-        center, half_size = box_of(
-            gaussians.replace(logit_opacities=torch.full((count,), logit)), 2.0
-        )
-        assert center.isfinite().all()
-        assert (half_size >= 2e-3).all()
-        if count:
-            torch.testing.assert_close(center, gaussians.means[0])
-
-
-def test_means_that_are_not_finite_do_not_spoil_the_box() -> None:
-    gaussians = cloud(50).replace(logit_opacities=torch.full((50,), 2.0))
-    means = gaussians.means.clone()
-    means[0] = math.nan
-    means[1] = math.inf
-    center, half_size = box_of(gaussians.replace(means=means), 1.0)
-    assert center.isfinite().all()
-    assert half_size.isfinite().all()
-
-
-@pytest.mark.parametrize("distance", [1e3, 1e6, 1e30])
-def test_gaussians_far_outside_the_box(distance: float) -> None:
-    """Planes: the offsets of the border. Nodes: those of the nearest, carried along by its turn.
-    All finite to 1e6."""
-    means = cloud().means.clone()
-    means[3] = distance
-    planes = stirred_field("hexplane")
-    border = means.clamp(-2, 2)
-    torch.testing.assert_close(
-        values(planes.offsets(means, 0.4)), values(planes.offsets(border, 0.4))
-    )
-    if distance > 1e6:
-        return
-    for kind in ("mlp", "control_nodes"):
-        field = stirred_field(kind)
-        field = field.edited(TopologyEdit(torch.arange(9), torch.zeros(9, dtype=torch.bool)))
-        assert values(field.offsets(means, 0.4)).isfinite().all()
-
-
 # --- rotations
 # --------------------------------------------------------------------------------------------------------
-
-
-def image_of(gaussians: Gaussians) -> Tensor:
-    intrinsics = torch.tensor([[40.0, 0, 16], [0, 40, 16], [0, 0, 1]])
-    return render(gaussians, Cameras(look_around(1, torch.float32), intrinsics[None], 32, 32)).rgb
-
-
-def test_a_zero_quaternion_cannot_be_turned() -> None:
-    """It stays the identity, which is what the rasterizer takes it for."""
-    gaussians = cloud().replace(quats=torch.zeros(9, 4))
-    turned = deformed(gaussians, Offsets(torch.zeros(9, 3), torch.randn(9, 4)))
-    assert torch.equal(image_of(turned), image_of(gaussians))
-
-
-def test_an_offset_that_cancels_the_identity_is_no_rotation() -> None:
-    """1 + (-1) leaves a zero quaternion: drawn unrotated, with finite gradients."""
-    quats = torch.zeros(9, 4)
-    quats[:, 0] = -1.0
-    quats.requires_grad_()
-    turned = deformed(cloud(), Offsets(torch.zeros(9, 3), quats))
-    identity = cloud().replace(quats=torch.tensor([[1.0, 0, 0, 0]]).expand(9, 4))
-    assert torch.equal(image_of(turned), image_of(identity))
-    (slope,) = torch.autograd.grad(image_of(turned).sum(), [quats])
-    assert slope.isfinite().all()
 
 
 # --- fields that explode
@@ -359,39 +217,6 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 
 # --- where motion begins
 # ----------------------------------------------------------------------------------------------
-
-
-def test_a_image_that_a_still_model_explains(capture: Path) -> None:
-    """No error stands out: nothing moves, no random Gaussians, no field; the run goes on static."""
-    trainer = fine_trainer(capture, "control_nodes", motion_threshold=10.0)
-    assert isinstance(trainer.model.scene, DynamicScene)
-    assert trainer.model.scene.field is None
-    assert len(trainer.model.scene.gaussians) == len(reference_set(capture))
-    assert trainer.step().loss > 0
-
-
-def test_no_random_gaussians(capture: Path) -> None:
-    """Just the Gaussians that were there move."""
-    sizes = []
-    moving = []
-    for added in (12, 0):
-        trainer = assemble(busy_config(capture, capture, "control_nodes", num_random_moving=added))
-        for _ in range(8):
-            trainer.step()
-        sizes.append(len(trainer.model.scene.gaussians))
-        moving.append(trainer.num_moving)
-        assert trainer.step().loss > 0
-    assert sizes[0] == sizes[1] + 12
-    assert moving[0] == moving[1] + 12 > 12
-
-
-def reference_set(capture: Path) -> Gaussians:
-    """What a static run of as many steps has."""
-    config = busy_config(capture, capture, "control_nodes")
-    trainer = assemble(config.model_copy(update={"model": StaticModel(sh_degree=1)}))
-    for _ in range(10):
-        trainer.step()
-    return trainer.model.scene.gaussians
 
 
 @pytest.mark.parametrize("filtered", [False, True])

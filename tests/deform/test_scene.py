@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_field, tiny_options
+from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.config import DynamicModel
-from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import field_state
@@ -18,7 +17,6 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.static.scene import StaticScene
 
 ROWS = torch.tensor([1, 4, 5, 8])
 NOTHING = torch.zeros(0, dtype=torch.long)
@@ -54,25 +52,11 @@ def test_only_the_rows_move(kind: str) -> None:
     assert not late.means.requires_grad
 
 
-@pytest.mark.parametrize("time", [-1e9, -0.1, None])
-def test_times_before_the_clip_are_its_start(time: float | None) -> None:
-    scene = some_scene()
-    assert same(scene.at(time), scene.at(0.0))
-
-
 @pytest.mark.parametrize("time", [1.0001, 7.0, float("inf")])
 def test_times_after_the_clip_are_its_end(time: float) -> None:
     scene = some_scene()
     assert same(scene.at(time), scene.at(1.0))
     assert not same(scene.at(time), scene.at(0.0))
-
-
-@pytest.mark.parametrize("kind", [*ALL_KINDS, None])
-def test_a_time_that_is_no_number_is_refused(kind: str | None) -> None:
-    """Also where nothing moves."""
-    scene = some_scene(kind) if kind else scene_of(NOTHING)
-    with pytest.raises(DyngsError, match="not a number; give one from 0 to 1"):
-        scene.at(float("nan"))
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
@@ -91,35 +75,6 @@ def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) 
         whole = scene.at(time)
         assert same(moving.at(time), whole.select(ROWS))
         assert same(still.at(time), whole.select(others))
-
-
-def test_parts_of_extreme_scenes() -> None:
-    field = stirred_field("control_nodes", 9)
-    all_move = scene_of(torch.arange(9), field)
-    assert same(all_move.part("moving").at(0.3), all_move.at(0.3))
-    assert len(all_move.part("still")) == 0
-    none_moves = scene_of(NOTHING)
-    assert same(none_moves.part("still").at(0.3), none_moves.gaussians)
-    assert len(none_moves.part("moving").at(0.3)) == 0
-
-
-def test_what_a_scene_says_of_itself() -> None:
-    scene = some_scene("hexplane")
-    field = tiny_field("hexplane", 4)
-    assert len(scene) == 9
-    assert scene.moving_fraction == pytest.approx(4 / 9)
-    assert scene.num_motion_values == sum(x.numel() for x in field.parameters.values().values())
-    for still in (scene_of(NOTHING), scene_of(NOTHING, field)):
-        assert still.is_static
-        assert (still.moving_fraction, still.num_motion_values) == (0.0, 0)
-        assert still.at(0.7) is still.gaussians
-
-
-def test_the_filter_acts_on_what_is_drawn() -> None:
-    std = torch.full((9,), 0.3)
-    scene = some_scene("control_nodes", std)
-    plain = some_scene("control_nodes")
-    assert same(scene.at(0.6), fuse_filter(plain.at(0.6), std))
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
@@ -168,20 +123,3 @@ def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
     assert len(masked) == 9
     assert same(masked.part("moving").at(0.4), scene.part("moving").at(0.4))
     assert same(masked.unmasked().at(0.4), scene.at(0.4))
-
-
-def test_a_state_without_field_is_a_still_scene() -> None:
-    for scene in (
-        StaticScene.restored(cloud(), {}),
-        DynamicScene.restored(DynamicModel(), cloud(), {}),
-    ):
-        assert scene.is_static
-        assert scene.times == ()
-        assert same(scene.at(0.5), cloud())
-
-
-def test_a_field_that_lacks_something_is_a_key_error() -> None:
-    state = {f"field.{name}": x for name, x in tensors_of(field_state(tiny_field("mlp"))).items()}
-    del state["field.learned.bias0"]
-    with pytest.raises(KeyError, match="bias0"):
-        DynamicScene.restored(DynamicModel(deform=tiny_options("mlp")), cloud(), state)

@@ -8,17 +8,8 @@ from tiny_fields import cloud, stirred_field
 
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.spline_fit import refitted, spline_basis
-from dyngs.ops.nodes import cubic_fractions
 
 PLACES = torch.linspace(0, 1, 41, dtype=torch.float64)
-
-
-def test_the_basis_is_that_of_the_nodes() -> None:
-    basis = spline_basis(torch.tensor([0.0, 0.3, 1.0]), 5)
-    assert torch.allclose(basis.sum(1), torch.ones(3, dtype=torch.float64))
-    # float32 places
-    assert torch.allclose(basis[1, 1:5], torch.tensor(cubic_fractions(0.5)).double(), atol=1e-6)
-    assert torch.allclose(basis[2, 4:], torch.tensor(cubic_fractions(1.0)).double())
 
 
 @pytest.mark.parametrize("pieces", [6, 9])
@@ -30,30 +21,6 @@ def test_divided_pieces_lose_nothing(pieces: int) -> None:
         spline_basis(PLACES, pieces) @ finer, spline_basis(PLACES, 3) @ points, atol=1e-9
     )
     assert torch.allclose(refitted(finer, 3), points, atol=1e-9)
-
-
-def test_polynomials_need_one_piece() -> None:
-    cubic = refitted(torch.randn(2, 4, 1, generator=torch.Generator().manual_seed(1)).double(), 12)
-    assert torch.allclose(
-        spline_basis(PLACES, 1) @ refitted(cubic, 1), spline_basis(PLACES, 12) @ cubic, atol=1e-8
-    )
-
-
-def test_no_other_fit_is_nearer() -> None:
-    """The mean square over time grows whichever way the control points are changed."""
-    generator = torch.Generator().manual_seed(2)
-    points = torch.randn(1, 11, 2, generator=generator).double()
-    fitted = refitted(points, 3)
-    places = (torch.arange(960, dtype=torch.float64) + 0.5) / 960
-    wanted = spline_basis(places, 8) @ points
-
-    def error(x: torch.Tensor) -> float:
-        return float((spline_basis(places, 3) @ x - wanted).square().mean())
-
-    for _ in range(10):
-        assert error(
-            fitted + 0.05 * torch.randn(fitted.shape, generator=generator).double()
-        ) > error(fitted)
 
 
 def test_a_field_with_all_nodes_and_pieces_moves_as_before() -> None:

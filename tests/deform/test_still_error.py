@@ -11,7 +11,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import look_around
-from tiny_fields import cloud
 from torch import Tensor
 from two_balls import cameras_around, two_balls
 
@@ -33,8 +32,6 @@ from dyngs.gaussians.rendering import RenderOptions, render
 SIZE = 24
 OPTIONS = RenderOptions(nonfinite="trust")
 BLACK = torch.zeros(3)
-WHITE = torch.ones(3)
-SH_CONSTANT = 0.28209479177387814
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -90,28 +87,6 @@ def scores_of(gaussians: Gaussians, images: list[Image], background: Tensor) -> 
     return found.most
 
 
-def test_colours_of_a_shader_are_expected() -> None:
-    """What a network says that the base colours do not is no motion."""
-    gaussians = balls((0.0, 0.0, 0.0), sideways(0.8))
-
-    def red(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
-        return torch.tensor([1.0, 0.0, 0.0]).expand(len(cameras), len(gaussians), 3)
-
-    shown = image(render(gaussians, camera(), OPTIONS, background=BLACK, shader=red).rgb[0])
-    assert (
-        still_errors(lambda _: gaussians, [shown], OPTIONS, BLACK, lambda _: red).most < 1e-6
-    ).all()
-    assert (scores_of(gaussians, [shown], BLACK) > 0.2).all(), (
-        "half of each channel, times the mean alpha"
-    )
-
-
-def test_what_the_images_show_has_no_error() -> None:
-    gaussians = cloud(12)
-    images = [image(rendered(gaussians, view=view), view=view) for view in range(3)]
-    assert scores_of(gaussians, images, BLACK).max() < 1e-6
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=3))
 def test_a_known_colour_is_the_error(colour: list[float]) -> None:
@@ -137,45 +112,6 @@ def test_errors_count_where_a_gaussian_shows() -> None:
     assert 0.05 < border < 0.25
 
 
-def test_masked_pixels_do_not_count() -> None:
-    scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
-    truth = rendered(scene) + 0.3 * left_half()[..., None]
-    for mask, expected in ((left_half(), [0.3, 0.0, 0.3]), (1 - left_half(), [0.0, 0.0, 0.0])):
-        scores = scores_of(scene, [image(truth, mask)], BLACK)
-        assert scores.tolist() == pytest.approx(expected, abs=0.01)
-
-
-def test_what_shows_nowhere_has_no_error() -> None:
-    """Behind the camera, beside the image, behind three dense walls, transparent: exactly 0."""
-    center = camera().centers[0]
-    behind = tuple((2 * center).tolist())
-    places = [sideways(0.0), behind, sideways(40.0), tuple((-0.5 * center).tolist()), sideways(0.5)]
-    walls = [tuple((fraction * center).tolist()) for fraction in (0.4, 0.3, 0.2)]
-    scene = balls(*places, *walls)  # type: ignore[arg-type]
-    logits = scene.logit_opacities.clone()
-    scales = scene.log_scales.clone()
-    logits[4] = -20.0
-    logits[5:] = 20.0
-    scales[5:] = 3.0
-    scene = scene.replace(logit_opacities=logits, log_scales=scales)
-    scores = scores_of(scene, [image(torch.ones(SIZE, SIZE, 3))], BLACK)
-    assert scores[:5].tolist() == [0.0] * 5
-    assert scores[5] > 0.3
-
-
-def test_the_background_lies_behind_both() -> None:
-    """Where an image is transparent, the truth is the background."""
-    scene = balls(sideways(0.0))
-    clear = torch.zeros(SIZE, SIZE)
-    empty = image(torch.zeros(SIZE, SIZE, 3), alpha=clear)
-    errors = [float(scores_of(scene, [empty], colour)) for colour in (BLACK, WHITE)]
-    # grey is as far from black as from white
-    assert errors[0] == pytest.approx(errors[1], rel=1e-3)
-    assert 0.2 < errors[0] < 0.5
-    grey = torch.full((3,), 0.5)
-    assert float(scores_of(scene, [empty], grey)) == pytest.approx(0.0, abs=1e-6)
-
-
 def test_detail_cancels_in_a_view_but_not_between_views() -> None:
     """Stripes that a ball cannot resolve are no error; a ball too bright in one view and too dark
     in the next is."""
@@ -188,52 +124,6 @@ def test_detail_cancels_in_a_view_but_not_between_views() -> None:
         image(rendered(ball, view=view) + 0.3 * (-1) ** view, view=view) for view in range(2)
     ]
     assert float(scores_of(ball, changes, BLACK)) == pytest.approx(0.3, rel=1e-3)
-
-
-def test_it_is_the_weighted_mean() -> None:
-    """The weights, one Gaussian at a time: what is seen of it if it alone is white and all others
-    are black."""
-    count = 12
-    random = torch.Generator().manual_seed(0)
-    gaussians = cloud(count)
-    masks = [None, (torch.rand(SIZE, SIZE, generator=random) > 0.3).float(), None]
-    images = [
-        image(torch.rand(SIZE, SIZE, 3, generator=random), masks[view], view=view)
-        for view in range(3)
-    ]
-    error = torch.zeros(count)
-    weight = torch.zeros(count)
-    for view, one in enumerate(images):
-        wrong = rendered(gaussians, WHITE, view) - one.rgb_premultiplied
-        counts = torch.ones(SIZE, SIZE) if one.mask is None else one.mask
-        for i in range(count):
-            sh = torch.full((count, 1, 3), -0.5 / SH_CONSTANT)
-            sh[i] = 0.5 / SH_CONSTANT
-            fraction = rendered(gaussians.replace(sh=sh), view=view)[..., 0] * counts
-            error[i] += (fraction[..., None] * wrong).sum((0, 1)).abs().mean()
-            weight[i] += fraction.sum()
-    scores = scores_of(gaussians, images, WHITE)
-    assert (weight > 0.1).sum() > 5
-    torch.testing.assert_close(scores, error / weight.clamp_min(1e-6), rtol=1e-3, atol=1e-5)
-
-
-def test_nothing_is_left_behind() -> None:
-    """Neither gradients nor changes; leaf tensors are taken too."""
-    gaussians = Gaussians(
-        **{name: x.clone().requires_grad_() for name, x in cloud(5).tensors().items()}
-    )
-    scores = scores_of(gaussians, [image(torch.rand(SIZE, SIZE, 3))], BLACK)
-    assert not scores.requires_grad
-    for name, x in gaussians.tensors().items():
-        assert x.grad is None
-        assert torch.equal(x.detach(), cloud(5).tensors()[name])
-
-
-def test_no_gaussians() -> None:
-    nobody = cloud(3).select(torch.zeros(0, dtype=torch.long))
-    scores = scores_of(nobody, [image(torch.ones(SIZE, SIZE, 3))], BLACK)
-    assert scores.shape == (0,)
-    assert two_group_threshold(scores) == float("inf")
 
 
 # --- cameras that stay in place
@@ -272,32 +162,12 @@ def test_what_changes_again_and_again_moves() -> None:
     assert float(found.usual) == pytest.approx(0.1, rel=1e-3)
 
 
-def test_images_in_which_a_gaussian_does_not_show_do_not_count() -> None:
-    """Seen by one of two cameras, which sees it change in every second image."""
-    ball = balls(sideways(0.0))
-    beside = [image(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), view=1)] * 10
-    found = still_errors(lambda _: ball, in_place(*[0.0, 0.3] * 3) + beside, OPTIONS, BLACK)
-    assert float(found.usual) == pytest.approx(0.3, rel=1e-3)
-
-
-def test_a_camera_that_stays_is_preferred_to_one_that_does_not() -> None:
-    images = in_place(0.0, 0.0, 0.0) + in_place(0.5, view=1)
-    found = still_errors(lambda _: balls(sideways(0.0)), images, OPTIONS, BLACK)
-    assert float(found.most) == pytest.approx(0.0, abs=1e-6)
-
-
 def views(*cameras: int) -> list[View]:
     """From one of three places each."""
     poses = look_around(3, torch.float64).numpy()
     intrinsics = camera().intrinsics[0].double().numpy()
     place = partial(View, image_path=Path("x.png"), intrinsics=intrinsics, width=SIZE, height=SIZE)
     return [place(str(i), cam_from_world=poses[at], time=i / 1000) for i, at in enumerate(cameras)]
-
-
-def test_views_are_evenly_chosen_of_a_moving_camera() -> None:
-    assert views_to_compare(views(0, 1, 2), 50) == [0, 1, 2]
-    assert views_to_compare(views(0, 1, 2, 0, 1, 2), 3) == [0, 2, 4]
-    assert views_to_compare([], 3) == []
 
 
 def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
@@ -326,11 +196,6 @@ def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale:
     threshold = two_group_threshold(scores[order])
     bin_width = float(scores.max() - scores.min()) / 256
     assert scale * max(low) - bin_width <= threshold < scale * min(high) - bin_width
-
-
-@pytest.mark.parametrize("scores", [[], [0.3], [0.3] * 50, [0.0] * 5])
-def test_of_equal_scores_none_stands_out(scores: list[float]) -> None:
-    assert two_group_threshold(torch.tensor(scores)) == float("inf")
 
 
 def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
@@ -374,10 +239,3 @@ def test_what_is_covered_at_times_only_is_not_usual() -> None:
     found = moving_fractions(lambda _: two_balls(), images, RenderOptions(), 0.06)
     assert float(found.most[0]) > 0.1
     assert float(found.usual.max()) == 0
-
-
-def test_masked_pixels_are_in_no_motion_mask() -> None:
-    found = moving_fractions(
-        lambda _: two_balls(), [masked_image(left(), torch.zeros(18, 24))], RenderOptions(), 0.06
-    )
-    assert found.most.tolist() == [0, 0]

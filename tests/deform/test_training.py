@@ -26,37 +26,18 @@ from moving_training import (
     new_run,
     speeds_of,
 )
-from pretend_gpu import GPU, pretend_gpu
 from static_balls import Ball, filmed
 from tiny_fields import KINDS, stir, tiny_options
-from torch import Tensor
 
-from dyngs.config import ControlNodesField, DynamicModel, FreeField, OptimConfig
-from dyngs.deform.still_error import StillErrors
+from dyngs.config import DynamicModel, FreeField, OptimConfig
 from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.schedule import Rates
 
 # --- phases
 # -----------------------------------------------------------------------------------------------------------
-
-
-def test_before_the_fine_phase_it_is_the_static_model() -> None:
-    gaussians = flat_cloud()
-    run = new_run(gaussians, still_errors=lambda _: alike(torch.arange(9.0)))
-    for step in (1, FINE):
-        assert run.grow(step - 1) is None
-        drawn = run.time_step(0.3, step)
-        assert drawn.gaussians is gaussians
-        assert drawn.penalties == {}
-        assert run.scene.num_moving == 0
-        run.after_step(step)
-    run.grow(FINE)
-    assert run.scene.num_moving > 0
-    assert torch.equal(run.drawn_at(0.3).means, gaussians.means)
 
 
 @pytest.mark.parametrize(("step", "tracks"), [(FINE + 2, True), (FINE + 3, False)])
@@ -157,45 +138,8 @@ def test_random_gaussians_move_too(kind: str) -> None:
     assert torch.equal(torch.nonzero(moved)[:, 0], run.scene.rows)
 
 
-def test_the_filter_of_a_still_model_counts_the_random_gaussians() -> None:
-    """A checkpoint of that very step has as many values as Gaussians."""
-    update = FilterUpdate([camera()])
-    errors = alike(torch.tensor(ERRORS))
-    run = new_run(flat_cloud(), still_errors=lambda _: errors, update=update, num_random_moving=4)
-    run.time_step(0.3, FINE)
-    assert len(run.model_state["filter_std"]) == 9
-    run.grow(FINE)
-    assert len(run.model_state["filter_std"]) == 13
-
-
 # --- the field learns
 # -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_field_learns_after_the_fine_phase(kind: str) -> None:
-    """Gradients of what is drawn reach field and canonical Gaussians; ``after_step`` changes the
-    field alone."""
-    gaussians = flat_cloud()
-    run = begun(gaussians, deform=tiny_options(kind), motion_sparsity=0.1)
-    for step in (FINE + 1, FINE + 2):
-        drawn = run.time_step(0.7, step)
-        (
-            drawn.gaussians.means[:, 1].sum() + sum(drawn.penalties.values(), torch.zeros(()))
-        ).backward()
-        canonical = gaussians.means.detach().clone()
-        assert run.after_step(step) == 0
-        assert torch.equal(gaussians.means, canonical)
-    assert (run.drawn_at(0.7).means[:, 1] < gaussians.means[:, 1]).all()
-    assert set(drawn.penalties) == {"motion sparsity"} | {
-        "hexplane": {"plane smoothness"},
-        "control_nodes": {"node acceleration", "node rigidity"},
-    }.get(kind, set())
-    assert gaussians.means.grad is not None
-    tolerance = 0.01 if kind == "control_nodes" else 1e-6  # nodes turn what follows them
-    torch.testing.assert_close(
-        gaussians.means.grad, torch.tensor([0.0, 2, 0]).expand(9, 3), rtol=0, atol=tolerance
-    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -228,30 +172,6 @@ def test_motion_is_learned_from_images(kind: str) -> None:
         found = run.drawn_at(time).means - gaussians.means.detach()
         # one camera sees no depth
         assert (found.mean(0) - (time - 0.5) * shift)[:2].norm() < 0.2 * 0.3
-
-
-def test_bad_gradients_of_the_field_are_counted() -> None:
-    gaussians = flat_cloud()
-    run = begun(gaussians)
-    assert run.scene.field is not None
-    grad = torch.zeros(9, 1, 3)
-    grad[4, 0, 1] = float("nan")
-    run.scene.field.parameters["means"].grad = grad
-    assert run.after_step(FINE + 1) == 1
-    assert run.scene.field.parameters["means"].isfinite().all()
-
-
-def test_it_trains_on_the_window() -> None:
-    """Which opens where motion begins: before, all views are trained on."""
-    run = new_run(flat_cloud(), times=tuple(i / 100 for i in range(101)), time_window=0.1)
-    assert all(
-        run.training.trains_on(time, step)
-        for time in (0.0, 0.5, 1.0, None)
-        for step in (1, FINE, FULL)
-    )
-    assert run.training.trains_on(0.5, FINE + 1)
-    assert not run.training.trains_on(0.0, FINE + 1)
-    assert not run.training.trains_on(None, FINE + 1), "no time is time 0"
 
 
 def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
@@ -311,28 +231,6 @@ def test_freezing_bakes_a_constant_offset_into_the_canonical_gaussians() -> None
     assert run.scene.field is None
     for name, x in run.drawn_at(0.9).tensors().items():
         torch.testing.assert_close(x, moved_at.tensors()[name], rtol=0, atol=1e-6)
-
-
-def test_where_nothing_moves_the_field_goes_for_good() -> None:
-    gaussians = flat_cloud()
-    run = begun(gaussians)
-    run.after_step(SPLIT)
-    assert (run.scene.field, run.scene.rows.tolist(), run.scene.num_moving) == (None, [], 0)
-    assert run.model_state.keys() == {"times"}
-    assert run.time_step(0.2, SPLIT + 1).gaussians is gaussians
-    run.after_step(SPLIT + 1, EditResult(TopologyEdit.select(torch.arange(9) < 5)))
-    assert run.scene.field is None
-
-
-def test_freezing_goes_on_at_the_next_split() -> None:
-    gaussians = flat_cloud()
-    run = begun(gaussians)
-    move(run, torch.tensor([1.0, 0, 1, 0, 1, 0, 1, 0, 1]))
-    run.after_step(SPLIT)
-    move(run, torch.tensor([0.0, 1, 1, 0, 1]))
-    run.after_step(SPLIT)
-    assert run.scene.rows.tolist() == [2, 4, 8]
-    assert torch.equal(speeds_of(run), torch.ones(3))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -399,30 +297,6 @@ def test_descendants_of_what_moves_move(data: st.DataObject) -> None:
     assert run.scene.num_moving == (0 if run.scene.field is None else len(speeds_of(run)))
 
 
-def test_moments_of_new_rows_start_at_zero() -> None:
-    gaussians = flat_cloud()
-    run = begun(gaussians)
-    move(run, torch.tensor([0.0, 1, 1, 1, 0, 0, 0, 0, 0]))
-    run.after_step(SPLIT)
-    assert run.scene.field is not None
-    run.scene.field.parameters["means"].grad = torch.ones(3, 1, 3)
-    edit = TopologyEdit(
-        torch.tensor([0, 1, 1, 2, 8, 3]), torch.tensor([False, False, True, False, True, True])
-    )
-    run.after_step(SPLIT + 1, EditResult(edit))
-    assert run.scene.rows.tolist() == [1, 2, 3, 5]
-    moments = run.scene.field.parameters.state()["exp_avg.means"].tensor
-    assert moments.any(-1)[:, 0].tolist() == [True, False, True, False]
-
-
-def test_a_reset_of_opacities_moves_no_rows() -> None:
-    gaussians = flat_cloud()
-    run = begun(gaussians)
-    move(run, torch.ones(9))
-    run.after_step(FINE + 1, EditResult(None, {"logit_opacities": torch.zeros(9)}))
-    assert torch.equal(speeds_of(run), torch.ones(9))
-
-
 # --- state
 # ------------------------------------------------------------------------------------------------------------
 
@@ -482,40 +356,3 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
         assert (ball.median(0).values - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.1
     scene = begin().training.restored(run.scene.gaussians, run.model_state)
     torch.testing.assert_close(scene.at(0.3).means, run.scene.at(0.3).means)
-
-
-def test_motion_begins_on_a_gpu_as_on_the_cpu() -> None:
-    """Tracks and seeds are found on the CPU whatever the scene lies on."""
-    times = tuple(i / 7 for i in range(8))
-    footage = filmed(lambda t: [Ball((0.0, 0.1, 1.6 * t - 0.8))], times)
-
-    def means_on(device: torch.device) -> Tensor:
-        def errors(_: object) -> StillErrors:
-            return alike(torch.tensor(ERRORS).to(device))
-
-        run = new_run(flat_cloud(), times, errors, deform=FreeField(), num_random_moving=300)
-        run.training.capture = replace(run.training.capture, standing=lambda: footage)
-        grown = run.training.revised(run.scene.to(device), FINE)
-        assert grown is not None
-        assert grown[0].gaussians.means.device == device
-        return grown[0].at(0.3).means.detach().cpu()
-
-    expected = means_on(torch.device("cpu"))
-    with pretend_gpu():
-        assert torch.equal(means_on(GPU), expected)
-
-
-def test_where_nothing_changes_random_gaussians_are_added() -> None:
-    """And for fields that follow things through the clip the cameras are not even asked."""
-    errors = alike(torch.tensor(ERRORS))
-    nothing = filmed(lambda _: [], TIMES[:4])
-    for deform, footage in ((FreeField(), nothing), (ControlNodesField(nodes=4), None)):
-        run = new_run(
-            flat_cloud(), still_errors=lambda _: errors, deform=deform, num_random_moving=4
-        )
-        run.training.capture = replace(run.training.capture, standing=lambda shown=footage: shown)
-        result = run.grow(FINE)
-        assert result is not None
-        assert result.finding is None
-        assert run.scene.num_moving >= 7
-        assert run.training.state() == {}

@@ -3,7 +3,6 @@ they are stored."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 
@@ -13,10 +12,9 @@ from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.core.state import tensors_of
-from dyngs.deform.field import deformed, innermost, with_innermost
+from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.deform.windows import EDGE, OPEN, WindowedField
-from dyngs.gaussians import TopologyEdit
 
 COUNT = 9
 
@@ -56,28 +54,6 @@ def test_windows_are_flat_inside_and_fall_off_outside() -> None:
             assert x == pytest.approx(window(a, b, time) - window(*OPEN, time), abs=1e-4)
 
 
-def test_windows_add_to_opacities_that_change() -> None:
-    field = windowed("hexplane")
-    means = cloud().means
-    found = field.offsets(means, 0.37)
-    alone = field.others.offsets(means, 0.37)
-    plain = windowed("hexplane", everything=False).offsets(means, 0.37)
-    assert found.logit_opacities is not None
-    assert alone.logit_opacities is not None
-    assert plain.logit_opacities is not None
-    torch.testing.assert_close(found.logit_opacities, alone.logit_opacities + plain.logit_opacities)
-
-
-def test_rows_alone_are_computed_alike() -> None:
-    field = windowed()
-    means = cloud().means
-    rows = torch.tensor([8, 0, 3])
-    some = field.offsets(means, 0.37, rows)
-    every = field.offsets(means, 0.37).select(rows)
-    for name, x in vars(some).items():
-        torch.testing.assert_close(x, getattr(every, name), rtol=0, atol=1e-6)
-
-
 def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they_began() -> None:
     field = WindowedField(stirred_field("control_nodes"), COUNT)
     means = cloud().means
@@ -92,23 +68,6 @@ def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they
     assert torch.equal(field.edges[:, 1], began[:, 1])
     assert len(field.leaves) == 1 + len(field.others.leaves)
     assert field.penalties(0.3).keys() == field.others.penalties(0.3).keys()
-
-
-def test_what_is_born_has_its_parents_window() -> None:
-    field = windowed()
-    edited = field.edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
-    assert torch.equal(edited.edges, field.edges[[3, 3, 0]])
-
-
-def test_the_field_within_can_be_exchanged() -> None:
-    field = windowed()
-    other = stirred_field("mlp")
-    assert innermost(field) is field.others
-    exchanged = with_innermost(field, other)
-    assert isinstance(exchanged, WindowedField)
-    assert exchanged.others is other
-    assert torch.equal(exchanged.edges, field.edges)
-    assert with_innermost(other, field.others) is field.others
 
 
 def stored(field: WindowedField) -> dict[str, Tensor]:
@@ -145,9 +104,3 @@ def test_a_forged_state_is_refused(change: Callable[[Tensor], Tensor | None]) ->
         tensors["windows.edges"] = forged
     with pytest.raises((KeyError, ValueError)):
         restored_field(tiny_options("control_nodes"), tensors, COUNT)
-
-
-def test_copies_do_not_share_windows() -> None:
-    field = windowed()
-    other = copy.copy(field).to("cpu")
-    assert torch.equal(other.edges, field.edges)

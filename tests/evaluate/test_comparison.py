@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
 from dyngs.evaluate.comparison import compared
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.scene_file import write_scene_file
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -33,6 +33,7 @@ from dyngs.evaluate.report import (
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -41,7 +42,6 @@ from dyngs.runs.checkpoint import (
     load_run,
     save_checkpoint,
 )
-from dyngs.static.scene import StaticScene
 
 
 def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:

@@ -32,11 +32,11 @@ from dyngs.evaluate.view_scores import (
 )
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.models.renderable import Rendering
 from dyngs.runs.checkpoint import load_run
-from dyngs.static.scene import StaticScene
 
 NO_LPIPS = Lpips("alex", "no weights here")
 

@@ -1,17 +1,16 @@
 """Files of a run: where things are at each moment, its parts, sequences that are whole or not
-there."""
+there, tracks, bodies as nodes, cameras."""
 
 from __future__ import annotations
 
-import re
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from dyngs.io.formats.rotation import AXES, turn_between
 from moving_scene import (
     MOVING_ROWS,
     TRAIN_TIMES,
@@ -19,19 +18,29 @@ from moving_scene import (
     moved_x,
     moving_scene,
     row_of_balls,
+    sliding_nodes,
     still_scene,
     write_moving_run,
 )
 from scene_kinds import KINDS, onlooker, scene_of_kind
+from scipy.spatial.transform import Rotation, Slerp
+from splat_scenes import cloud
 
 from dyngs.cli import main
+from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture, Lens, PointCloud
+from dyngs.data.read import read_capture
+from dyngs.deform.bodies.field import BodyField, BodyRest, bodies_of
+from dyngs.deform.scene import DynamicScene
+from dyngs.deform.windows import WindowedField
 from dyngs.export import splat_files
+from dyngs.export.body_nodes import write_bodies
+from dyngs.export.cameras import NAME, write_cameras
+from dyngs.export.redrawn import compare_run, compare_splats
 from dyngs.export.splat_files import (
     Part,
-    Tracks,
     Writing,
-    frame_names,
     read_moment,
     scene_part,
     splats_at,
@@ -44,10 +53,12 @@ from dyngs.export.splat_files import (
     writing_of,
 )
 from dyngs.gaussians.rendering import render
-from dyngs.io.formats.formats import read_splats
-from dyngs.io.formats.similarity import AXES, Similarity, turn_between
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.io.formats.formats import read_splats, upright, write_splats
+from dyngs.io.formats.similarity import Similarity
+from dyngs.io.formats.splat_file import SplatFile
+from dyngs.io.gltf import GltfFile
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
-from dyngs.static.scene import StaticScene
 
 ALL = (0, 1, 2, 3, 4)
 STILL_ROWS = (0, 2, 4)
@@ -59,12 +70,8 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Opened:
 
 
 @pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Opened:
-    return open_run(write_moving_run(tmp_path_factory.mktemp("still"), moves=False))
-
-
-def written(run: Opened, path: Path, time: float = 0.0, part: Part = "all") -> Path:
-    return write_run_splats(run, path, time, part).path
+def near(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    return open_run(write_moving_run(tmp_path_factory.mktemp("near")))
 
 
 def x_of(path: Path) -> torch.Tensor:
@@ -73,7 +80,7 @@ def x_of(path: Path) -> torch.Tensor:
 
 @pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
 def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
-    splat = read_splats(written(moving, tmp_path / "a.ply", time))
+    splat = read_splats(write_run_splats(moving, tmp_path / "a.ply", time).path)
     torch.testing.assert_close(splat.gaussians.means[:, 0], moved_x(ALL, time))
     assert torch.equal(splat.gaussians.means[:, 1:], row_of_balls().means[:, 1:])
     assert f"dyngs time {time!r}" in splat.comments
@@ -81,58 +88,28 @@ def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
     assert splat.eps2d == moving.config.model.eps2d
 
 
-def test_a_still_run_has_no_time(still: Opened, tmp_path: Path) -> None:
-    early, late = (written(still, tmp_path / f"{time}.ply", time) for time in (0.0, 1.0))
-    assert early.read_bytes() == late.read_bytes()
-    assert not any("time" in comment for comment in read_splats(early).comments)
-    everything = written(still, tmp_path / "still.ply", part="still")
-    assert everything.read_bytes() == early.read_bytes()
-
-
-def test_the_default_is_the_beginning(tmp_path: Path) -> None:
-    run_dir = write_moving_run(tmp_path)
-    torch.testing.assert_close(
-        x_of(written(open_run(run_dir), tmp_path / "a.ply")), moved_x(ALL, 0.0)
-    )
-
-
 def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
-    for time in (0.0, 0.7):
-        moves = x_of(written(moving, tmp_path / "moving.ply", time, "moving"))
-        stays = x_of(written(moving, tmp_path / "still.ply", time, "still"))
-        torch.testing.assert_close(moves, moved_x(MOVING_ROWS, time))
-        torch.testing.assert_close(stays, moved_x(STILL_ROWS, time))
+    parts: dict[Part, tuple[int, ...]] = {"moving": MOVING_ROWS, "still": STILL_ROWS}
+    for part, rows in parts.items():
+        path = write_run_splats(moving, tmp_path / f"{part}.ply", 0.7, part).path
+        torch.testing.assert_close(x_of(path), moved_x(rows, 0.7))
     assert not any("time" in comment for comment in read_splats(tmp_path / "still.ply").comments)
-
-
-def test_empty_parts_are_refused() -> None:
     with pytest.raises(DyngsError, match="nothing moves in this run"):
         scene_part(still_scene(), "moving")
-    with pytest.raises(DyngsError, match="every Gaussian of this run moves"):
+    with pytest.raises(DyngsError, match="no static part"):
         scene_part(moving_scene(Sliding(), ALL), "still")
 
 
 @pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])
-def test_a_sequence(moving: Opened, part, rows: tuple[int, ...], tmp_path: Path) -> None:
+def test_a_sequence(moving: Opened, part: Part, rows: tuple[int, ...], tmp_path: Path) -> None:
     times = (0.0, 0.25, 1.0)
     files = write_run_sequence(moving, tmp_path / "new" / "seq", times, part)
     paths = [one.path for one in files]
     assert [p.name for p in paths] == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
     assert sorted((tmp_path / "new" / "seq").iterdir()) == paths
-    assert all(re.fullmatch(r"(.*?)(\d+)\.ply", p.name) for p in paths)  # what players look for
     for path, time in zip(paths, times, strict=True):
         torch.testing.assert_close(x_of(path), moved_x(rows, time))
         assert f"dyngs time {time!r}" in read_splats(path).comments
-
-
-@pytest.mark.parametrize(
-    ("count", "last"),
-    [(1, "frame_0000.ply"), (10_000, "frame_9999.ply"), (10_001, "frame_10000.ply")],
-)
-def test_names_are_in_order_of_frames(count: int, last: str) -> None:
-    names = frame_names(count)
-    assert (len(set(names)), names[-1]) == (count, last)
-    assert sorted(names) == names
 
 
 def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
@@ -151,189 +128,43 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
         write_run_sequence(moving, folder / "notes.txt", (0.0, 0.5))
 
 
-@pytest.mark.parametrize(
-    "problem", [DyngsError("NaN"), OSError(28, "No space left on device"), KeyboardInterrupt()]
-)
 @pytest.mark.parametrize("exists", [False, True])
 def test_a_sequence_that_fails_leaves_nothing(
-    moving: Opened,
-    problem: BaseException,
-    exists: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    moving: Opened, exists: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "seq"
-    real = splat_files.write_splats
-    count = []
     if exists:
         folder.mkdir()
         (folder / "notes.txt").write_text("mine")
+    real = splat_files.write_splats
 
-    def failing(*arguments, **options):
-        count.append(1)
-        if len(count) == 3:
-            raise problem
-        return real(*arguments, **options)
+    def failing(path: Path, *arguments: object, **options: object) -> object:
+        if path.name == "frame_0002.ply":
+            raise OSError(28, "No space left on device")
+        return real(path, *arguments, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(splat_files, "write_splats", failing)
-    with pytest.raises(DyngsError if isinstance(problem, OSError) else type(problem)):
+    with pytest.raises(DyngsError, match="No space left"):
         write_run_sequence(moving, folder, (0.0, 0.25, 0.5, 0.75))
-    assert len(count) == 3
     assert [p.name for p in tmp_path.rglob("*")] == (["seq", "notes.txt"] if exists else [])
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Opened:
-    return open_run(write_moving_run(tmp_path))
-
-
-def test_the_cameras_know(run: Opened) -> None:
-    found = up_of(run)
+def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
+    found = up_of(near)
     assert found is not None
-    assert found[0] in AXES.values()
     name = next(name for name, axis in AXES.items() if axis == found[0])
-    how, line = writing_of(run, "y")
+    how, line = writing_of(near, "y")
     assert how.turn == turn_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
-    assert "the axes of the capture are kept" in writing_of(run, name)[1]
-
-
-def test_without_a_capture_nothing_is_turned(run: Opened) -> None:
-    lost = replace(
-        run, captured=Captured(run.config.data.model_copy(update={"root": Path("no")}), run.info)
-    )
+    assert "the axes of the capture are kept" in writing_of(near, name)[1]
+    data = near.config.data.model_copy(update={"root": Path("no")})
+    lost = replace(near, captured=Captured(data, near.info))
     assert up_of(lost) is None
     how, line = writing_of(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
     assert "--from-up=AXIS tells it" in line
-    told, _ = writing_of(lost, "y", from_up="z")
-    assert told.turn == turn_between(AXES["z"], AXES["y"])
+    assert writing_of(lost, "y", from_up="z")[0].turn == turn_between(AXES["z"], AXES["y"])
     assert writing_of(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
-
-
-def expected(times: tuple[float, ...], speed: float = 1.0) -> np.ndarray:
-    """(5, T, 3) where the balls of ``moving_scene(Sliding(speed))`` are."""
-    wanted = np.repeat(row_of_balls().means.numpy()[:, None], len(times), axis=1)
-    wanted[list(MOVING_ROWS), :, 0] += speed * np.array(times, np.float32)
-    return wanted
-
-
-@settings(max_examples=20, deadline=None)
-@given(times=st.lists(st.floats(0, 1), min_size=1, max_size=5).map(tuple), speed=st.floats(-10, 10))
-def test_positions_are_those_of_the_scene(times: tuple[float, ...], speed: float) -> None:
-    tracks = tracks_of(moving_scene(Sliding(speed)), times)
-    assert tracks.positions.dtype == np.float32
-    np.testing.assert_allclose(tracks.positions, expected(times, speed), atol=1e-5)
-    assert tracks.times.tolist() == list(times)
-    assert tracks.times.dtype == np.float64
-    assert tracks.moving.tolist() == [False, True, False, True, False]
-    assert tracks.ids.tolist() == [0, 1, 2, 3, 4]
-
-
-def test_only_what_moves() -> None:
-    tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, part="moving")
-    np.testing.assert_allclose(
-        tracks.positions, expected(TRAIN_TIMES)[list(MOVING_ROWS)], atol=1e-6
-    )
-    assert tracks.moving.tolist() == [True, True]
-    assert tracks.ids.tolist() == list(MOVING_ROWS)
-    with pytest.raises(DyngsError, match="nothing moves"):
-        tracks_of(still_scene(), TRAIN_TIMES, part="moving")
-
-
-def test_the_whole_scene_may_move_or_stand() -> None:
-    every = tracks_of(moving_scene(Sliding(), (0, 1, 2, 3, 4)), (0.0, 1.0))
-    np.testing.assert_allclose(every.positions[:, 1, 0], row_of_balls().means[:, 0] + 1)
-    assert every.moving.all()
-    none = tracks_of(still_scene(), (0.0, 1.0))
-    np.testing.assert_array_equal(none.positions[:, 0], none.positions[:, 1])
-    assert not none.moving.any()
-
-
-def test_far_scenes_keep_their_precision() -> None:
-    """Of map coordinates, float32 would keep half a metre."""
-    offset = (500_000.25, 5_400_000.125, 0.0)
-    tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, Similarity(shift=offset))
-    assert tracks.positions.dtype == np.float64
-    np.testing.assert_allclose(
-        tracks.positions - np.array(offset), expected(TRAIN_TIMES), atol=1e-6
-    )
-
-
-def test_a_file_holds_arrays_without_pickle(tmp_path: Path) -> None:
-    tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES)
-    path = write_tracks(tmp_path / "new" / "tracks.npz", tracks)
-    with np.load(path, allow_pickle=False) as stored:
-        assert sorted(stored.files) == ["ids", "moving", "positions", "times"]
-        for name in stored.files:
-            np.testing.assert_array_equal(stored[name], getattr(tracks, name), strict=True)
-    first = path.read_bytes()
-    assert write_tracks(path, tracks).read_bytes() == first
-    assert [p.name for p in path.parent.iterdir()] == ["tracks.npz"]
-
-
-def test_nothing_is_written_of_positions_that_are_not_finite(tmp_path: Path) -> None:
-    tracks = tracks_of(moving_scene(Sliding(float("nan"))), TRAIN_TIMES)
-    with pytest.raises(DyngsError, match="not finite"):
-        write_tracks(tmp_path / "tracks.npz", tracks)
-    assert not any(tmp_path.iterdir())
-
-
-def test_sizes_beyond_the_limit_are_refused_before_memory_is_taken(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(splat_files, "MAX_BYTES", 5 * 4 * 3 * 4)
-    assert tracks_of(moving_scene(Sliding()), (0.0,) * 4).positions.nbytes == 5 * 4 * 3 * 4
-    with pytest.raises(
-        DyngsError, match=r"tracks of 5 Gaussians at 5 times .* fewer --times, or --dynamic"
-    ):
-        tracks_of(moving_scene(Sliding()), (0.0,) * 5)
-    monkeypatch.undo()
-    with pytest.raises(DyngsError, match=r"6\.0 GB"):
-        tracks_of(StaticScene(gaussians=row_of_balls(5)), range(100_000_000))
-
-
-def test_fields_are_the_arrays_of_the_file() -> None:
-    assert set(Tracks.__dataclass_fields__) == {"positions", "times", "moving", "ids"}
-
-
-def test_every_moment_is_where_it_should_be(tmp_path: Path) -> None:
-    pytest.importorskip("fourdgs")
-    run = open_run(write_moving_run(tmp_path / "run"))
-    times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
-    written = write_moving(run, tmp_path / "a.4dgs", times)
-    for i in (0, 3, 8, 9):
-        read = read_moment(written.path, i).gaussians
-        torch.testing.assert_close(
-            read.means[:, 0], moved_x((0, 1, 2, 3, 4), times[i]), rtol=0, atol=0.01
-        )
-        torch.testing.assert_close(
-            read.base_rgb, written.splats[i].gaussians.base_rgb.clamp(0, 1), rtol=0, atol=0.01
-        )
-        torch.testing.assert_close(
-            read.scales, written.splats[i].gaussians.scales, rtol=0.02, atol=0
-        )
-
-
-def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("fourdgs")
-    run = write_moving_run(tmp_path / "run")
-    assert main(["export", str(run), "--times", "0:1:3", "--out", str(tmp_path / "a.4dgs")]) == 0
-    said = capsys.readouterr().out
-    assert "3 times, each shown for 1/30 s" in said
-    assert "drawn again from 4 cameras" in said
-    assert main(["export", str(run), "--format", "4dgs", "--out", str(tmp_path / "b")]) == 2
-    assert main(["export", str(run), "--sh-degree", "3", "--out", str(tmp_path / "a.4dgs")]) == 2
-
-
-def test_without_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise ImportError(name)
-
-    run = open_run(write_moving_run(tmp_path / "run"))
-    monkeypatch.setattr(splat_files, "import_module", missing)
-    with pytest.raises(DyngsError, match=r"pip install 'dyngs\[4dgs\]'"):
-        write_moving(run, tmp_path / "a.4dgs", [0.0])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -350,3 +181,203 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
     assert float(before.max()) > 0.05
     torch.testing.assert_close(after, before, rtol=0, atol=2e-4)
     assert (splat.edited, splat.up) == (edit, "y")
+
+
+def test_a_file_drawn_again_is_compared_with_its_run(near: Opened, tmp_path: Path) -> None:
+    for how in (Writing(), Writing(turn_between(AXES["z"], AXES["-y"]), "-y")):
+        written = write_run_splats(near, tmp_path / "a.ply", 0.7, how=how)
+        read = read_splats(written.path)
+        assert compare_run(near, near.scene, 0.7, written.splat, read).psnr > 80
+        # another time is seen as such
+        assert compare_run(near, near.scene, 0.0, written.splat, read).psnr < 40
+    splat = SplatFile(cloud(300), up="z")
+    exact = write_splats(tmp_path / "a.ply", upright(splat, None, tmp_path / "a.ply"))
+    assert compare_splats(splat, exact).psnr > 80
+    assert compare_splats(splat, write_splats(tmp_path / "a.splat", splat)).psnr < 30
+
+
+def expected(times: tuple[float, ...], speed: float = 1.0) -> np.ndarray:
+    """(5, T, 3) where the balls of ``moving_scene(Sliding(speed))`` are."""
+    wanted = np.repeat(row_of_balls().means.numpy()[:, None], len(times), axis=1)
+    wanted[list(MOVING_ROWS), :, 0] += speed * np.array(times, np.float32)
+    return wanted
+
+
+def test_tracks_are_the_positions_of_the_scene() -> None:
+    times = (0.0, 1.0, 0.3)
+    tracks = tracks_of(moving_scene(Sliding(-3.0)), times)
+    assert tracks.positions.dtype == np.float32
+    np.testing.assert_allclose(tracks.positions, expected(times, -3.0), atol=1e-5)
+    assert (tracks.times.tolist(), tracks.times.dtype) == (list(times), np.float64)
+    assert tracks.moving.tolist() == [False, True, False, True, False]
+    assert tracks.ids.tolist() == [0, 1, 2, 3, 4]
+    part = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, part="moving")
+    wanted = expected(TRAIN_TIMES)[list(MOVING_ROWS)]
+    np.testing.assert_allclose(part.positions, wanted, atol=1e-6)
+    assert (part.moving.tolist(), part.ids.tolist()) == ([True, True], list(MOVING_ROWS))
+    with pytest.raises(DyngsError, match="nothing moves"):
+        tracks_of(still_scene(), TRAIN_TIMES, part="moving")
+    assert not tracks_of(still_scene(), (0.0, 1.0)).moving.any()
+    # of map coordinates, float32 would keep half a metre
+    offset = (500_000.25, 5_400_000.125, 0.0)
+    far = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, Similarity(shift=offset)).positions
+    assert far.dtype == np.float64
+    np.testing.assert_allclose(far - np.array(offset), expected(TRAIN_TIMES), atol=1e-6)
+
+
+def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
+    tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES)
+    path = write_tracks(tmp_path / "new" / "tracks.npz", tracks)
+    with np.load(path, allow_pickle=False) as stored:
+        assert sorted(stored.files) == ["ids", "moving", "positions", "times"]
+        for name in stored.files:
+            np.testing.assert_array_equal(stored[name], getattr(tracks, name), strict=True)
+    first = path.read_bytes()
+    assert write_tracks(path, tracks).read_bytes() == first
+    broken = tracks_of(moving_scene(Sliding(float("nan"))), TRAIN_TIMES)
+    with pytest.raises(DyngsError, match="not finite"):
+        write_tracks(path, broken)
+    assert path.read_bytes() == first
+    with pytest.raises(DyngsError, match=r"6\.0 GB.* fewer --times, or --dynamic"):
+        tracks_of(StaticScene(gaussians=row_of_balls(5)), range(100_000_000))
+
+
+def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("fourdgs")
+    times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
+    written = write_moving(near, tmp_path / "a.4dgs", times)
+    for i in (0, 3, 8, 9):
+        read = read_moment(written.path, i).gaussians
+        meant = written.splats[i].gaussians
+        torch.testing.assert_close(read.means[:, 0], moved_x(ALL, times[i]), rtol=0, atol=0.01)
+        torch.testing.assert_close(read.base_rgb, meant.base_rgb.clamp(0, 1), rtol=0, atol=0.01)
+        torch.testing.assert_close(read.scales, meant.scales, rtol=0.02, atol=0)
+    run = str(near.path)
+    assert main(["export", run, "--times", "0:1:3", "--out", str(tmp_path / "b.4dgs")]) == 0
+    told = capsys.readouterr().out
+    assert "3 times, each shown for 1/30 s" in told
+    assert "drawn again from 4 cameras" in told
+    assert main(["export", run, "--sh-degree", "3", "--out", str(tmp_path / "c.4dgs")]) == 2
+
+
+def test_without_the_package_of_moving_files(
+    tmp_path: Path, near: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "fourdgs", None)
+    with pytest.raises(DyngsError, match=r"pip install 'dyngs\[4dgs\]'"):
+        write_moving(near, tmp_path / "a.4dgs", [0.0])
+
+
+@pytest.fixture(scope="module")
+def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    """Of five balls the second and the fourth are one body, which turns by 0.9 times half a turn
+    and moves aside."""
+    opened = open_run(write_moving_run(tmp_path_factory.mktemp("rolling")))
+    angles = torch.linspace(-0.6, 1.1, 9) * np.pi / 2
+    quats = torch.stack([angles.cos(), angles.sin() * 0.6, 0 * angles, angles.sin() * 0.8], dim=1)
+    way = torch.linspace(0, 1, 9)
+    places = torch.stack([2 * way - 1, 0.25 * way**2, 0 * way], dim=1)
+    labels = torch.zeros(len(MOVING_ROWS), dtype=torch.long)
+    rest = BodyRest(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), labels)
+    field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]})
+    assert isinstance(opened.scene, DynamicScene)
+    return opened.showing(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
+
+
+@pytest.mark.parametrize("how", [Writing(), Writing((0.5, 0.5, 0.5, 0.5), "y")])
+def test_the_animation_of_bodies_shows_the_scene_at_all_times(
+    tmp_path: Path, rolling: Opened, how: Writing
+) -> None:
+    written = write_bodies(rolling, tmp_path / "a.glb", 0.25, how)
+    found = read_splats(written.path).gaussians
+    order = [*MOVING_ROWS, *STILL_ROWS]  # the reader begins with the last node
+    for name, x in found.tensors().items():  # without the animation
+        wanted = written.splat.gaussians.tensors()[name][order]
+        torch.testing.assert_close(x, wanted, atol=1e-5, rtol=0)
+    assert any("bodies: 1" in note for note in written.notes)
+    file = GltfFile(written.path)
+    rest, body = file.document.nodes
+    assert (rest.name, body.name) == ("rest", "body 0")
+    animation = file.document.animations[0]
+    samples = {}
+    for channel in animation.channels:
+        assert channel.target.node == 1
+        sampler = animation.samplers[channel.sampler]
+        kind = {"translation": "VEC3", "rotation": "VEC4"}[channel.target.path]
+        seconds = file.numbers(sampler.input, "SCALAR", np.float64)[:, 0]
+        samples[channel.target.path] = file.numbers(sampler.output, kind, np.float64)
+    assert seconds[-1] == pytest.approx(rolling.seconds)
+    assert (samples["rotation"][1:] * samples["rotation"][:-1]).sum(1).min() > 0
+    turns = Slerp(seconds, Rotation.from_quat(samples["rotation"]))
+    local = found.means[:2].numpy() - body.translation
+    for time in (0.0, 0.25, 0.3, 0.875):
+        now = time * rolling.seconds
+        place = np.array([np.interp(now, seconds, samples["translation"][:, k]) for k in range(3)])
+        means = splats_at(rolling, rolling.scene, time, how).gaussians.means[list(MOVING_ROWS)]
+        atol = 1e-5 if time != 0.3 else 0.02  # between two poses of the file
+        np.testing.assert_allclose(turns(now).apply(local) + place, means.numpy(), atol=atol)
+
+
+def test_bodies_that_stand_and_runs_without_bodies(
+    tmp_path: Path, rolling: Opened, near: Opened, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert isinstance(rolling.scene, DynamicScene)
+    body = bodies_of(rolling.scene.field)
+    assert body is not None
+    # splines of zeros, from a damaged or forged run
+    blank = {name: torch.zeros_like(body.parameters[name].detach()) for name in ("places", "quats")}
+    field = BodyField(body.others, body.rest, blank)
+    damaged = rolling.showing(replace(rolling.scene, field=field))
+    assert len(read_splats(write_bodies(damaged, tmp_path / "a.glb", 0.0).path).gaussians) == 5
+    with pytest.raises(DyngsError, match="no body that turns"):
+        write_bodies(near, tmp_path / "b.glb", 0.0)
+    for wrong in ("--out a.ply", "--times 0:1:3", "--static", "--sh-degree 1", "--format ply"):
+        assert main(["export", str(near.path), "--bodies", *wrong.split()]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]
+
+
+@pytest.fixture
+def far_capture(still: Path) -> Capture:
+    """A capture whose world is far away, with a lens of another kind for each of its first
+    views."""
+    lenses = [
+        Lens(),
+        Lens("opencv", (0.1, -0.02, 0.001, 0.002)),
+        Lens("opencv", (0.1,) * 8),
+        Lens("fisheye", (0.01,) * 4, 1.5),
+    ]
+    found = read_capture(still)
+    views = []
+    for i, view in enumerate(found.splits["train"]):
+        mask = view.image_path if i == 1 else None
+        views.append(replace(view, lens=lenses[i % 4], camera_id=i, mask_path=mask, time=i / 10))
+    random = np.random.default_rng(0)
+    cloud = PointCloud(random.normal(size=(5, 3)), random.integers(0, 255, (5, 3)).astype(np.uint8))
+    splits = {**found.splits, "train": tuple(views)}
+    offset = np.array([10.0, 0, -20])
+    return replace(found, splits=splits, points=cloud, world_offset=offset, span=(2.0, 4.0))
+
+
+def test_a_written_capture_is_read_as_it_was(far_capture: Capture, tmp_path: Path) -> None:
+    capture = far_capture
+    path = write_cameras(tmp_path / "out" / NAME, capture, {"train": capture.splits["train"]})
+    times = [frame["time"] for frame in json.loads(path.read_text())["frames"]]
+    np.testing.assert_allclose(times, [2 + 2 * i / 10 for i in range(len(times))])
+    back = read_capture(DataConfig(root=tmp_path / "out", follow_links=True, test_every=0))
+    assert back.points is not None
+    assert capture.points is not None
+    np.testing.assert_allclose(back.points.xyz, capture.points.xyz + capture.world_offset)
+    np.testing.assert_array_equal(back.points.rgb, capture.points.rgb)
+    views = {view.image_path.resolve(): view for view in back.splits["train"]}
+    assert len(views) == len(times)
+    for view in capture.splits["train"]:
+        same = views[view.image_path.resolve()]
+        shift = np.eye(4)
+        shift[:3, 3] = capture.world_offset
+        found = same.cam_from_world @ shift
+        np.testing.assert_allclose(found, view.cam_from_world, atol=1e-9)
+        matrix = view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1.0])
+        np.testing.assert_allclose(same.intrinsics, matrix)
+        assert (same.lens, same.camera_id) == (replace(view.lens, focal_ratio=1.0), view.camera_id)
+        assert (same.mask_path is None) == (view.mask_path is None)

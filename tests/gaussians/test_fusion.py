@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from seen_ball import HIGH, LOW, RADIUS, SIZE, views
+from seen_ball import HIGH, LOW, RADIUS, views
 
-from dyngs.gaussians.fusion import Mesh, Seen, colours_of, fused, simplified
+from dyngs.gaussians.fusion import Mesh, colours_of, fused, simplified
 
 
 @cache
@@ -66,8 +66,3 @@ def test_colours_are_those_of_the_views_that_show_a_point() -> None:
     torch.testing.assert_close(colours[0], torch.tensor([1.0, 0, 0]), atol=0.02, rtol=0)
     torch.testing.assert_close(colours[1], torch.zeros(3), atol=0.02, rtol=0)
     torch.testing.assert_close(colours[2], torch.full((3,), 0.5))
-
-
-def test_nothing_has_no_surface() -> None:
-    empty = [Seen(one.camera, one.depth, torch.zeros(SIZE, SIZE), one.colour) for one in views()]
-    assert fused(empty, LOW, HIGH, 20) is None

@@ -86,25 +86,6 @@ def test_neighbour_distance_equals_brute_force(count: int, seed: int) -> None:
     torch.testing.assert_close(found, squared.mean(1).clamp_min(1e-7), rtol=1e-6, atol=1e-12)
 
 
-def test_coincident_points_have_the_floor_as_size() -> None:
-    gaussians = initial_gaussians(
-        _with_points(np.zeros((9, 3))), PointsInit(), StartValues(), 0, _generator()
-    )
-    torch.testing.assert_close(gaussians.scales, torch.full((9, 3), 1e-7**0.5))
-
-
-def test_points_that_are_not_finite_are_left_out() -> None:
-    xyz = np.random.default_rng(0).random((8, 3))
-    xyz[3, 1] = np.nan
-    assert (
-        len(initial_gaussians(_with_points(xyz), PointsInit(), StartValues(), 0, _generator())) == 7
-    )
-    nothing = initial_gaussians(
-        _with_points(xyz[3:4]), PointsInit(num_random=5), StartValues(), 0, _generator()
-    )
-    assert len(nothing) == 5
-
-
 @pytest.mark.parametrize(
     ("scene", "options", "half"),
     [
@@ -155,13 +136,3 @@ def test_mcmc_starts_smaller_and_more_opaque_and_keeps_its_cap() -> None:
     assert {tuple(row) for row in few.means.tolist()} <= {
         tuple(row) for row in plain.means.tolist()
     }
-
-
-def test_the_seed_decides() -> None:
-    def draw(seed: int) -> torch.Tensor:
-        return initial_gaussians(
-            Surroundings(_views()), PointsInit(num_random=10), StartValues(), 0, _generator(seed)
-        ).means
-
-    assert torch.equal(draw(1), draw(1))
-    assert not torch.equal(draw(1), draw(2))

@@ -10,7 +10,6 @@ from moving_scene import camera
 from splat_scenes import cloud
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians import levels as module
 from dyngs.gaussians.levels import MERGED, Levels, levels_of, merged
@@ -48,29 +47,6 @@ def test_merged_moments_are_those_of_the_mixture() -> None:
     torch.testing.assert_close(shares.sum(1), torch.ones(10).double())
 
 
-def test_mass_is_kept_until_it_is_opaque() -> None:
-    """A ball's area is 4 pi r^2: two of equal place and size are twice as opaque as one, and never
-    more than opaque."""
-    ball = cloud(1).to(dtype=torch.float64).replace(log_scales=torch.full((1, 3), -1.0).double())
-    for opacity, expected in ((0.2, 0.4), (0.8, module.LARGEST_OPACITY)):
-        pair = Gaussians.joined(
-            [ball.replace(logit_opacities=torch.tensor([opacity]).double().logit())] * 2
-        )
-        one, _ = merged(pair, 2)
-        assert float(one.opacities) == pytest.approx(expected)
-        torch.testing.assert_close(covariances(one), covariances(ball))
-
-
-def test_one_gaussian_that_is_all_there_is_stays_as_it_is() -> None:
-    """The others, of no opacity, have no say, wherever they are."""
-    several = cloud(4).to(dtype=torch.float64)
-    several.logit_opacities[1:] = -torch.inf
-    one, _ = merged(several, 4)
-    torch.testing.assert_close(one.means, several.means[:1])
-    torch.testing.assert_close(covariances(one), covariances(several)[:1])
-    torch.testing.assert_close(one.opacities, several.opacities[:1])
-
-
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 1000])
 def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None:
     gaussians = cloud(count)
@@ -86,15 +62,6 @@ def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None
         if i:
             below = [child for block in blocks for child in levels.children(block)]
             assert below == [(i - 1, k) for k in range(len(levels.blocks[i - 1]))]
-
-
-def test_boxes_of_the_tree_are_apart(small_blocks: None) -> None:
-    """Halves of the whole do not overlap along the axis that is longest."""
-    order = module._tree_order(cloud(64).means.numpy())
-    assert sorted(order) == list(range(64))
-    points = cloud(64).means.numpy()[order]
-    axis = int(np.ptp(points, axis=0).argmax())
-    assert points[:32, axis].max() <= points[32:, axis].min()
 
 
 def whole(levels: Levels, cut: list[tuple[int, int]]) -> list[int]:
@@ -129,12 +96,6 @@ def test_the_finest_cut_is_the_scene_to_the_bit(small_blocks: None) -> None:
     assert torch.equal(render(seen, camera()).rgb, render(gaussians, camera()).rgb)
 
 
-def test_equal_gaussians_give_equal_levels(small_blocks: None) -> None:
-    one, other = (levels_of(cloud(300)) for _ in range(2))
-    for a, b in zip(one.levels, other.levels, strict=True):
-        assert all(torch.equal(x, b.tensors()[name]) for name, x in a.tensors().items())
-
-
 def test_what_is_behind_or_beside_the_camera_stays_coarse(small_blocks: None) -> None:
     levels = levels_of(cloud(1000))
     pose = camera().cam_from_world.clone()
@@ -166,8 +127,3 @@ def test_from_afar_fewer_look_the_same(small_blocks: None) -> None:
     assert len(seen) < len(gaussians) / 5
     errors = [float((render(x, far).rgb - truth).square().mean()) for x in (seen, gaussians)]
     assert errors[0] < 1.02 * errors[1]
-
-
-def test_nothing_has_no_levels() -> None:
-    with pytest.raises(DyngsError, match="without Gaussians"):
-        levels_of(cloud(1).select(torch.zeros(0, dtype=torch.long)))

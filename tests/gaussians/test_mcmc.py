@@ -48,33 +48,6 @@ def test_relocation_keeps_the_integral_of_the_profile(opacity: float, copies: in
     torch.testing.assert_close(1 - (1 - thinner) ** copies, o, rtol=1e-12, atol=0)
 
 
-def test_relocation_equals_the_published_double_sum() -> None:
-    from math import comb
-
-    o, n = 0.7, 6
-    thin = 1 - (1 - o) ** (1 / n)
-    total = sum(
-        comb(i - 1, k) * (-1) ** k * thin ** (k + 1) / (k + 1) ** 0.5
-        for i in range(1, n + 1)
-        for k in range(i)
-    )
-    thinner, factor = relocated(torch.tensor([o], dtype=torch.float64), torch.tensor([n]))
-    assert float(thinner) == pytest.approx(thin, rel=1e-12)
-    assert float(factor) == pytest.approx(o / total, rel=1e-12)
-
-
-def test_relocation_is_finite_at_the_ends() -> None:
-    opacities = torch.tensor([1.0, 1.0, 0.005, 0.5], dtype=torch.float64)
-    thinner, factor = relocated(opacities, torch.tensor([2, 500, 50, 1]))
-    assert torch.isfinite(thinner).all()
-    assert torch.isfinite(factor).all()
-    assert (factor > 0).all()
-    assert thinner[2] == 0.005
-    torch.testing.assert_close(
-        torch.stack([thinner[3], factor[3]]), torch.tensor([0.5, 1.0], dtype=torch.float64)
-    )
-
-
 def test_dead_ones_move_onto_living_ones() -> None:
     gaussians = _gaussians([0.001, 0.8, 0.002, 0.004, 0.3])
     densifier = McmcDensifier(McmcStrategy(max_gaussians=5), SCHEDULE, 0.05)
@@ -113,31 +86,6 @@ def test_the_set_grows_to_its_cap_and_no_further() -> None:
         )
 
 
-@pytest.mark.parametrize(("cap", "expected"), [(104, 104), (50, 100), (200, 110)])
-def test_a_later_limit_replaces_the_cap(cap: int, expected: int) -> None:
-    densifier = McmcDensifier(McmcStrategy(max_gaussians=100), SCHEDULE, 0.1)
-    densifier.limit(cap)
-    result = densifier.edit(200, _gaussians([0.4] * 100), torch.Generator().manual_seed(0))
-    assert result is not None
-    assert result.edit is not None
-    assert len(result.edit.source) == expected
-
-
-def test_growth_beyond_all_numbers_ends_at_the_cap() -> None:
-    densifier = McmcDensifier(McmcStrategy(max_gaussians=120), SCHEDULE, 1e308)
-    result = densifier.edit(200, _gaussians([0.4] * 100), torch.Generator().manual_seed(0))
-    assert result is not None
-    assert result.edit is not None
-    assert len(result.edit.source) == 120
-
-
-def test_nothing_outside_the_schedule_or_without_survivors() -> None:
-    densifier = McmcDensifier(McmcStrategy(), SCHEDULE, 0.05)
-    assert densifier.edit(250, _gaussians([0.5]), torch.Generator()) is None
-    assert densifier.edit(1000, _gaussians([0.5]), torch.Generator()) is None
-    assert densifier.edit(200, _gaussians([0.001] * 3), torch.Generator()) is None
-
-
 def test_noise_has_the_published_size_and_direction() -> None:
     count, lr = 4000, 1e-4
     one = _gaussians([0.004])
@@ -156,25 +104,6 @@ def test_noise_has_the_published_size_and_direction() -> None:
     torch.testing.assert_close(
         moved.T @ moved / count, expected, rtol=0.1, atol=0.05 * float(expected.abs().max())
     )
-
-
-def test_opaque_ones_stay_put_and_no_noise_means_none() -> None:
-    gaussians = _gaussians([0.001, 0.9])
-    before = gaussians.means.clone()
-    McmcDensifier(McmcStrategy(noise=0), SCHEDULE, 0.05).perturb(gaussians, 1e-4, torch.Generator())
-    assert torch.equal(gaussians.means, before)
-    McmcDensifier(McmcStrategy(), SCHEDULE, 0.05).perturb(gaussians, 1e-4, torch.Generator())
-    assert not torch.equal(gaussians.means[0], before[0])
-    assert torch.equal(gaussians.means[1], before[1])
-
-
-def test_regularizers_are_weighted_means() -> None:
-    gaussians = _gaussians([0.2, 0.4])
-    terms = McmcDensifier(
-        McmcStrategy(opacity_reg=0.5, scale_reg=0.25), SCHEDULE, 0.05
-    ).regularizers(gaussians)
-    assert float(terms["opacity"]) == pytest.approx(0.5 * 0.3, rel=1e-6)
-    assert float(terms["scale"]) == pytest.approx(0.25 * float(gaussians.scales.mean()), rel=1e-6)
 
 
 def test_the_result_does_not_depend_on_threads() -> None:

@@ -52,33 +52,6 @@ def test_it_is_adam_with_a_falling_rate(decay: float) -> None:
         assert learned[name].grad is None
 
 
-def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
-    learned = Parameters(start_values(), RATES)
-    before = start_values()
-    give_gradients(learned, 1)
-    for name, row in (("weight", (2, 1)), ("planes", (1, 2, 3, 0))):
-        grad = learned[name].grad
-        assert grad is not None
-        grad[row] = float("nan")
-    assert learned.step(1, 0.0) == 2
-    same = {name: learned[name].detach() == x for name, x in before.items()}
-    assert same["weight"].all(1).tolist() == [False, False, True, False]
-    assert int(same["planes"].all(-1).sum()) == 1
-    assert same["planes"][1, 2, 3].all()
-    assert all(x.isfinite().all() for x in tensors_of(learned.state()).values())
-
-
-def test_what_has_no_gradient_stays() -> None:
-    learned = Parameters(start_values(), RATES)
-    learned["bias"].grad = torch.ones(3)
-    learned.step(1, 0.0)
-    for name, x in start_values().items():
-        assert torch.equal(learned[name].detach(), x) == (name != "bias")
-    assert learned.num_values == sum(x.numel() for x in start_values().values())
-    assert "bias" in learned
-    assert "slope" not in learned
-
-
 def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
     """Those of the tensors that have that role; the parameters before stay as they were."""
     roles = dict.fromkeys(SHAPES, Role.SHARED) | {"weight": Role.PER_MOVING}
@@ -139,45 +112,3 @@ def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
     for name in ("bias", "exp_avg.bias"):
         with pytest.raises(KeyError, match=name):
             second.restored({n: x for n, x in state.items() if n != name})
-
-
-def test_a_restored_one_may_have_other_rows_where_it_is_told() -> None:
-    wide = Parameters(start_values() | {"weight": torch.randn(7, 5)}, RATES)
-    like = Parameters(start_values(), RATES)
-    state = tensors_of(wide.state())
-    found = like.restored(state, {"weight": 7})
-    assert all(torch.equal(x, state[name]) for name, x in tensors_of(found.state()).items())
-    with pytest.raises(ValueError, match="weight"):
-        like.restored(state)
-
-
-def test_without_moments_they_are_zero() -> None:
-    """As in files for drawing."""
-    learned = Parameters(start_values(), RATES)
-    give_gradients(learned, 1)
-    learned.step(1, 0.0)
-    found = tensors_of(Parameters(start_values(), RATES).restored(learned.values()).state())
-    for name, x in learned.values().items():
-        assert torch.equal(found[name], x)
-        assert not found[f"exp_avg.{name}"].any()
-        assert not found[f"exp_avg_sq.{name}"].any()
-
-
-def test_values_have_the_roles_they_were_given_and_moments_are_for_training() -> None:
-    roles = {"weight": Role.PER_GAUSSIAN, "bias": Role.SHARED, "planes": Role.PER_MOVING}
-    for learned in (
-        Parameters(start_values(), RATES, roles=roles),
-        Parameters({}, {}, roles=roles),
-    ):
-        for name, x in learned.state().items():
-            assert x.role is roles.get(name, Role.TRAINING)
-
-
-def test_on_its_own_device_it_goes_on_alike() -> None:
-    first = Parameters(start_values(), RATES, 0.5)
-    give_gradients(first, 1)
-    first.step(1, 0.0)
-    second = first.to("cpu")
-    for name, x in tensors_of(first.state()).items():
-        assert torch.equal(tensors_of(second.state())[name], x), name
-    assert all(second[name].is_leaf and second[name].requires_grad for name in SHAPES)

@@ -22,8 +22,6 @@ from dyngs.ops.rasterization import BlendOptions
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-EXACT = RenderOptions(alpha_min=0.0, transmittance_min=0.0)
-
 
 def leaves(gaussians: Gaussians) -> Gaussians:
     return Gaussians(
@@ -77,34 +75,6 @@ def test_a_shader_gives_the_colours() -> None:
     assert not gaussians.sh.grad[:, 1:].any()
 
 
-@pytest.mark.parametrize("depth", ["accumulated", "expected"])
-def test_gradcheck(depth: str) -> None:
-    """Through activations, cameras, colours, alpha, depth and background, without thresholds.
-
-    Wide Gaussians: where alpha is nearly zero, 1 - transmittance has no digits, and depth / alpha
-    none either.
-    """
-    scene = random_scene(n=3, views=2, size=(4, 3), degree=1)
-    scene = replace(scene, scales=5 * scene.scales)
-    options = replace(EXACT, depth=depth, mode=RasterizeMode.ANTIALIASED)
-
-    def run(
-        poses: Tensor, intrinsics: Tensor, background: Tensor, *tensors: Tensor
-    ) -> tuple[Tensor, ...]:
-        cameras = replace(scene, cam_from_world=poses, intrinsics=intrinsics).cameras
-        image = render(Gaussians(*tensors), cameras, options, background=background)
-        assert image.depth is not None
-        return image.rgb, image.alpha, image.depth
-
-    tensors = (
-        scene.cam_from_world,
-        scene.intrinsics,
-        scene.background,
-        *scene.gaussians.tensors().values(),
-    )
-    assert torch.autograd.gradcheck(run, [x.detach().clone().requires_grad_() for x in tensors])
-
-
 def test_depth_of_a_half_transparent_wall() -> None:
     gaussians, scene = half_transparent_wall(z=4.0)
     found = {}
@@ -135,30 +105,6 @@ def test_depth_where_nothing_is_drawn_is_zero_with_a_finite_gradient() -> None:
     )
 
 
-def test_alpha_of_a_half_transparent_wall() -> None:
-    gaussians, scene = half_transparent_wall()
-    alpha = render(gaussians, scene.cameras).alpha
-    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.5), rtol=1e-6, atol=0)
-
-
-def test_one_background_serves_every_view() -> None:
-    scene = random_scene()
-    one = scene.background[0]
-    gaussians = scene.gaussians
-    shared = render(gaussians, scene.cameras, background=one).rgb
-    each = render(gaussians, scene.cameras, background=torch.stack([one, one])).rgb
-    assert torch.equal(shared, each)
-    black = render(gaussians, scene.cameras).rgb
-    assert torch.equal(black, render(gaussians, scene.cameras, background=torch.zeros(3)).rgb)
-
-
-def test_background_of_another_precision() -> None:
-    scene = random_scene()
-    half = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float16)
-    truth = render(scene.gaussians, scene.cameras, background=half.double()).rgb
-    assert torch.equal(render(scene.gaussians, scene.cameras, background=half).rgb, truth)
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_sh_degree_limits_the_terms(degree: int) -> None:
     scene = random_scene(degree=3)
@@ -166,53 +112,6 @@ def test_sh_degree_limits_the_terms(degree: int) -> None:
     limited = render(scene.gaussians, scene.cameras, RenderOptions(sh_degree=degree)).rgb
     assert torch.equal(limited, render(cut, scene.cameras).rgb)
     assert torch.equal(render(cut, scene.cameras, RenderOptions(sh_degree=4)).rgb, limited)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
-    scene = random_scene()
-    halves = leaves(
-        Gaussians(**{name: x.to(dtype) for name, x in scene.gaussians.tensors().items()})
-    )
-    floats = Gaussians(**{name: x.detach().float() for name, x in halves.tensors().items()})
-    image = render(halves, scene.cameras.to(dtype=torch.float32))
-    assert image.rgb.dtype == torch.float32
-    assert torch.equal(image.rgb, render(floats, scene.cameras.to(dtype=torch.float32)).rgb)
-    image.rgb.sum().backward()
-    assert halves.means.grad is not None
-    assert halves.means.grad.dtype == dtype
-    assert halves.means.grad.isfinite().all()
-
-
-def test_mixed_precisions_follow_the_means() -> None:
-    scene = random_scene()
-    mixed = scene.to(torch.float32).gaussians.replace(sh=scene.sh, quats=scene.quats)
-    image = render(mixed, scene.cameras)
-    assert image.rgb.dtype == torch.float32
-    assert torch.equal(image.rgb, render(scene.to(torch.float32).gaussians, scene.cameras).rgb)
-
-
-def test_strided_gaussians_equal_contiguous_ones() -> None:
-    scene = random_scene().to(torch.float32)
-    packed = torch.cat([x.reshape(20, -1) for x in scene.gaussians.tensors().values()], 1)
-    widths = [3, 4, 3, 1, 12]
-    means, quats, log_scales, logits, sh = packed.split(widths, 1)
-    assert not means.is_contiguous()
-    views = Gaussians(means, quats, log_scales, logits[:, 0], sh.unflatten(1, (4, 3)))
-    assert torch.equal(render(views, scene.cameras).rgb, render(scene.gaussians, scene.cameras).rgb)
-
-
-def test_probe_collects_the_densification_signal() -> None:
-    scene = random_scene()
-    for absgrad in (False, True):
-        probe = torch.zeros(2, 20, 4, dtype=torch.float64, requires_grad=True)
-        image = render(scene.gaussians, scene.cameras, RenderOptions(absgrad=absgrad), probe=probe)
-        (image.rgb * weights(image.rgb)).sum().backward()
-        assert probe.grad is not None
-        assert probe.grad[..., :2].any()
-        assert probe.grad[..., 2:].any() == absgrad
-        if absgrad:
-            assert (probe.grad[..., 2:] >= probe.grad[..., :2].abs() - 1e-12).all()
 
 
 @pytest.mark.parametrize("shaded", [False, True])
@@ -260,40 +159,6 @@ def test_world_and_camera_moved_together_see_the_same() -> None:
     ours = render(moved.gaussians, moved.cameras)
     truth = render(scene.gaussians, scene.cameras)
     torch.testing.assert_close(ours.rgb, truth.rgb, rtol=1e-9, atol=1e-11)
-
-
-def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
-    """Bitwise, activations and their derivatives included."""
-    scene = random_scene(n=40_000, size=(75, 50), seed=9).to(torch.float32)
-    scene = replace(scene, scales=0.05 * scene.scales, opacities=0.2 * scene.opacities)
-    found = []
-    for n in (1, 2, 8):
-        set_threads(n)
-        gaussians = leaves(scene.gaussians)
-        image = render(
-            gaussians, scene.cameras, RenderOptions(depth="expected"), background=scene.background
-        )
-        total = (image.rgb * weights(image.rgb)).sum() + image.alpha.sum()
-        found.append([image.rgb, image.alpha, image.depth])
-        found[-1] += torch.autograd.grad(total, list(gaussians.tensors().values()))
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
-
-
-def test_no_gaussians_leave_the_background() -> None:
-    scene = random_scene(n=0)
-    gaussians = leaves(scene.gaussians)
-    background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
-    for nonfinite in ("error", "skip", "trust"):
-        options = RenderOptions(depth="expected", nonfinite=nonfinite)
-        image = render(gaussians, scene.cameras, options, background=background)
-        assert torch.equal(image.rgb, background.expand(2, 29, 37, 3))
-        assert image.depth is not None
-        assert not image.alpha.any()
-        assert not image.depth.any()
-    image.rgb.sum().backward()
-    assert gaussians.sh.grad is not None
-    assert gaussians.sh.grad.shape == (0, 4, 3)
 
 
 def compiled_and_plain(scene: Scene, options: RenderOptions) -> list[list[Tensor]]:
@@ -387,17 +252,6 @@ def test_background_and_probe_of_another_shape_are_refused(shape: tuple[int, ...
         render(scene.gaussians, scene.cameras, background=torch.zeros(shape))
     with pytest.raises(DyngsError, match=r"probe must be \(2, 20, 4\), got"):
         render(scene.gaussians, scene.cameras, probe=torch.zeros(shape))
-
-
-def test_a_rendering_in_another_precision() -> None:
-    scene = random_scene()
-    found = render(scene.gaussians, scene.cameras, RenderOptions(depth="expected")).to(
-        dtype=torch.float32
-    )
-    assert found.rgb.dtype == found.transmittance.dtype == torch.float32
-    assert found.depth is not None
-    assert found.depth.dtype == torch.float32
-    assert found.radii.dtype == torch.int32
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -9,22 +9,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scene_kinds import KINDS, PERSON, onlooker, restored, scene_of_kind
+from scene_kinds import KINDS, onlooker, restored, scene_of_kind
 from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.config import FixedStrategy, StaticModel
-from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, part_of, tensors_of
-from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.training import HumanTraining
 from dyngs.training.new_trainer import assemble
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
@@ -79,15 +75,6 @@ def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
         atol = 1e-5 if drawing and kind == "human" else 0.0
         torch.testing.assert_close(image(found, time), image(scene, time), rtol=0, atol=atol)
     assert float(image(scene, 0.37).std()) > 0.01, "something is seen"
-
-
-def test_what_is_stored_is_stored_again_alike(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    again = replace(restored(kind, scene.state()), colour=scene.colour).state()
-    assert again.keys() == scene.state().keys()
-    for name, x in scene.state().items():
-        assert again[name].role is x.role, name
-        assert torch.equal(again[name].tensor, x.tensor), name
 
 
 def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
@@ -148,16 +135,6 @@ def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
     assert_alike(scene.at(time), before, atol=0.0)
 
 
-def test_a_selection_is_an_edit_that_copies_nothing(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    chosen = torch.arange(len(scene)) % 3 == 1
-    by_bools = scene.select(chosen)
-    by_index = scene.select(torch.nonzero(chosen)[:, 0])
-    for time in TIMES:
-        assert_alike(by_bools.at(time), by_index.at(time), atol=0.0)
-        assert_alike(by_bools.unmasked().at(time), scene.unmasked().at(time).select(chosen))
-
-
 def test_what_moves_and_what_is_still_make_the_scene(kind: str) -> None:
     scene = scene_of_kind(kind)
     moving = scene.part("moving")
@@ -173,63 +150,12 @@ def test_what_moves_and_what_is_still_make_the_scene(kind: str) -> None:
         assert_alike(still.at(time), whole.select(~moves))
 
 
-def test_rows_are_those_that_move(kind: str) -> None:
-    scene = scene_of_kind(kind).unmasked()
-    moved = (scene.at(0.0).means != scene.at(0.37).means).any(1)
-    assert torch.equal(torch.nonzero(moved)[:, 0], scene.rows)
-    assert scene.is_static == (len(scene.rows) == 0)
-    assert scene.num_moving == len(scene.rows)
-    assert scene.moving_fraction == pytest.approx(len(scene.rows) / len(scene))
-    assert torch.isin(scene.offset_rows, scene.rows).all()
-
-
 # --- times
 # ------------------------------------------------------------------------------------------------------------
 
 
-def test_times_are_clamped_and_must_be_numbers(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    assert list(scene.times) == sorted(set(scene.times))
-    for outside, inside in ((None, 0.0), (-1e30, 0.0), (1.0001, 1.0), (float("inf"), 1.0)):
-        assert_alike(scene.at(outside), scene.at(inside), atol=0.0)
-        assert torch.equal(image(scene, outside), image(scene, inside))
-    with pytest.raises(DyngsError, match="not a number; give one from 0 to 1"):
-        scene.time_step(float("nan"))
-
-
 # --- drawing
 # ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_moment_may_be_drawn_again(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    with torch.no_grad():
-        moment = scene.time_step(0.37)
-        assert torch.equal(scene.render(onlooker(), moment).rgb, image(scene, 0.37))
-    assert moment.penalties == {}
-    assert not scene.at(0.37).means.requires_grad
-
-
-def test_the_background_is_that_of_the_scene_unless_another_is_given(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    red = torch.tensor([1.0, 0.0, 0.0])
-    given_later = scene.render(onlooker(), 0.5, background=red).rgb
-    assert torch.equal(replace(scene, background=red).render(onlooker(), 0.5).rgb, given_later)
-    assert not torch.equal(given_later.detach(), image(scene, 0.5))
-
-
-def test_images_are_differentiable_in_the_gaussians(kind: str) -> None:
-    """Gradients reach the tensors of the scene, and the values are those without gradients."""
-    scene = scene_of_kind(kind)
-    scene = scene.with_gaussians(leaves(scene.gaussians))
-    rgb = scene.render(onlooker(), 0.37).rgb
-    torch.testing.assert_close(rgb.detach(), image(scene, 0.37), rtol=0, atol=1e-5)
-    rgb.square().sum().backward()
-    for name in ("means", "log_scales", "logit_opacities", "sh"):
-        grad = getattr(scene.gaussians, name).grad
-        assert grad is not None, name
-        assert grad.isfinite().all(), name
-        assert grad.any(), name
 
 
 def test_a_changed_scene_is_drawn_as_it_is_now(kind: str) -> None:
@@ -245,16 +171,6 @@ def test_a_changed_scene_is_drawn_as_it_is_now(kind: str) -> None:
 
 # --- devices
 # ----------------------------------------------------------------------------------------------------------
-
-
-def test_on_its_own_device_it_stays_as_it_is(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    before = tensors_of(scene.state())
-    moved = scene.to("cpu")
-    assert type(moved) is type(scene)
-    assert moved.state().keys() == scene.state().keys()
-    assert all(torch.equal(x.tensor, before[name]) for name, x in moved.state().items())
-    assert all(torch.equal(image(moved, time), image(scene, time)) for time in TIMES)
 
 
 def test_all_that_is_computed_with_moves_to_a_device(kind: str) -> None:
@@ -310,20 +226,3 @@ def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
             trainer.model.scene, replace(view, time=time), config.train.steps
         )
         assert_alike(in_training.gaussians.detach(), loaded.at(time))
-
-
-def test_a_person_is_trained_as_it_is_played() -> None:
-    scene = scene_of_kind("human")
-    assert isinstance(scene, HumanScene)
-    training = HumanTraining(PERSON, (0, 1, 2), Rates(10))
-    for frame, time in enumerate(scene.times):
-        view = Image("view", onlooker(), torch.zeros(28, 36, 3), None, None, time, frame)
-        moment = training.time_step(scene, view, 10)
-        torch.testing.assert_close(
-            moment.gaussians.means.detach(), scene.at(time).means, rtol=0, atol=1e-5
-        )
-        # Axes of discs may be others, their images not; what is played has its poses as axis-angle
-        # vectors.
-        drawn = scene.render(onlooker(), moment).rgb.detach()
-        torch.testing.assert_close(drawn, image(scene, time), rtol=0, atol=1e-4)
-        assert set(moment.penalties) >= {"offset", "pose"}

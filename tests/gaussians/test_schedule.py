@@ -31,9 +31,7 @@ from dyngs.gaussians.schedule import (
     active_sh_degree,
     densify_schedule,
     filter_steps,
-    grad_threshold,
     growth_per_change,
-    learning_rates,
     means_rate,
     rate_factors,
 )
@@ -73,23 +71,6 @@ def test_resets_leave_time_to_recover(steps: int, white: bool) -> None:
     assert schedule.stop <= max(1, steps // 2 + 1)
 
 
-def test_without_resets_nothing_is_lowered_or_too_large() -> None:
-    schedule = densify_schedule(DefaultStrategy(reset_every=None), 5000, white_background=True)
-    assert schedule.resets == ()
-    assert schedule.prune_scale_after == 5000
-    assert (
-        densify_schedule(DefaultStrategy(reset_every=10**6), 5000, white_background=True).resets
-        == ()
-    )
-
-
-def test_short_runs() -> None:
-    schedule = densify_schedule(DefaultStrategy(), 2000, white_background=False)
-    assert (schedule.start, schedule.stop, schedule.resets) == (100, 1000, (400,))
-    assert densify_schedule(DefaultStrategy(), 7000, white_background=True).resets == (1400,)
-    assert densify_schedule(DefaultStrategy(), 10, white_background=True).resets == ()
-
-
 @pytest.mark.parametrize(
     ("steps", "every"), [(1, 1), (500, 25), (1000, 50), (2000, 100), (30_000, 100)]
 )
@@ -98,18 +79,6 @@ def test_short_runs_change_as_often(steps: int, every: int) -> None:
         assert densify_schedule(strategy, steps, white_background=False).every == every
         asked = strategy.model_copy(update={"every": 7})
         assert densify_schedule(asked, steps, white_background=False).every == 7
-
-
-def test_short_runs_densify_from_a_lower_gradient_on() -> None:
-    strategy = DefaultStrategy()
-    assert (
-        grad_threshold(strategy, 30_000)
-        == grad_threshold(strategy, 60_000)
-        == strategy.grad_threshold
-    )
-    thresholds = [grad_threshold(strategy, steps) for steps in (500, 2000, 7000, 29_999)]
-    assert thresholds == sorted(thresholds)
-    assert thresholds[0] > 0.25 * strategy.grad_threshold
 
 
 def _config(
@@ -143,19 +112,6 @@ def test_rates_of_what_moves_are_the_published_ones_at_any_length(model: SceneMo
     assert rate_factors(_config(500, OptimConfig(rate_factor=2), model)) == (2, 2)
 
 
-def test_given_rates_are_multiplied_too() -> None:
-    given = OptimConfig(lr_means=1.0, lr_quats=0.5, rate_factor=3)
-    assert learning_rates(_config(30_000)) == OptimConfig(rate_factor=1)
-    short = learning_rates(_config(700, given))
-    assert (short.lr_means, short.lr_quats, short.lr_opacities) == (
-        3,
-        1.5,
-        3 * OptimConfig().lr_opacities,
-    )
-    as_published = given.model_copy(update={"rate_factor": 1.0})
-    assert learning_rates(_config(700, as_published)) == as_published
-
-
 def test_means_rate_is_log_linear_times_the_extent() -> None:
     options = OptimConfig()
     assert means_rate(options, 0.0, 2.0) == pytest.approx(3.2e-4)
@@ -173,22 +129,9 @@ def test_sh_degree_rises_at_the_scaled_steps(steps: int, every: int) -> None:
     assert active_sh_degree(options, steps, 0) == 0
 
 
-@pytest.mark.parametrize("steps", [1000, 2000, 7000, 15_000, 30_000])
-def test_mcmc_can_reach_its_cap_at_any_length(steps: int) -> None:
-    schedule = densify_schedule(McmcStrategy(), steps, white_background=False)
-    changes = sum(schedule.densifies_at(step) for step in range(steps))
-    assert (1 + growth_per_change(steps)) ** changes > 15
-
-
 @pytest.mark.parametrize("steps", [1, 20, 7000, 30_000, 300_000])
 def test_growth_is_the_published_one_or_more_up_to_a_quarter_at_any_length(steps: int) -> None:
     assert GROWTH <= growth_per_change(steps) <= MAX_GROWTH
-
-
-def test_the_filter_is_refreshed_after_densification_only() -> None:
-    steps = filter_steps(DefaultStrategy(), 7000)
-    assert (steps[0], steps[-1], steps.step) == (3500, 6900, 100)
-    assert len(filter_steps(DefaultStrategy(), 50)) == 0
 
 
 @settings(max_examples=150, deadline=None)
@@ -208,27 +151,6 @@ def test_phases_of_a_dynamic_model_come_in_order(
         deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), Rates(steps)).splits
         == ()
     )
-
-
-def test_phases_of_runs_of_usual_lengths() -> None:
-    """Splits come after a tenth, three tenths and a half of the steps that see all times."""
-    schedule = deform_schedule(
-        DynamicModel(motion_from=0.13, time_window_full_at=0.4), Rates(20_000)
-    )
-    assert (schedule.fine, schedule.full, schedule.splits) == (2600, 8000, (9200, 11_600, 14_000))
-    assert deform_schedule(DynamicModel(time_window_full_at=0.69), Rates(1000)).splits == (
-        721,
-        783,
-        845,
-    )
-    assert deform_schedule(DynamicModel(), Rates(1)).fine == 1
-
-
-@pytest.mark.parametrize(("steps", "fine"), [(300, 100), (2000, 666), (5000, 1000), (10_000, 1300)])
-def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
-    """1000 steps, but no more than a third of the run, unless a larger share is asked for."""
-    assert deform_schedule(DynamicModel(motion_from=0.13), Rates(steps)).fine == fine
-    assert deform_schedule(DynamicModel(motion_from=0.5), Rates(steps)).fine == steps // 2
 
 
 @pytest.mark.parametrize(
@@ -252,15 +174,6 @@ def test_images_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None
     assert set(divisors[600:]) == {1}
     if coarsest == 8:
         assert [divisors.index(x) + 1 for x in (4, 2, 1)] == [300, 450, 600]
-
-
-def test_images_may_sharpen_at_once() -> None:
-    """Also where the last halving is asked for before the first."""
-    for to in (0.5, 0.2):
-        options = TrainConfig(
-            steps=10, initial_downscale=4, resolution_grows_from=0.5, resolution_full_at=to
-        )
-        assert [image_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6
 
 
 @given(st.integers(1, 1000), st.floats(0, 1))

@@ -7,8 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.core.state import tensors_of
-from dyngs.gaussians.visibility import VisibilityMasks, matched
+from dyngs.gaussians.visibility import VisibilityMasks
 
 TIMES = (0.0, 0.25, 0.5, 1.0)
 
@@ -34,33 +33,8 @@ def test_a_time_lies_between_two_key_times(time: float, interval: int) -> None:
     assert some_masks()[0].interval(time) == interval
 
 
-def test_active_is_what_either_end_sees() -> None:
-    masks, seen = some_masks()
-    for k in range(3):
-        assert torch.equal(masks.active(k), torch.nonzero(seen[k] | seen[k + 1])[:, 0])
-
-
 def test_they_follow_the_gaussians() -> None:
     masks, seen = some_masks()
     index = torch.tensor([18, 3, 3, 0])
     assert torch.equal(masks.select(index).seen, seen[:, index])
     assert masks.select(index).times == TIMES
-
-
-def test_through_a_checkpoint() -> None:
-    masks, seen = some_masks()
-    again = VisibilityMasks.restored(tensors_of(masks.state()))
-    assert again is not None
-    assert (again.times, again.count) == (TIMES, 19)
-    assert torch.equal(again.seen, seen)
-    assert VisibilityMasks.restored({}) is None
-    with pytest.raises(KeyError, match="bits"):
-        VisibilityMasks.restored({"times": torch.zeros(2)})
-
-
-def test_matched_finds_the_common_ones_in_both() -> None:
-    rows = torch.tensor([1, 4, 5, 8])
-    active = torch.tensor([0, 4, 6, 8])
-    asked, places = matched(rows, active, 9)
-    assert torch.equal(rows[asked], torch.tensor([4, 8]))
-    assert torch.equal(active[places], torch.tensor([4, 8]))

@@ -17,7 +17,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.opened import open_run
@@ -34,9 +34,7 @@ def toy() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(
-        folder, StillOptions(size=24, num_train=6, num_test=2, samples=1, distance=4.0)
-    )
+    write_still_capture(folder, StillOptions(size=24, num_train=6, num_test=2, samples=1))
     return folder
 
 

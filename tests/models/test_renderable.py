@@ -24,13 +24,12 @@ from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.levels import LevelScene
+from dyngs.gaussians.static_scene import Sides, StaticScene
 from dyngs.human.predict.fields.people import Body, Sources
 from dyngs.human.predict.fields.scene import SECTIONS, PredictedField, network_of
 from dyngs.models.renderable import DrawOptions, Renderable
 from dyngs.ops.rays import Space
-from dyngs.static.levels import LevelScene
-from dyngs.static.scene import StaticScene
-from dyngs.static.sides import Sides
 
 SPACE = Space((0.0, 0.0, 0.0), 2.0, 1, 8)
 WITH_CAMERA_GRADIENTS = (*KINDS, "sides")

@@ -22,14 +22,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.ops.checks import (
     MAX_SIDE,
-    check_choice,
-    check_count,
     check_finite,
-    check_memory,
-    check_near_and_far,
-    check_number,
     check_size,
-    count_nonfinite_op,
     finite_rows,
 )
 from dyngs.ops.native import core
@@ -85,34 +79,6 @@ def test_the_ends_of_the_ranges_are_allowed(options: dict[str, Any]) -> None:
     assert RenderOptions(**options).projection.near >= 0
 
 
-def test_largest_alpha_leaves_something_in_float32() -> None:
-    from dyngs.ops.rasterization import LARGEST_ALPHA
-
-    assert 1 - torch.tensor(BlendOptions(alpha_max=LARGEST_ALPHA).alpha_max) > 0
-
-
-def test_messages_say_what_is_wanted_and_what_was_given() -> None:
-    for check, message in (
-        (
-            lambda: check_number("size", math.nan, 0),
-            "size must be a number of at least 0 and finite, got nan",
-        ),
-        (
-            lambda: check_number("share", 2, 0, 1),
-            "share must be a number of at least 0 and at most 1, got 2",
-        ),
-        (
-            lambda: check_count("degree", 7, 0, 4),
-            "degree must be a whole number from 0 to 4, got 7",
-        ),
-        (lambda: check_choice("mode", "x", ("a", "b")), "mode must be one of a, b, got 'x'"),
-        (lambda: check_near_and_far(2, 1), "far must lie beyond near, got near 2 and far 1"),
-    ):
-        with pytest.raises(DyngsError) as caught:
-            check()
-        assert str(caught.value) == message
-
-
 BAD = [float("nan"), float("inf"), -float("inf")]
 DTYPES = [torch.float32, torch.float64]
 
@@ -152,32 +118,11 @@ def test_extreme_but_finite_numbers_pass(dtype: torch.dtype) -> None:
     )
 
 
-def test_sees_strided_and_large_tensors() -> None:
-    wide = torch.zeros(200_000, 2)
-    wide[:, 1] = float("nan")
-    check_finite({"x": wide[:, 0]})
-    wide[199_999, 0] = float("inf")
-    with pytest.raises(DyngsError, match="holds 1 NaN or infinite"):
-        check_finite({"x": wide[:, 0]})
-
-
 def test_rows_are_finite_only_if_they_are_in_every_tensor() -> None:
     one = torch.zeros(3, 2)
     two = torch.zeros(3)
     one[0, 1], two[2] = float("nan"), float("inf")
     assert finite_rows([one, two]).tolist() == [False, True, False]
-
-
-def test_nothing_is_finite() -> None:
-    check_finite({"x": torch.zeros(0, 3)})
-    assert finite_rows([torch.zeros(0, 3)]).shape == (0,)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_is_a_well_behaved_torch_op(dtype: torch.dtype) -> None:
-    x = torch.tensor([1.0, float("nan"), float("inf")], dtype=dtype)
-    assert count_nonfinite_op([x, x[:2], x[:1]]).tolist() == [2, 1, 0]
-    torch.library.opcheck(count_nonfinite_op, ([x, x[:2]],))
 
 
 def veils(count: int = 1) -> Projection:
@@ -207,20 +152,6 @@ def test_sides_that_cannot_be_are_refused(side: int) -> None:
             project(torch.ones(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), cameras)
 
 
-def test_the_kernels_refuse_them_too() -> None:
-    for width, height, threads in (
-        (0, 5, 1),
-        (5, MAX_SIDE + 1, 1),
-        (5, 5, 0),
-        (5, 5, -3),
-        (5, 5, 10**9),
-    ):
-        with pytest.raises(ValueError, match=r"is .*, expected 1 to"):
-            core.BlendSettings(width, height, 0.0, 0.99, 0.0, threads)
-        with pytest.raises(ValueError, match=r"is .*, expected 1 to"):
-            core.ProjectSettings(width, height, 0.3, 0.2, 1e10, 0.0, 0.0, False, threads)
-
-
 def test_a_image_larger_than_memory_is_refused() -> None:
     side = MAX_SIDE
     with pytest.raises(
@@ -245,15 +176,6 @@ def test_pairs_beyond_counting_are_refused_soon() -> None:
         bin_tiles(veils(count), torch.ones(1, count), (2**14, 2**17))
 
 
-def test_memory_that_is_there_is_not_asked_for() -> None:
-    check_memory(10**6, "this", torch.empty(0))
-    with pytest.raises(
-        DyngsError,
-        match=r"^render refused: this take 1000000000.0 GB; \d+\.\d GB of memory are available",
-    ):
-        check_memory(10**18, "this", torch.empty(0))
-
-
 # --- what the system says
 # ---------------------------------------------------------------------------------------------
 
@@ -270,16 +192,6 @@ def test_memory_of_the_machine(tmp_path: Path) -> None:
     assert core.available_memory(system(tmp_path, {})) == 8_192_000_000
 
 
-@pytest.mark.parametrize("limit", ["max", "9223372036854771712", "99999999999999999999"])
-def test_control_groups_without_a_limit(tmp_path: Path, limit: str) -> None:
-    files = {
-        "proc/self/cgroup": "0::/a\n",
-        "sys/fs/cgroup/a/memory.max": limit,
-        "sys/fs/cgroup/a/memory.current": "5",
-    }
-    assert core.available_memory(system(tmp_path, files)) == 8_192_000_000
-
-
 def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
     """Files that the kernel can drop are not used up."""
     group = "sys/fs/cgroup/user.slice"
@@ -291,22 +203,6 @@ def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
         f"{group}/app/memory.max": "max\n",
     }
     assert core.available_memory(system(tmp_path, files)) == 1_500_000_000
-
-
-def test_control_groups_of_version_1(tmp_path: Path) -> None:
-    group = "sys/fs/cgroup/memory"
-    files = {
-        "proc/self/cgroup": "9:cpu:/\n4:memory:/job\n0::/\n",
-        f"{group}/memory.limit_in_bytes": "9223372036854771712\n",
-        f"{group}/job/memory.limit_in_bytes": "2000000000\n",
-        f"{group}/job/memory.usage_in_bytes": "2500000000\n",
-        f"{group}/job/memory.stat": "total_inactive_file 100000000\n",
-    }
-    assert core.available_memory(system(tmp_path, files)) == 0
-
-
-def test_nothing_is_known_of_the_system(tmp_path: Path) -> None:
-    assert core.available_memory(str(tmp_path)) == 2**63 - 1
 
 
 # --- in a process with little memory

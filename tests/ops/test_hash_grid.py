@@ -15,12 +15,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.ops.hash_grid import (
     HashLevels,
     hash_features,
-    hash_grid_backward_op,
-    hash_grid_op,
     known_features,
-    known_features_op,
 )
-from dyngs.ops.native import kernel_threads
 
 LEVELS = HashLevels.geometric(4, 3, 24, 64)
 
@@ -71,39 +67,6 @@ def test_double_equals_the_formula(
     assert torch.allclose(by_kernel, by_formula, rtol=1e-12, atol=1e-12)
 
 
-def test_gradients_are_those_of_finite_differences() -> None:
-    levels = HashLevels.geometric(2, 2, 4, 8)
-    coords = some(6)
-    table = table_of(levels, 2)
-    sizes = list(levels.scales), list(levels.sizes), list(levels.rows)
-    assert torch.autograd.gradcheck(lambda x: hash_grid_op(coords, x, *sizes), (table,))
-
-
-@pytest.mark.parametrize("features", [2, 4])
-def test_the_same_bytes_on_any_number_of_threads(features: int) -> None:
-    """More threads than levels share the rows of a level between them."""
-    coords = some(5000).float()
-    table = table_of(LEVELS, features).detach().float().requires_grad_()
-    weights = torch.randn(5000, 4 * features, generator=torch.Generator().manual_seed(3))
-    results = []
-    for threads in (1, 2, 7):
-        with kernel_threads(threads):
-            found = hash_features(coords, table, LEVELS)
-            results.append((found.detach(), torch.autograd.grad(found, table, weights)[0]))
-    assert all(
-        torch.equal(a, b) for one in results[1:] for a, b in zip(one, results[0], strict=True)
-    )
-
-
-def test_single_precision_is_close() -> None:
-    coords = some(200)
-    table = table_of(LEVELS, 4).detach()
-    exact = hash_features(coords, table, LEVELS)
-    single = hash_features(coords.float(), table.float(), LEVELS)
-    # weights are off by 24 cells times the rounding of a coordinate
-    assert (single.double() - exact).abs().max() < 1e-4
-
-
 def test_known_features_have_the_gradient_of_a_look_up() -> None:
     coords = some(40)
     table = table_of(LEVELS, 2)
@@ -125,15 +88,6 @@ def test_a_coordinate_that_is_no_number_shows(bad: float) -> None:
     assert found.isfinite().all(1).tolist() == [True, True, False, True, True]
 
 
-def test_nan_in_a_row_reaches_only_points_beside_it() -> None:
-    table = table_of(LEVELS, 1).detach()
-    table[0] = math.nan  # the lowest corner of the coarsest level
-    found = hash_features(
-        torch.tensor([[0.0, 0, 0], [0.9, 0.9, 0.9]], dtype=torch.float64), table, LEVELS
-    )
-    assert found.isfinite().all(1).tolist() == [False, True]
-
-
 def test_what_does_not_fit_is_refused() -> None:
     coords = some(4)
     table = table_of(LEVELS, 2)
@@ -146,15 +100,3 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         with pytest.raises(DyngsError, match=message):
             hash_features(points, rows, LEVELS)
-
-
-def test_the_ops_are_registered_as_torch_wants_them() -> None:
-    coords = some(6)
-    table = table_of(LEVELS, 2)
-    sizes = list(LEVELS.scales), list(LEVELS.sizes), list(LEVELS.rows)
-    features = hash_features(coords, table, LEVELS).detach()
-    torch.library.opcheck(hash_grid_op, (coords, table, *sizes))
-    torch.library.opcheck(hash_grid_backward_op, (coords, table.detach(), features, *sizes))
-    torch.library.opcheck(
-        known_features_op, (features, torch.tensor([1, 4]), coords[[1, 4]], table, *sizes)
-    )

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.loss import _ssim_map, l1_ssim_loss, l1_ssim_op, reference_l1_ssim, ssim
+from dyngs.ops.loss import _ssim_map, l1_ssim_loss, reference_l1_ssim, ssim
 
 # Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its
 # gradient; the images have contrast everywhere, so nothing cancels after that. Of 3,300 draws none
@@ -78,20 +78,6 @@ def test_equals_float64_reference_across_tiles(height: int, width: int) -> None:
     assert_equals_reference(rendered, target, 0.2, mask.clamp_min(0.1))
 
 
-def test_flat_bright_images_keep_their_digits() -> None:
-    # Here E[x^2] - E[x]^2 loses all digits in float32: the plain formula is off by half the value.
-    # The fused one works on x - y and has the value; its gradient still contains the variance of x
-    # + y, hence the wider tolerance.
-    target = torch.ones(64, 64, 3)
-    rendered = target - 1e-3 * make_images(64, 64)[0]
-    value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
-    expected, expected_gradient = value_and_gradient(
-        reference_l1_ssim, rendered.double(), target.double(), 1.0
-    )
-    assert value == pytest.approx(expected, rel=2e-4)
-    assert (gradient - expected_gradient).abs().max() <= 5e-4 * expected_gradient.abs().max()
-
-
 def test_reference_agrees_with_scikit_image() -> None:
     metrics = pytest.importorskip("skimage.metrics")
     rendered, target, _ = (x.double() for x in make_images(40, 50))
@@ -129,29 +115,6 @@ def test_equal_images_cost_exactly_nothing() -> None:
         assert value == 0
         assert not gradient.any()
     assert ssim(rendered, rendered).item() == 1
-
-
-def test_any_number_of_threads_gives_the_same_bytes() -> None:
-    rendered, target, mask = make_images(210, 530)
-    before = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            results.append(value_and_gradient(l1_ssim_loss, rendered, target, 0.2, mask))
-    finally:
-        torch.set_num_threads(before)
-    for value, gradient in results[1:]:
-        assert value == results[0][0]
-        assert torch.equal(gradient, results[0][1])
-
-
-def test_mask_of_ones_is_no_mask() -> None:
-    rendered, target, _ = make_images(20, 30)
-    value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 0.2, torch.ones(20, 30))
-    expected, expected_gradient = value_and_gradient(l1_ssim_loss, rendered, target, 0.2, None)
-    assert value == expected
-    assert torch.equal(gradient, expected_gradient)
 
 
 def test_what_the_mask_hides_does_not_matter() -> None:
@@ -222,78 +185,6 @@ def test_one_large_pixel_costs_what_the_formula_says(large: float, ssim_weight: 
     rendered[5, 5] = 0  # its own window, but far from the large pixel of the other image
     target[100, 280, 0] = large
     assert math.isfinite(value_and_gradient(l1_ssim_loss, rendered, target, ssim_weight)[0])
-
-
-def test_a_bright_tile_leaves_the_others_their_bytes() -> None:
-    rendered, target, _ = make_images(97, 800)
-    _, ordinary = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
-    rendered[50, 10] = 30.0
-    _, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
-    assert torch.equal(gradient[:, 300:], ordinary[:, 300:])
-    assert not torch.equal(gradient[:, :20], ordinary[:, :20])
-
-
-def test_reference_in_float32_keeps_its_digits() -> None:
-    rendered, target, _ = (1000 + 0.2 * x for x in make_images(30, 30))
-    expected = reference_l1_ssim(rendered.double(), target.double(), 1.0).item()
-    assert reference_l1_ssim(rendered, target, 1.0).item() == pytest.approx(expected, rel=1e-5)
-
-
-def test_upstream_gradient_scales() -> None:
-    rendered, target, _ = make_images(12, 17)
-    _, gradient = value_and_gradient(l1_ssim_loss, rendered, target)
-    _, tripled = value_and_gradient(lambda *x: 3 * l1_ssim_loss(*x), rendered, target)
-    torch.testing.assert_close(tripled, 3 * gradient)
-
-
-def test_target_gets_no_gradient() -> None:
-    rendered, target, _ = make_images(8, 8)
-    target.requires_grad_()
-    l1_ssim_loss(rendered.requires_grad_(), target).backward()
-    assert target.grad is None
-
-
-def test_strided_and_half_inputs() -> None:
-    rendered, target, _ = make_images(20, 30)
-    expected, expected_gradient = value_and_gradient(l1_ssim_loss, rendered, target)
-    strided = rendered.permute(2, 0, 1).contiguous().permute(1, 2, 0)
-    value, gradient = value_and_gradient(l1_ssim_loss, strided, target)
-    assert value == expected
-    assert torch.equal(gradient, expected_gradient)
-
-    half = rendered.half()
-    half_target = target.half()
-    value, gradient = value_and_gradient(l1_ssim_loss, half, half_target)
-    assert gradient.dtype == torch.float16
-    assert value == l1_ssim_loss(half.float(), half_target.float()).item()
-
-
-def test_no_grad_gives_the_same_value() -> None:
-    rendered, target, mask = make_images(20, 30)
-    value, _ = value_and_gradient(l1_ssim_loss, rendered, target, 0.2, mask)
-    assert l1_ssim_loss(rendered, target, 0.2, mask).item() == value
-
-
-def test_gradcheck_in_float64() -> None:
-    rendered, target, mask = (x.double() for x in make_images(4, 7))
-    rendered.requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, 0.2), rendered)
-    assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, 0.2, mask), rendered)
-
-
-def test_opcheck() -> None:
-    rendered, target, mask = make_images(13, 14)
-    torch.library.opcheck(l1_ssim_op, (rendered.clone().requires_grad_(), target, mask, 0.2, True))
-    torch.library.opcheck(l1_ssim_op, (rendered, target, None, 0.2, False))
-
-
-def test_compiles_to_one_graph() -> None:
-    rendered, target, _ = make_images(13, 14)
-    compiled = torch.compile(l1_ssim_loss, fullgraph=True, backend="aot_eager")
-    value, gradient = value_and_gradient(compiled, rendered, target)
-    expected, expected_gradient = value_and_gradient(l1_ssim_loss, rendered, target)
-    assert value == expected
-    assert torch.equal(gradient, expected_gradient)
 
 
 @pytest.mark.parametrize(

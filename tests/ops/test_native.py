@@ -16,12 +16,8 @@ import torch
 from dyngs.core.errors import DyngsError
 from dyngs.ops import native
 from dyngs.ops.native import (
-    active_isa,
-    array,
-    built_isas,
     choose_isa,
     core,
-    core_for,
     kernel_threads,
     num_threads,
 )
@@ -39,10 +35,6 @@ def imported_with(isa: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def test_the_best_kernels_are_loaded() -> None:
-    assert active_isa() == choose_isa(built_isas(), core.best_isa(), os.environ.get("DYNGS_ISA"))
 
 
 @pytest.mark.parametrize(
@@ -92,28 +84,9 @@ def test_kernels_that_would_crash_are_refused(
         choose_isa(built, newest, requested)
 
 
-def test_each_compiled_instruction_set_can_be_requested(monkeypatch: pytest.MonkeyPatch) -> None:
-    for isa in built_isas():
-        if isa <= core.best_isa():
-            module = imported_with(isa, monkeypatch)
-            assert (module.active_isa(), module.core.__name__.rsplit("_", 1)[1]) == (isa, isa)
-
-
 def test_an_unknown_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DyngsError, match=r"^DYNGS_ISA=v9: here run v"):
         imported_with("v9", monkeypatch)
-
-
-def test_kernels_follow_torch_unless_told_otherwise() -> None:
-    before = torch.get_num_threads()
-    assert num_threads() == before
-    with kernel_threads(3):
-        assert num_threads() == 3
-        assert torch.get_num_threads() == 1
-        with kernel_threads(2):
-            assert num_threads() == 2
-        assert num_threads() == 3
-    assert (num_threads(), torch.get_num_threads()) == (before, before)
 
 
 def test_thread_counts_come_back_after_an_error() -> None:
@@ -121,18 +94,6 @@ def test_thread_counts_come_back_after_an_error() -> None:
     with pytest.raises(RuntimeError), kernel_threads(3):
         raise RuntimeError
     assert (num_threads(), torch.get_num_threads()) == (before, before)
-
-
-def test_array_detaches_and_copies_only_if_needed() -> None:
-    x = torch.zeros(4, 2, requires_grad=True)
-    assert torch.from_dlpack(array(x)).data_ptr() == x.data_ptr()
-    assert not torch.from_dlpack(array(x)).requires_grad
-    assert torch.from_dlpack(array(x[:, 0])).stride() == (1,)
-
-
-def test_float64_on_a_gpu_is_refused_in_one_line() -> None:
-    with pytest.raises(DyngsError, match=r"^float64 is not there on a GPU; use float32$"):
-        core_for(torch.zeros(3, dtype=torch.float64, device="meta"))
 
 
 def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:

@@ -6,14 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.ops.native import kernel_threads
 from dyngs.ops.nodes import (
     HEAD_SIZES,
     cubic_fractions,
     node_penalties,
-    node_penalties_op,
-    nodes_at_backward_op,
-    nodes_at_op,
     spline_motion,
 )
 from dyngs.ops.quaternions import identity_quat, rotate
@@ -110,40 +106,9 @@ def test_penalties_equal_torch(dtype: torch.dtype, tolerance: float) -> None:
         )
 
 
-def test_any_number_of_threads_gives_the_same_bytes() -> None:
-    heads = as_leaves(splines(count=900), torch.float32)
-    found = []
-    positions = normal(900, 3).float()
-    radii = 1 + normal(900).abs().float()
-    neighbours = torch.randint(900, (900, 3), generator=torch.Generator().manual_seed(1))
-    for threads in (1, 2, 5):
-        with kernel_threads(threads):
-            motion, values = spline_motion(heads, 0.4)
-            penalties = node_penalties(positions, radii, neighbours, motion, there(heads)[0])
-            found.append(with_gradients((motion, values, penalties), there(heads)))
-    for other in found[1:]:
-        assert all(torch.equal(x, y) for x, y in zip(found[0], other, strict=True))
-
-
 def test_a_neighbour_that_does_not_exist_is_refused() -> None:
     positions, radii, neighbours = graph()
     with pytest.raises(IndexError, match="no such node"):
         node_penalties(
             positions, radii, neighbours + NODES, normal(NODES, 7), normal(NODES, POINTS, 3)
         )
-
-
-def test_are_well_behaved_torch_ops() -> None:
-    for heads in (
-        as_leaves(splines(count=4), torch.float32),
-        as_leaves(splines(0b10001, count=4), torch.float32),
-    ):
-        torch.library.opcheck(nodes_at_op, (*heads, 0.3))
-        constants = [None if x is None else x.detach() for x in heads]
-        width = sum(x.shape[2] for x in there(heads)[1:])
-        grads = [normal(4, 7).float(), normal(4, width).float()]
-        torch.library.opcheck(nodes_at_backward_op, (*constants, grads, 0.3))
-    positions, radii, neighbours = (x.float() if x.is_floating_point() else x for x in graph())
-    motion = normal(NODES, 7).float().requires_grad_()
-    paths = normal(NODES, POINTS, 3).float().requires_grad_()
-    torch.library.opcheck(node_penalties_op, (positions, radii, neighbours, motion, paths))

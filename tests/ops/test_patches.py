@@ -7,25 +7,19 @@ import math
 
 import pytest
 import torch
-from patch_reference import bernstein, reference_blend, reference_values, reference_visible
+from patch_reference import reference_blend, reference_values, reference_visible
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.ops.native import kernel_threads
 from dyngs.ops.patches import (
     Places,
     blend_patches,
-    blend_patches_backward_op,
-    blend_patches_op,
     lattice,
     lattice_size,
     lattice_values,
     outline_crossings,
-    patch_ends_op,
     patch_values,
-    patch_values_backward_op,
-    patch_values_op,
     project_points,
     visible_patches,
 )
@@ -74,15 +68,6 @@ def test_values_are_those_of_bernstein_polynomials() -> None:
     )
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_derivatives_are_those_of_the_values(axis: int) -> None:
-    values, (ids, uv) = random_patches(3), random_places(20, 3)
-    step = torch.zeros(2, dtype=torch.float64)
-    step[axis] = 1e-5
-    slope = (patch_values(values, ids, uv + step) - patch_values(values, ids, uv - step)) / 2e-5
-    torch.testing.assert_close(patch_values(values, ids, uv, "uv"[axis]), slope)  # pyright: ignore[reportArgumentType]
-
-
 @pytest.mark.parametrize("segments", [1, 2, 5])
 def test_a_lattice_is_linear_between_its_points(segments: int) -> None:
     places, faces = lattice(segments)
@@ -96,14 +81,6 @@ def test_a_lattice_is_linear_between_its_points(segments: int) -> None:
     torch.testing.assert_close(found, values[0][faces].mean(1))
     some, uv = random_places(30, 2)
     assert torch.autograd.gradcheck(lambda x: lattice_values(x, some, uv, segments), values)
-
-
-def test_a_lattice_of_linear_values_is_them() -> None:
-    """A function that is linear on the whole patch is so on the lattice's, wherever it is looked
-    up."""
-    places, _ = lattice(4)
-    ids, uv = random_places(50, 1)
-    torch.testing.assert_close(lattice_values(places[None], ids, uv, 4), uv)
 
 
 def test_faces_of_a_lattice_face_alike_and_fill_it() -> None:
@@ -135,17 +112,6 @@ def test_what_is_shown_projects_to_its_pixel() -> None:
     rows = (ids[0] >= 0).nonzero()
     torch.testing.assert_close(20 * x / (z + 3) + 12, rows[:, 1].double() + 0.5)
     torch.testing.assert_close(21 * y / (z + 3) + 9, rows[:, 0].double() + 0.5)
-
-
-def test_both_sides_are_shown_and_the_first_of_equals() -> None:
-    patch = flat((-1, -1, 0), (1, -1, 0), (0, 1, 0))
-    turned = patch[:, [0, 2, 1, 5, 4, 3]]
-    ids, _ = visible_patches(torch.cat([patch, patch]), camera(), 0.2)
-    assert (ids == 0).sum() > 50
-    assert not (ids == 1).any()
-    torch.testing.assert_close(
-        visible_patches(turned, camera(), 0.2)[0], visible_patches(patch, camera(), 0.2)[0]
-    )
 
 
 def test_neighbours_leave_no_gap() -> None:
@@ -245,17 +211,6 @@ def test_an_outline_covers_the_area_that_it_encloses(turn: float) -> None:
     assert abs(float(image.sum()) - 0.75 * 3**0.5 * 20 * 21) < 0.01 * crossed + 1
 
 
-@pytest.mark.parametrize("edge", [0.0, 0.21, 0.5, 0.73])
-def test_a_pixel_is_covered_as_far_as_the_outline_goes(edge: float) -> None:
-    """An upright edge at column 15 + ``edge``."""
-    right = (15 + edge - 12) * 3 / 20
-    points = flat((right, -9, 0), (right, 9, 0), (-20, 0, 0))
-    _, through = drawn(points, camera())
-    torch.testing.assert_close(
-        through[0, 9, 13:18], torch.tensor([0, 0, 1 - edge, 1, 1], dtype=torch.float64)
-    )
-
-
 def test_the_nearer_one_covers_the_other_along_its_own_outline() -> None:
     """A strip before a wall: only the strip's edges are outlines, and only they get a gradient."""
     wall = flat((-9, -9, 1), (9, -9, 1), (0, 18, 1))
@@ -267,20 +222,6 @@ def test_the_nearer_one_covers_the_other_along_its_own_outline() -> None:
     (by_points,) = torch.autograd.grad(image.sum(), points)
     assert (by_points[0] == 0).all()
     assert by_points[1, 3, 0] > 1
-
-
-def test_two_that_meet_share_their_outline() -> None:
-    """Neighbours of one wall: no light comes through, and both ends of the outline move it."""
-    one = flat((0.03, -9, 0), (0.03, 9, 0), (-20, 0, 0))
-    other = flat((0.03, -9, 0), (0.03, 9, 0), (20, 0, 0))
-    points = torch.cat([one, other]).requires_grad_()
-    image, through = drawn(
-        points, camera(), torch.stack([torch.zeros(6, 1), torch.ones(6, 1)]).double()
-    )
-    assert (through == 0).all()
-    (by_points,) = torch.autograd.grad(image.sum(), points)
-    torch.testing.assert_close(by_points[0, :4].sum(0), by_points[1, :4].sum(0))
-    assert by_points[0, 0, 0] < 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -309,48 +250,6 @@ def test_the_gradient_is_that_of_what_is_drawn(seed: int) -> None:
     assert error < 0.1, (error, found, slopes)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_same_bytes_on_any_number_of_threads(dtype: torch.dtype) -> None:
-    points = random_patches(30, 3, 0.3).to(dtype)
-    cameras = camera(70, 75, 2.5, views=2).to(dtype=dtype)
-    results = []
-    for threads in (1, 2, 4):
-        with kernel_threads(threads):
-            values = points.clone().requires_grad_()
-            ids, uv = visible_patches(values, cameras, 0.2)
-            places = Places.of(ids, uv)
-            at = patch_values(values, places.ids, places.uv)
-            crossings = outline_crossings(values, cameras, places)
-            image, through = blend_patches(at[:, :2] * 20 + 30, at, crossings, places)
-            (image.square().sum() + through.sum()).backward()
-            results.append(
-                [ids, uv, crossings.detach(), image.detach(), through.detach(), values.grad]
-            )
-    for other in results[1:]:
-        for one, two in zip(results[0], other, strict=True):
-            assert one is not None
-            assert two is not None
-            assert torch.equal(one, two)
-
-
-def test_the_ops_are_those_of_torch() -> None:
-    values, (ids, uv) = random_patches(2), random_places(5, 2)
-    torch.library.opcheck(patch_values_op, (values.requires_grad_(), ids, uv, 0))
-    means, colours, crossings, places = some_image(0)
-    torch.library.opcheck(
-        patch_values_backward_op,
-        (values.detach(), ids, uv, torch.ones(5, 3, dtype=torch.float64), 0),
-    )
-    torch.library.opcheck(blend_patches_op, (means, colours, crossings, places.rows, places.ids))
-    inputs = [colours.detach(), crossings.detach(), places.rows, places.ids]
-    by_image = [x.detach() for x in blend_patches(means, colours, crossings, places)]
-    torch.library.opcheck(blend_patches_backward_op, (inputs, by_image))
-    at = [x.detach() for x in (camera().cam_from_world, camera().intrinsics)]
-    torch.library.opcheck(
-        patch_ends_op, (values.detach(), at, torch.zeros_like(ids), ids, uv, torch.zeros_like(ids))
-    )
-
-
 def test_what_does_not_fit_is_refused() -> None:
     values, (ids, uv) = random_patches(2), random_places(5, 2)
     with pytest.raises(DyngsError, match="values must be"):
@@ -363,10 +262,3 @@ def test_what_does_not_fit_is_refused() -> None:
         lattice_values(values, ids, uv, 0)
     with pytest.raises(DyngsError, match="near"):
         visible_patches(values, camera(), 0.0)
-
-
-def test_weights_of_a_patch_sum_to_one() -> None:
-    uv = random_places(20, 1)[1]
-    torch.testing.assert_close(
-        bernstein(uv[:, 0], uv[:, 1]).sum(1), torch.ones(20, dtype=torch.float64)
-    )

@@ -14,12 +14,9 @@ from torch import Tensor
 
 import dyngs.ops.perceptron as ops
 from dyngs.core.errors import DyngsError
-from dyngs.ops.native import kernel_threads
 from dyngs.ops.perceptron import (
     Layer,
     perceptron,
-    perceptron_backward_op,
-    perceptron_op,
     reference_perceptron,
 )
 
@@ -95,73 +92,6 @@ def test_double_equals_torch(
     assert_close(got, expected, 1e-12)
 
 
-@pytest.mark.parametrize(
-    ("widths", "skip", "rows"),
-    [
-        ([64, 64, 192, 10], None, 3000),
-        ([76, *[128] * 8, 10], 4, 300),
-        ([3, 300, 2], None, 500),
-        ([300, 5], None, 97),
-    ],
-)
-def test_float_is_near_double(widths: list[int], skip: int | None, rows: int) -> None:
-    x, layers = cast(make_rows(rows, widths[0]), make_layers(widths, skip), torch.float32)
-    expected = value_and_gradients(reference_perceptron, *cast(x, layers, torch.float64), skip)
-    got = value_and_gradients(perceptron, x, layers, skip)
-    # The value: sums of up to 300 terms, 2^-24 each, mostly cancelling, through up to nine layers.
-    assert_close(got[:1], expected[:1], 5e-6)
-    # The gradients: as much again. In addition a ReLU whose input is within rounding of 0 may
-    # switch, which changes a row's part of the gradient by far more than rounding; of 10^5 to 10^6
-    # units a few do, so these are counted only.
-    for a, b in zip(got[1:], expected[1:], strict=True):
-        off = (a.double() - b).abs() > 2e-5 * b.abs().max()
-        assert off.double().mean() < 0.01
-
-
-@pytest.mark.parametrize(
-    ("widths", "skip"), [([3, 4, 2], None), ([2, 5, 3, 4, 3], 2), ([4, 3], None), ([2, 3, 1], 1)]
-)
-def test_gradcheck(widths: list[int], skip: int | None) -> None:
-    layers = make_layers(widths, skip)
-    x = make_rows(400, widths[0]).detach()
-    # rows where no ReLU is within reach of a finite difference
-    safe = torch.ones(400, dtype=torch.bool)
-    h = x
-    for i, layer in enumerate(layers[:-1]):
-        h = torch.cat([h, x], dim=1) if i == skip else h
-        z = torch.nn.functional.linear(h, layer.weight, layer.bias)
-        safe &= (z.abs() > 0.02).all(dim=1)
-        h = z.relu()
-    x = x[safe][:5].requires_grad_()
-    assert x.shape[0] == 5
-
-    def function(x: Tensor, *flat: Tensor) -> Tensor:
-        return perceptron(
-            x, [Layer(w, b) for w, b in zip(flat[::2], flat[1::2], strict=True)], skip=skip
-        )
-
-    assert torch.autograd.gradcheck(function, (x, *parameters(layers)))
-
-
-@pytest.mark.parametrize("kept", [True, False])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_same_bits_on_any_number_of_threads(
-    dtype: torch.dtype, kept: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    widths = [20, 33, 70, 10]
-    skip = 2
-    x, layers = cast(make_rows(2500, widths[0]), make_layers(widths, skip), dtype)
-    results = []
-    with kernel_threads(1):
-        results.append(value_and_gradients(perceptron, x, layers, skip))  # activations kept
-    monkeypatch.setattr(ops, "KEPT_BYTES", 2**30 if kept else -1)
-    for count in (1, 2, 8):
-        with kernel_threads(count):
-            results.append(value_and_gradients(perceptron, x, layers, skip))
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
 def test_a_row_does_not_depend_on_its_place() -> None:
     """Blocks and tiles are an implementation detail: each row's output is the same bits alone and
     among others."""
@@ -187,85 +117,11 @@ def test_a_bad_row_stays_alone(value: float, skip: int | None) -> None:
     assert bad[77].isnan().all() or not math.isnan(value)
 
 
-def test_gradients_by_the_inputs_of_other_rows_survive_nan() -> None:
-    x, layers = cast(make_rows(130, 11), make_layers([11, 20, 5], None), torch.float32)
-    spoilt = x.detach().clone()
-    spoilt[77] = math.nan
-    spoilt.requires_grad_()
-    good, bad = (torch.autograd.grad(perceptron(t, layers).sum(), t)[0] for t in (x, spoilt))
-    others = torch.arange(130) != 77
-    assert torch.equal(good[others], bad[others])
-
-
-def test_strided_and_transposed_inputs() -> None:
-    layers = make_layers([6, 8, 4], None)
-    wide = make_rows(12, 50).detach()
-    x = wide.t()[::2, ::2]  # (25, 6)
-    transposed = [Layer(layer.weight.t().contiguous().t(), layer.bias) for layer in layers]
-    assert torch.equal(perceptron(x, transposed), perceptron(x.contiguous(), layers))
-    y = perceptron(x.clone().requires_grad_(), layers)
-    expanded = torch.ones(1, 1, dtype=torch.float64).expand_as(y)
-    a = torch.autograd.grad(y, parameters(layers), expanded, retain_graph=True)
-    b = torch.autograd.grad(y, parameters(layers), expanded.contiguous())
-    assert all(torch.equal(p, q) for p, q in zip(a, b, strict=True))
-
-
-def test_known_answers() -> None:
-    weight = torch.tensor([[2.0, 0.0], [0.0, -1.0]])
-    layers = [
-        Layer(weight, torch.tensor([0.0, 1.0])),
-        Layer(torch.tensor([[1.0, 10.0]]), torch.tensor([0.5])),
-    ]
-    x = torch.tensor([[1.0, 3.0], [-1.0, -3.0]])
-    # Hidden, after the ReLU: (2, 0) and (0, 4).
-    assert perceptron(x, layers).tolist() == [[2.5], [40.5]]
-    # no ReLU after the last layer
-    assert perceptron(x, layers[:1]).tolist() == [[2.0, -2.0], [-2.0, 4.0]]
-    with_input = [layers[0], Layer(torch.tensor([[1.0, 10.0, 100.0, 1000.0]]), torch.tensor([0.5]))]
-    assert perceptron(x, with_input, skip=1).tolist() == [[3102.5], [-3059.5]]
-
-
 def test_half_precision_is_computed_in_float() -> None:
     x, layers = cast(make_rows(9, 5), make_layers([5, 7, 3], None), torch.bfloat16)
     assert perceptron(x, layers).dtype == torch.float32
     grads = torch.autograd.grad(perceptron(x, layers).sum(), [x, *parameters(layers)])
     assert {g.dtype for g in grads} == {torch.bfloat16}
-
-
-def test_gradients_that_nobody_asked_for_are_not_computed() -> None:
-    layers = make_layers([5, 7, 3], None)
-    x = make_rows(9, 5).detach()
-    frozen = [Layer(layer.weight.detach(), layer.bias.detach()) for layer in layers]
-    assert not perceptron(x, frozen).requires_grad
-    with_x = make_rows(9, 5)
-    expected = torch.autograd.grad(perceptron(with_x, layers).sum(), [with_x, *parameters(layers)])
-    assert torch.equal(
-        torch.autograd.grad(perceptron(with_x, frozen).sum(), with_x)[0], expected[0]
-    )
-    grads = torch.autograd.grad(perceptron(x, layers).sum(), parameters(layers))
-    assert all(torch.equal(a, b) for a, b in zip(grads, expected[1:], strict=True))
-
-
-def test_is_a_well_behaved_torch_op() -> None:
-    layers = make_layers([5, 7, 3], None)
-    params = torch.cat([p.detach().reshape(-1) for p in parameters(layers)]).requires_grad_()
-    # Activations are not kept here: opcheck would compare the padding between them, which nobody
-    # writes or reads.
-    torch.library.opcheck(perceptron_op, (make_rows(9, 5), params, [5, 7, 3], 0, False))
-    inputs = [make_rows(9, 5).detach(), params.detach(), torch.empty(0)]
-    grad = make_rows(9, 3).detach()
-    torch.library.opcheck(perceptron_backward_op, (inputs, grad, [5, 7, 3], 0, True))
-
-
-def test_compiles_in_one_graph() -> None:
-    x = make_rows(9, 5)
-    layers = make_layers([5, 7, 3], 1)
-    compiled = torch.compile(perceptron, fullgraph=True, backend="aot_eager")
-    assert_close(
-        value_and_gradients(compiled, x, layers, 1),
-        value_and_gradients(perceptron, x, layers, 1),
-        0.0,
-    )
 
 
 def bad_input(change: str) -> tuple[Tensor, list[Layer], int | None]:

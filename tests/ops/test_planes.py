@@ -14,14 +14,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.native import core, kernel_threads
 from dyngs.ops.planes import (
     PlaneLevel,
-    hexplane_backward_op,
     hexplane_features,
-    hexplane_op,
     plane_penalty,
-    plane_penalty_op,
 )
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -148,11 +144,6 @@ def assert_all_close(got: list[Tensor], expected: list[Tensor], tolerance: float
         assert (a.double() - b).abs().max().item() <= tolerance * scale if b.numel() else True
 
 
-def assert_equal(got: list[Tensor], expected: list[Tensor]) -> None:
-    assert len(got) == len(expected)
-    assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     count=st.integers(0, 70),
@@ -169,62 +160,6 @@ def test_features_equal_grid_sample(
     coords = make_coords(count, seed=seed)
     got = run_features(hexplane_features, coords, time, levels)
     assert_all_close(got, run_features(reference_features, coords, time, levels), 1e-12)
-
-
-@pytest.mark.parametrize("channels", [32, 19])
-def test_every_instruction_set_gives_the_same_features(isa: str, channels: int) -> None:
-    levels = make_levels((16, 32), 9, channels)
-    coords = make_coords(300)
-    expected = run_features(reference_features, coords, 0.37, levels)
-    assert_all_close(run_features(hexplane_features, coords, 0.37, levels), expected, 1e-12)
-    singles = [PlaneLevel(x.space.float(), x.time.float()) for x in levels]
-    # Products of six numbers and sums of some hundred terms are good to 1e-6. An index u * 15.5 +
-    # 15.5 is good to 2e-6, and the gradient by u is multiplied by 15.5.
-    got = run_features(hexplane_features, coords.float(), 0.37, singles)
-    inside = run_features(reference_features, coords.float().double(), 0.37, levels)
-    assert_all_close(got, inside, 2e-5)
-
-
-@pytest.mark.parametrize("channels", [48, 5])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_any_number_of_threads_gives_the_same_bytes(channels: int, dtype: torch.dtype) -> None:
-    # two levels of three packets of channels or one: more tasks than threads, and fewer
-    levels = make_levels((20, 33), 7, channels, dtype)
-    coords = make_coords(1500, dtype)
-    features = []
-    penalties = []
-    for threads in (1, 2, 3, 8):
-        with kernel_threads(threads):
-            features.append(run_features(hexplane_features, coords, 0.61, levels))
-            penalties.append(run_penalty(plane_penalty, levels))
-    for other in features[1:]:
-        assert_equal(other, features[0])
-    for other in penalties[1:]:
-        assert_equal(other, penalties[0])
-
-
-def test_gradcheck_of_features() -> None:
-    levels = make_levels((3, 5), 3, 3)
-    # a quarter between samples of both levels, away from the kinks
-    generator = torch.Generator().manual_seed(3)
-    coords = torch.randint(-4, 4, (6, 3), generator=generator).double() / 4 + 0.125
-    inputs = [x.requires_grad_() for x in (coords, *leaves(levels))]
-
-    def function(at: Tensor, *planes: Tensor) -> Tensor:
-        pairs = zip(planes[::2], planes[1::2], strict=True)
-        return hexplane_features(at, 0.3, [PlaneLevel(space, time) for space, time in pairs])
-
-    assert torch.autograd.gradcheck(function, inputs)
-
-
-def test_gradcheck_of_penalty() -> None:
-    inputs = [x.requires_grad_() for x in leaves(make_levels((4, 5), 6, 3))]
-
-    def function(*planes: Tensor) -> Tensor:
-        pairs = zip(planes[::2], planes[1::2], strict=True)
-        return 2.5 * plane_penalty([PlaneLevel(space, time) for space, time in pairs], WEIGHTS)
-
-    assert torch.autograd.gradcheck(function, inputs)
 
 
 def test_samples_lie_where_they_are_said_to() -> None:
@@ -252,11 +187,6 @@ def test_first_and_last_time(time: float) -> None:
     assert not torch.cat([g_time[:, :row], g_time[:, row + 1 :]], dim=1).any()
 
 
-def test_only_two_times_get_a_gradient() -> None:
-    *_, g_time = run_features(hexplane_features, make_coords(20), 0.5, make_levels((5,), 8, 4))
-    assert [row for row in range(8) if g_time[:, row].any()] == [3, 4]
-
-
 def test_outside_the_box_is_its_border() -> None:
     levels = make_levels((6,), 3, 4)
     outside = torch.tensor([[-7.0, 0.3, 1e30], [math.inf, -math.inf, 0.1]], dtype=torch.float64)
@@ -276,54 +206,12 @@ def test_nan_stays_where_it_is(dtype: torch.dtype) -> None:
     assert g_coords.isnan().any(dim=1).nonzero().flatten().tolist() == [17]
 
 
-def test_no_points() -> None:
-    results = run_features(
-        hexplane_features, torch.zeros(0, 3), 0.5, make_levels((4, 8), 3, 32, torch.float32)
-    )
-    features, g_coords, *g_planes = results
-    assert features.shape == (0, 64)
-    assert g_coords.shape == (0, 3)
-    assert len(g_planes) == 4
-    assert not any(x.any() for x in g_planes)
-
-
 def test_order_of_points_does_not_matter() -> None:
     levels = make_levels((12,), 3, 16)
     coords = make_coords(100)
     shuffled = torch.randperm(100, generator=torch.Generator().manual_seed(5))
     features = hexplane_features(coords, 0.3, levels)
     assert torch.equal(hexplane_features(coords[shuffled], 0.3, levels), features[shuffled])
-
-
-def test_strided_inputs() -> None:
-    levels = make_levels((7,), 4, 18)
-    coords = make_coords(30)
-    strided = [
-        PlaneLevel(
-            *(x.permute(3, 0, 1, 2).contiguous().permute(1, 2, 3, 0) for x in leaves(levels))
-        )
-    ]
-    assert not strided[0].space.is_contiguous()
-    expected = run_features(hexplane_features, coords, 0.4, levels)
-    assert_equal(run_features(hexplane_features, coords.T.contiguous().T, 0.4, strided), expected)
-    assert_equal(run_penalty(plane_penalty, strided), run_penalty(plane_penalty, levels))
-    # an expanded upstream gradient, as sums give
-    (leaf,) = with_gradients(levels)
-    hexplane_features(coords, 0.4, [leaf]).sum().backward()
-    (dense,) = with_gradients(levels)
-    hexplane_features(coords, 0.4, [dense]).backward(torch.ones(30, 18, dtype=torch.float64))
-    assert leaf.space.grad is not None
-    assert dense.space.grad is not None
-    assert torch.equal(leaf.space.grad, dense.space.grad)
-
-
-def test_constant_coordinates_get_no_gradient() -> None:
-    (level,) = with_gradients(make_levels((5,), 3, 4))
-    coords = make_coords(9)
-    hexplane_features(coords, 0.5, [level]).sum().backward()
-    assert coords.grad is None
-    assert level.space.grad is not None
-    assert not hexplane_features(coords, 0.5, make_levels((5,), 3, 4)).requires_grad
 
 
 @settings(max_examples=30, deadline=None)
@@ -345,29 +233,6 @@ def test_penalty_equals_reference(
     )
 
 
-def test_every_instruction_set_gives_the_same_penalty(isa: str) -> None:
-    levels = make_levels((16, 33), 20, 19)
-    expected = run_penalty(reference_penalty, levels)
-    assert_all_close(run_penalty(plane_penalty, levels), expected, 1e-13)
-    singles = [PlaneLevel(x.space.float(), x.time.float()) for x in levels]
-    rounded = run_penalty(
-        reference_penalty, [PlaneLevel(x.space.double(), x.time.double()) for x in singles]
-    )
-    # some ten roundings of 6e-8
-    assert_all_close(run_penalty(plane_penalty, singles), rounded, 1e-6)
-
-
-def test_straight_planes_of_ones_cost_nothing() -> None:
-    ramp = torch.arange(8, dtype=torch.float64)
-    space = (ramp[:, None] + 3 * ramp)[None, :, :, None].repeat(3, 1, 1, 4)
-    value, g_space, g_time = run_penalty(
-        plane_penalty, [PlaneLevel(space, torch.ones(3, 5, 8, 4).double())]
-    )
-    assert value == 0
-    assert not g_space.any()
-    assert not g_time.any()
-
-
 def test_known_penalty() -> None:
     space = torch.zeros(3, 3, 3, 1)
     time = torch.ones(3, 3, 3, 1)
@@ -386,20 +251,6 @@ def test_penalty_can_be_differentiated_again() -> None:
     (first,) = torch.autograd.grad(value, level.space, retain_graph=True)
     (second,) = torch.autograd.grad(3 * value, level.space)
     torch.testing.assert_close(second, 3 * first)
-
-
-def test_penalty_without_gradient_has_the_same_value() -> None:
-    levels = with_gradients(make_levels((6,), 5, 3))
-    with torch.no_grad():
-        value = plane_penalty(levels, WEIGHTS)
-    assert not value.requires_grad
-    assert torch.equal(value, plane_penalty(levels, WEIGHTS).detach())
-
-
-def test_nan_in_a_plane_shows_in_the_penalty() -> None:
-    (level,) = make_levels((6,), 5, 3)
-    level.time[0, 2, 3, 1] = math.nan
-    assert plane_penalty([level], WEIGHTS).isnan()
 
 
 @pytest.mark.parametrize(
@@ -441,50 +292,3 @@ def test_input_that_does_not_fit(
 def test_weights_must_be_finite() -> None:
     with pytest.raises(DyngsError, match="weights must be finite"):
         plane_penalty(make_levels((4,), 3, 5), (1.0, math.nan, 0.0))
-
-
-def test_the_kernels_refuse_arrays_that_do_not_fit() -> None:
-    (level,) = make_levels((4,), 3, 5, torch.float32)
-    arrays = [(level.space, level.time)]
-    with pytest.raises(ValueError, match="different sizes"):
-        core.hexplane_forward(
-            torch.zeros(7, 3), arrays, 0.5, torch.zeros(6, 5), torch.zeros(7, dtype=torch.int32), 1
-        )
-    with pytest.raises(ValueError, match="another size than the planes"):
-        core.plane_penalty(
-            arrays, [(level.time, level.time)], WEIGHTS, torch.zeros(1, dtype=torch.float64), 1
-        )
-
-
-@pytest.mark.parametrize("with_coords", [True, False])
-def test_features_are_a_well_behaved_torch_op(with_coords: bool) -> None:
-    levels = with_gradients(make_levels((4, 6), 3, 2))
-    coords = make_coords(9).requires_grad_(with_coords)
-    torch.library.opcheck(hexplane_op, (coords, leaves(levels), 0.3))
-    planes = [x.detach() for x in leaves(levels)]
-    features, order = hexplane_op(coords.detach(), planes, 0.3)
-    # The gradient by the coordinates is asked for, because opcheck refuses results without elements
-    # that are not new.
-    torch.library.opcheck(
-        hexplane_backward_op,
-        (coords.detach(), planes, order, torch.ones_like(features), 0.3, with_coords),
-    )
-
-
-@pytest.mark.parametrize("with_gradient", [True, False])
-def test_the_penalty_is_a_well_behaved_torch_op(with_gradient: bool) -> None:
-    levels = make_levels((4, 6), 3, 2)
-    planes = leaves(with_gradients(levels) if with_gradient else levels)
-    torch.library.opcheck(plane_penalty_op, (planes, list(WEIGHTS), with_gradient))
-
-
-def test_features_and_penalty_compile_in_one_graph() -> None:
-    def run(coords: Tensor, time: float, levels: list[PlaneLevel]) -> Tensor:
-        return hexplane_features(coords, time, levels).sum() + plane_penalty(levels, WEIGHTS)
-
-    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
-    coords = make_coords(9)
-    levels = make_levels((4, 6), 3, 2)
-    assert_equal(
-        run_features(compiled, coords, 0.3, levels), run_features(run, coords, 0.3, levels)
-    )

@@ -11,16 +11,13 @@ import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import Scene, look_around, random_scene, relative_error, weights
+from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
-from dyngs.core.camera import Cameras
 from dyngs.ops.projection import (
     Projection,
     ProjectionOptions,
     project,
-    project_backward_op,
-    project_op,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -100,77 +97,12 @@ def test_equals_the_reference(seed: int, antialiased: bool, eps2d: float, alpha_
         assert relative_error(x, y) < 1e-9, name
 
 
-def test_gradcheck() -> None:
-    options = ProjectionOptions(alpha_min=0.0)
-    leaves = random_scene(n=3, views=2).leaves()
-
-    def run(*tensors: Tensor) -> tuple[Tensor, ...]:
-        p = splats(replace(leaves, **dict(zip(INPUTS, tensors, strict=True))), options)
-        return p.means2d, p.depths, p.factors, p.compensations
-
-    assert torch.autograd.gradcheck(run, [getattr(leaves, name) for name in INPUTS])
-
-
-def test_float_equals_double_on_every_isa(isa: str) -> None:
-    """1e-5: rounding, 6e-8 per operation, times the condition of the formulas (x/z of points near
-    the camera)."""
-    scene = random_scene(n=200).to(torch.float32)
-    truth_scene = scene.to(torch.float64)
-    options = ProjectionOptions(alpha_min=0.0)
-    ours = splats(scene, options)
-    truth = splats(truth_scene, options)
-    assert torch.equal(visible(ours), visible(truth))
-    for name in OUTPUTS:
-        assert relative_error(getattr(ours, name), getattr(truth, name)) < 1e-5, name
-    for name, x, y in zip(
-        INPUTS, slopes(scene, options), slopes(truth_scene, options), strict=True
-    ):
-        assert relative_error(x, y) < 1e-5, name
-
-
-def test_double_on_every_isa_equals_the_reference(isa: str, scene: Scene) -> None:
-    for x, y in zip(slopes(scene), slopes(scene, function=reference.project), strict=True):
-        assert relative_error(x, y) < 1e-9
-
-
-def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
-    scene = random_scene(n=5000).to(torch.float32)
-    found = []
-    for n in (1, 2, 8):
-        set_threads(n)
-        p = splats(scene)
-        found.append([p.radii, *(getattr(p, name) for name in OUTPUTS), *slopes(scene)])
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
-
-
 def test_many_cameras_equal_one_at_a_time(scene: Scene) -> None:
     together = splats(scene)
     for v in range(2):
         alone = splats(scene.view(v))
         for name in (*OUTPUTS, "radii"):
             assert torch.equal(getattr(alone, name)[0], getattr(together, name)[v])
-
-
-def test_no_gaussians() -> None:
-    empty = random_scene(n=0)
-    p = splats(empty)
-    assert p.means2d.shape == (2, 0, 2)
-    assert p.radii.dtype == torch.int32
-    assert [x.shape for x in slopes(empty)] == [(0, 3), (0, 4), (0, 3), (2, 4, 4), (2, 3, 3)]
-    assert not any(x.any() for x in slopes(empty)[3:])
-
-
-def test_strided_inputs_equal_contiguous_ones(scene: Scene) -> None:
-    def spread(x: Tensor) -> Tensor:
-        wide = torch.zeros(*x.shape[:-1], 2 * x.shape[-1], dtype=x.dtype)
-        wide[..., ::2] = x
-        return wide[..., ::2]
-
-    strided = scene.map(spread)
-    assert not strided.means.is_contiguous()
-    assert torch.equal(splats(strided).factors, splats(scene).factors)
-    assert torch.equal(slopes(strided)[0], slopes(scene)[0])
 
 
 @pytest.mark.parametrize("name", ["cam_from_world", "intrinsics"])
@@ -200,15 +132,6 @@ def test_faint_and_small_splats_are_culled(dtype: torch.dtype) -> None:
         False,
         True,
     ]
-
-
-def test_splats_beside_the_image_are_culled() -> None:
-    scene = front(4)
-    radius = float(splats(scene).radii[0, 0, 0])
-    per_px = 3 / scene.intrinsics[0, 0, 0]
-    edge = 16 + radius
-    scene.means[:, 0] = torch.tensor([-edge - 0.01, -edge + 0.01, edge - 0.01, edge]) * per_px
-    assert visible(splats(scene))[0].tolist() == [False, True, True, False]
 
 
 def test_culled_rows_are_zero_and_get_no_gradient() -> None:
@@ -248,68 +171,3 @@ def test_compensation_is_the_share_of_light_before_the_low_pass() -> None:
     assert splats(scene, ProjectionOptions(eps2d=0.0)).compensations.item() == pytest.approx(
         1, rel=1e-12
     )
-
-
-def test_quaternions_need_not_be_normalised(scene: Scene) -> None:
-    longer = replace(scene, quats=7 * scene.quats)
-    torch.testing.assert_close(
-        splats(longer).factors, splats(scene).factors, rtol=1e-12, atol=1e-14
-    )
-    torch.testing.assert_close(7 * slopes(longer)[1], slopes(scene)[1], rtol=1e-9, atol=1e-12)
-    along = (slopes(scene)[1] * scene.quats).sum(-1)
-    assert along.abs().max() < 1e-12 * slopes(scene)[1].abs().max()  # length has no influence
-
-
-def test_world_and_camera_moved_together_see_the_same(scene: Scene) -> None:
-    motion = look_around(3)[2]
-    # 0.6 rad about y
-    turn = torch.tensor([0.955336489125606, 0.0, 0.29552020666133955, 0.0], dtype=torch.float64)
-    w, (x, y, z, s) = turn, scene.quats.unbind(-1)
-    product = [w[0] * x - w[2] * z, w[0] * y + w[2] * s, w[0] * z + w[2] * x, w[0] * s - w[2] * y]
-    moved = replace(
-        scene,
-        means=scene.means @ motion[:3, :3].T + motion[:3, 3],
-        quats=torch.stack(product, -1),
-        cam_from_world=scene.cam_from_world @ torch.linalg.inv(motion),
-    )
-    ours = splats(moved)
-    truth = splats(scene)
-    for name in OUTPUTS:
-        assert relative_error(getattr(ours, name), getattr(truth, name)) < 1e-12, name
-
-
-@pytest.mark.parametrize("with_cameras", [False, True])
-def test_opcheck(with_cameras: bool, scene: Scene) -> None:
-    leaves = scene.leaves()
-    cameras = leaves if with_cameras else scene
-    tensors = (
-        leaves.means,
-        leaves.quats,
-        leaves.scales,
-        scene.opacities,
-        cameras.cam_from_world,
-        cameras.intrinsics,
-    )
-    args = (*tensors, list(scene.size), [0.3, 0.2, 1e10, 0.0, 0.0], False)
-    torch.library.opcheck(project_op, args)
-
-
-def test_opcheck_backward(scene: Scene) -> None:
-    p = splats(scene)
-    tensors = [
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
-        scene.cam_from_world,
-        scene.intrinsics,
-    ]
-    grads = [weights(getattr(p, name)) for name in OUTPUTS]
-    args = (tensors, p.radii, grads, list(scene.size), [0.3, 0.2, 1e10, 0.0, 0.0], False, True)
-    torch.library.opcheck(project_backward_op, args)
-
-
-def test_single_and_empty_batches_of_cameras(scene: Scene) -> None:
-    none = Cameras(scene.cam_from_world[:0], scene.intrinsics[:0], *scene.size)
-    p = project(scene.means, scene.quats, scene.scales, scene.opacities, none)
-    assert p.means2d.shape == (0, 20, 2)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from field_reference import cell_of, reference_composite, reference_march
@@ -11,21 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.native import kernel_threads
 from dyngs.ops.rays import (
     Rays,
     Samples,
     Space,
     Steps,
     composite,
-    composite_backward_op,
-    composite_op,
     march,
-    march_counts_op,
-    march_samples_op,
     offsets_of,
     reached,
-    reached_op,
 )
 
 NESTED = Space((0.1, 0.2, -0.1), 1.0, 2, 8)
@@ -136,18 +128,6 @@ def test_samples_grow_with_the_distance() -> None:
     assert torch.allclose(found.starts[1:], found.ends[:-1])
 
 
-def test_hard_rays_end() -> None:
-    """Along a wall, of no direction, of no number, from so far away that a step is lost in
-    rounding."""
-    space = Space((0.0, 0, 0), 1.0, 1, 4)
-    all_cells = torch.ones(1, 4, 4, 4, dtype=torch.bool)
-    origins = torch.tensor([[-5.0, 1, 1], [0, 0, 0], [math.nan, 0, 0], [-1e9, 0, 0]])
-    rays = Rays(origins, torch.tensor([[1.0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]]))
-    found = march(rays, torch.full((4,), 0.5), space, all_cells, Steps(0.0, 0.1, most=100))
-    assert found.starts.isfinite().all()
-    assert (found.offsets.diff() <= 100).all()
-
-
 def test_the_unit_cube_holds_everything_and_the_middle_half_what_is_near() -> None:
     points = torch.tensor(
         [[1.0, 0, 0], [2.0, 0, 0], [1e6, 0, 0], [-1.0, 1, 0.5]], dtype=torch.float64
@@ -186,14 +166,6 @@ def test_rays_see_what_a_loop_sees(counts: list[int], seed: int, least: float) -
         )
 
 
-def test_gradients_are_those_of_finite_differences() -> None:
-    densities, colours, samples = some_samples([4, 0, 7])
-    rest = samples.starts, samples.ends, samples.offsets
-    assert torch.autograd.gradcheck(
-        lambda a, b: composite_op(a, b, *rest, 0.0)[:3], (densities, colours)
-    )
-
-
 def test_nothing_is_seen_through_a_wall_and_everything_through_air() -> None:
     _, colours, samples = some_samples([3, 3])
     densities = torch.tensor([0.0, 1e9, 1.0, 0, 0, 0], dtype=torch.float64)
@@ -224,25 +196,6 @@ def test_what_is_not_reached_changes_nothing() -> None:
     assert torch.equal(one.transmittance, other.transmittance)
 
 
-def test_the_same_bytes_on_any_number_of_threads() -> None:
-    rays = some_rays(700)
-    results = []
-    occupied = torch.rand(NESTED.shape, generator=torch.Generator().manual_seed(0)) < 0.4
-    single = Rays(rays.origins.float(), rays.directions.float())
-    for threads in (1, 2, 5):
-        with kernel_threads(threads):
-            samples = march(single, torch.full((700,), 0.5), NESTED, occupied, Steps(0.05, 0.02))
-            generator = torch.Generator().manual_seed(1)
-            densities = (torch.rand(len(samples), generator=generator) * 4).requires_grad_()
-            colours = torch.rand(len(samples), 3, generator=generator).requires_grad_()
-            seen = composite(densities, colours, samples)
-            seen.colour.square().sum().backward()
-            results.append((samples.coords, seen.colour, seen.depth, densities.grad, colours.grad))
-    assert len(results[0][0]) > 10_000
-    for one in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(one, results[0], strict=True))
-
-
 def test_what_does_not_fit_is_refused() -> None:
     densities, colours, samples = some_samples([3])
     with pytest.raises(DyngsError, match="densities must be"):
@@ -257,24 +210,3 @@ def test_what_does_not_fit_is_refused() -> None:
             torch.ones(2, 8, 8, 4, dtype=torch.bool),
             Steps(0.0, 0.1),
         )
-
-
-def test_the_ops_are_registered_as_torch_wants_them() -> None:
-    densities, colours, samples = some_samples([2, 3])
-    given = densities, colours, samples.starts, samples.ends, samples.offsets
-    torch.library.opcheck(composite_op, (*given, 0.0))
-    grads = [torch.ones(2, 3, dtype=torch.float64), *torch.ones(2, 2, dtype=torch.float64).unbind()]
-    torch.library.opcheck(composite_backward_op, ([x.detach() for x in given], grads, 0.0))
-    torch.library.opcheck(reached_op, (densities.detach(), *given[2:], 0.1))
-    rays = some_rays(3)
-    where = (
-        [rays.origins, rays.directions, shifts_of(rays)],
-        torch.ones(NESTED.shape, dtype=torch.bool),
-    )
-    sizes = (
-        [*NESTED.centre, NESTED.half, float(NESTED.cascades), float(NESTED.cells)],
-        [0.1, 0.05, 0.0, 100.0],
-    )
-    torch.library.opcheck(march_counts_op, (*where, *sizes))
-    offsets = offsets_of(march_counts_op(*where, *sizes))
-    torch.library.opcheck(march_samples_op, (*where, *sizes, offsets, int(offsets[-1])))

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.ops.native import kernel_threads
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.shading import Sight, num_inputs, shading_inputs, shading_op
+from dyngs.ops.shading import Sight, num_inputs, shading_inputs
 
 
 def sight(
@@ -60,44 +59,6 @@ def test_it_is_what_torch_says(
     torch.testing.assert_close(found, reference.shading_inputs(seen, base))
 
 
-@pytest.mark.parametrize("scale", [1e-42, 1e-20, 1e-13, 1e20, 1e37])
-def test_rotations_may_have_any_length(scale: float) -> None:
-    seen = sight(3, normals=True, timed=False, on_body=False, dtype=torch.float32)
-    rough = replace(seen, quats=seen.quats.sign())
-    longer = replace(rough, quats=rough.quats * scale)
-    base = torch.full((7, 3), 0.3)
-    torch.testing.assert_close(shading_inputs(longer, base), shading_inputs(rough, base))
-    torch.testing.assert_close(reference.shading_inputs(longer, base), shading_inputs(rough, base))
-
-
-def test_every_isa_says_the_same(isa: str) -> None:
-    seen = sight(3, normals=True, timed=True, on_body=True, dtype=torch.float32)
-    base = torch.full((7, 3), 0.3)
-    torch.testing.assert_close(
-        shading_inputs(seen, base), reference.shading_inputs(seen, base), msg=isa
-    )
-
-
-def test_threads_change_nothing() -> None:
-    seen = sight(0, normals=True, timed=True, on_body=True)
-    many = replace(
-        seen, rows=torch.randint(0, 11, (5000,), generator=torch.Generator().manual_seed(1))
-    )
-    base = torch.rand(5000, 3, dtype=torch.float64)
-    with kernel_threads(1):
-        alone = shading_inputs(many, base)
-    with kernel_threads(3):
-        assert torch.equal(shading_inputs(many, base), alone)
-
-
-def test_only_base_colours_get_a_gradient() -> None:
-    seen = sight(0, normals=True, timed=True, on_body=False)
-    seen = replace(seen, means=seen.means.requires_grad_())
-    base = torch.rand(7, 3, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: shading_inputs(seen, x), base)
-    assert seen.means.grad is None
-
-
 def test_what_is_degenerate_stays_finite() -> None:
     """An eye in the centre of a Gaussian, a rotation of length zero, three equal scales, nothing
     seen."""
@@ -137,28 +98,3 @@ def test_far_places_stay_bounded_and_in_order(seed: int, scale: float) -> None:
     assert (inside <= 2).all()
     assert torch.equal(reference.contracted(points)[lengths <= 1], points[lengths <= 1])
     assert (inside[lengths.argsort()].diff() >= -1e-12).all()
-
-
-def test_the_shortest_axis_is_the_normal() -> None:
-    quats = torch.randn(30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    log_scales = torch.randn(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    expected = rotation_matrices(quats).gather(
-        2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1)
-    )[..., 0]
-    torch.testing.assert_close(reference.shortest_axes(quats, log_scales), expected)
-
-
-@pytest.mark.parametrize("on_body", [True, False])
-def test_is_a_well_behaved_torch_op(on_body: bool) -> None:
-    seen = sight(0, normals=on_body, timed=on_body, on_body=on_body)
-    base = torch.rand(7, 3, dtype=torch.float64).requires_grad_()
-    rest, turn = seen.rest or (None, None)
-    placed = (seen.means, seen.quats, seen.log_scales, seen.rows, seen.eye, seen.box, rest, turn)
-    torch.library.opcheck(shading_op, (base, *placed, seen.time, seen.normals))
-
-
-def test_compiles_in_one_graph() -> None:
-    seen = sight(0, normals=True, timed=True, on_body=True)
-    base = torch.rand(7, 3, dtype=torch.float64)
-    compiled = torch.compile(shading_inputs, fullgraph=True, backend="aot_eager")
-    assert torch.equal(compiled(seen, base), shading_inputs(seen, base))

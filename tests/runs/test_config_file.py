@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import dyngs
+from dyngs.api.scene_file import write_scene_file
 from dyngs.cli import main
 from dyngs.config import Config
 from dyngs.config.io import load_resolved, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.scene_file import write_scene_file
 from dyngs.runs.checkpoint import latest_checkpoint
 from dyngs.runs.config_file import is_same_body, with_body_of, write_config
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from dyngs.api.prune import prune_run
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.cli.demo_run import is_unused
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
-from dyngs.export.scene_file import write_scene_file
 from dyngs.export.splat_files import write_run_sequence
 from dyngs.io.lock import LOCK_NAME, InUseError, writing
 from dyngs.io.outputs import new_folder, require_new_folder

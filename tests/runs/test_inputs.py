@@ -13,6 +13,7 @@ import pytest
 from moving_scene import write_moving_run
 
 import dyngs
+from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
 from dyngs.capture.inspection.report import draw_cameras
 from dyngs.config import DataConfig, RunConfig
@@ -21,10 +22,9 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.cameras import write_cameras
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.html.page import write_page
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
-from dyngs.export.scene_file import write_scene_file
 from dyngs.export.splat_files import write_moving, write_run_sequence, write_run_splats
 from dyngs.io.containment import following_links_of_runs
 from dyngs.runs.checkpoint import checkpoint_paths, load_run

@@ -16,6 +16,7 @@ from hypothesis.extra import numpy as nps
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import part_of
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.runs.scene_file import (
     MAGIC,
@@ -31,7 +32,6 @@ from dyngs.runs.scene_file import (
     write_scene,
 )
 from dyngs.runs.scene_tensors import COARSENESS
-from dyngs.static.scene import StaticScene
 
 INFO = CheckpointInfo(7, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic")
 STEPS = {

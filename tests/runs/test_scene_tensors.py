@@ -21,6 +21,7 @@ from dyngs.core.state import Role, part_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
@@ -59,7 +60,6 @@ from dyngs.runs.scene_tensors import (
     to_grid,
     to_whole,
 )
-from dyngs.static.scene import StaticScene
 
 
 def test_names_decide() -> None:

@@ -15,10 +15,9 @@ from splat_scenes import AROUND, cloud
 from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import levels
+from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.static.levels import LevelScene
-from dyngs.static.scene import StaticScene
-from dyngs.static.sides import Sides
+from dyngs.gaussians.static_scene import Sides, StaticScene
 
 
 def test_near_it_is_the_scene_itself() -> None:

@@ -14,8 +14,7 @@ from splat_scenes import cloud
 from dyngs.core.state import tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.static.scene import StaticScene
-from dyngs.static.sides import Sides
+from dyngs.gaussians.static_scene import Sides, StaticScene
 
 PARTS = [cloud(40), cloud(60)]
 EYES = [torch.tensor([4.0, 0.0, 1.5]), torch.tensor([-4.0, 0.0, 1.5])]

@@ -12,8 +12,8 @@ from dyngs.core.state import part_of, tensors_of
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
-from dyngs.static.scene import StaticScene
-from dyngs.static.training import SmallRemoval, StaticTraining
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.gaussians.static_training import SmallRemoval, StaticTraining
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
 

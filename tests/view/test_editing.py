@@ -15,10 +15,10 @@ from dyngs.export.edit.frame import Frame
 from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import Writing, write_run_splats
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import read_splats
 from dyngs.io.formats.similarity import Similarity
 from dyngs.runs.opened import Opened, open_run, open_scene, opened_scene
-from dyngs.static.scene import StaticScene
 from dyngs.view.editing import Editing, looking_along, picked
 from dyngs.view.layers import Shot
 

@@ -12,9 +12,9 @@ from view_sessions import balls, opened_at
 from dyngs.core.errors import DyngsError
 from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
+from dyngs.gaussians.levels import LevelScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run
-from dyngs.static.levels import LevelScene
-from dyngs.static.scene import StaticScene
 from dyngs.view.captured_views import views_of
 from dyngs.view.layers import (
     LAYERS,

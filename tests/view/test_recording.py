@@ -6,7 +6,7 @@ import torch
 from moving_scene import camera
 
 from dyngs.core.camera import Cameras
-from dyngs.export.camera_paths.path import read_path
+from dyngs.export.camera_paths import read_path
 from dyngs.io.formats.similarity import Similarity
 from dyngs.view.recording import Keyframe, Recording
 

@@ -19,11 +19,11 @@ from dyngs.gaussians.colour.training import ColourTraining
 from dyngs.gaussians.fusion import Mesh, Seen, colours_of, fused, simplified
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.start import densifier_of, first_gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.surface import opaque_box, seen_by
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.static.scene import StaticScene
 
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000

@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.polyhedra import polyhedra, true_edges
 from dyngs.data.synthetic.raytrace import (
     CAMERA_ANGLE_X,
     Scene,
@@ -29,6 +28,8 @@ CaptureStyle = Literal["teleport", "moving", "fixed"]
 """One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all
 times."""
 
+DISTANCE = 4.0
+"""Of the cameras from the origin, world units."""
 _FRONT_DEG = -45.0
 _SECTOR_DEG = 64.0
 """Middle and range of the azimuths of fixed and moving cameras."""
@@ -41,14 +42,12 @@ class ImageOptions:
     Attributes:
         num_val, num_test: images that are held out.
         seed: rotates the training cameras; one seed gives the same bytes each time.
-        distance: of the cameras from the origin, world units.
     """
 
     size: int = 128
     num_val: int = 0
     num_test: int = 8
     seed: int = 0
-    distance: float = 4.0
     samples: int = 3
 
 
@@ -83,7 +82,7 @@ class DynamicOptions(ImageOptions):
 
 
 @dataclass(frozen=True)
-class _Shot:
+class Shot:
     """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, the
     time, a fixed camera."""
 
@@ -102,44 +101,14 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
     """
     scene = still_life()
     splits = {
-        "train": hemisphere_cameras(options.num_train, options.distance, options.seed),
-        "val": orbit_cameras(options.num_val, options.distance, elevation_deg=45.0, start_deg=10.0),
-        "test": orbit_cameras(
-            options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0
-        ),
+        "train": hemisphere_cameras(options.num_train, DISTANCE, options.seed),
+        "val": orbit_cameras(options.num_val, DISTANCE, elevation_deg=45.0, start_deg=10.0),
+        "test": orbit_cameras(options.num_test, DISTANCE, elevation_deg=28.0, start_deg=0.0),
     }
     with new_folder(out) as started:
         for split, poses in splits.items():
-            shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
-            _write_split(started, split, shots, lambda _: scene, options)
-    return out
-
-
-CLOSE = 0.4  # Distance of close-ups, in that of the other cameras
-
-
-def write_polyhedra_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
-    """Write images of ``polyhedra`` as ``write_still_capture`` does; returns ``out``.
-
-    The split val has as many close-ups as test has images, from 40 % of the distance.
-    ``edges/SPLIT/r_000.png`` is white where the true edges of the images of test and val are.
-    """
-    scene = polyhedra()
-    close = CLOSE * options.distance
-    splits = {
-        "train": hemisphere_cameras(options.num_train, options.distance, options.seed),
-        "val": orbit_cameras(options.num_test, close, elevation_deg=33.0, start_deg=10.0),
-        "test": orbit_cameras(
-            options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0
-        ),
-    }
-    with new_folder(out) as started:
-        for split, poses in splits.items():
-            shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
-            _write_split(started, split, shots, lambda _: scene, options)
-            for shot in shots if split != "train" else ():
-                edges = true_edges(scene, shot.world_from_cam, options.size, options.samples)
-                write_image(started / "edges" / f"{shot.name}.png", edges)
+            shots = [Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            write_split(started, split, shots, lambda _: scene, options)
     return out
 
 
@@ -178,7 +147,7 @@ def write_dynamic_capture(
     ]
     with new_folder(out) as started:
         for split, shots in splits.items():
-            _write_split(
+            write_split(
                 started,
                 split,
                 shots,
@@ -192,11 +161,11 @@ def write_dynamic_capture(
     return out
 
 
-def _write_split(
+def write_split(
     out: Path,
     split: str,
-    shots: Sequence[_Shot],
-    scene_of: Callable[[_Shot], Scene],
+    shots: Sequence[Shot],
+    scene_of: Callable[[Shot], Scene],
     options: ImageOptions,
     is_opaque: bool = False,
 ) -> None:
@@ -221,7 +190,7 @@ def _write_split(
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
 
 
-def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[_Shot]]:
+def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[Shot]]:
     """One image per training time, by cameras in random order or on a smooth arc; the validation
     camera is fixed.
 
@@ -235,17 +204,17 @@ def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, lis
         middle_deg = _FRONT_DEG + random.uniform(-2.0, 2.0)
         along = np.array(_even_times(options.num_times)) - 0.5
         train = _poses(
-            options.distance,
+            DISTANCE,
             middle_deg + _SECTOR_DEG * along,
             20.0 + 5.0 * np.sin(2 * np.pi * along),
         )
-        fixed = _poses(options.distance, np.array([middle_deg]), np.array([28.0]))
+        fixed = _poses(DISTANCE, np.array([middle_deg]), np.array([28.0]))
         test = np.repeat(fixed, count, axis=0)
     else:
-        train = hemisphere_cameras(options.num_times, options.distance, options.seed)
+        train = hemisphere_cameras(options.num_times, DISTANCE, options.seed)
         train = random.permutation(train)  # the spiral climbs: time would tell the height
-        test = orbit_cameras(count, options.distance, elevation_deg=28.0, start_deg=-60.0)
-        fixed = orbit_cameras(1, options.distance, elevation_deg=28.0, start_deg=-60.0)
+        test = orbit_cameras(count, DISTANCE, elevation_deg=28.0, start_deg=-60.0)
+        fixed = orbit_cameras(1, DISTANCE, elevation_deg=28.0, start_deg=-60.0)
     poses = {"train": train, "val": np.repeat(fixed, options.num_val, axis=0), "test": test}
     times = {
         "train": _even_times(options.num_times),
@@ -255,14 +224,14 @@ def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, lis
     }
     return {
         split: [
-            _Shot(f"{split}/r_{i:03d}", pose, time)
+            Shot(f"{split}/r_{i:03d}", pose, time)
             for i, (pose, time) in enumerate(zip(own, times[split], strict=True))
         ]
         for split, own in poses.items()
     }
 
 
-def _fixed_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
+def _fixed_shots(options: DynamicOptions) -> dict[str, list[Shot]]:
     """Fixed cameras on an arc in front, low and high in turn; the test camera in the middle of the
     arc."""
     count = options.num_cameras
@@ -272,7 +241,7 @@ def _fixed_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
     middle = _FRONT_DEG + shift + (0.5 * _SECTOR_DEG / count if count % 2 else 0.0)
     azimuths_deg = np.append(azimuths_deg, [middle, middle])
     elevations_deg = np.append(elevations_deg, [22.0, 34.0])
-    poses = _poses(options.distance, azimuths_deg, elevations_deg)
+    poses = _poses(DISTANCE, azimuths_deg, elevations_deg)
     cameras = {
         "train": range(count),
         "val": (count + 1,) if options.num_val else (),
@@ -280,7 +249,7 @@ def _fixed_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
     }
     return {
         split: [
-            _Shot(f"cam{camera:02d}/frame_{i:04d}", poses[camera], time, camera)
+            Shot(f"cam{camera:02d}/frame_{i:04d}", poses[camera], time, camera)
             for i, time in enumerate(_even_times(options.num_times))
             for camera in cameras[split]
         ]

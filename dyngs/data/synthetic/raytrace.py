@@ -1,5 +1,4 @@
-"""A small ray tracer in NumPy: painted balls, capsules, boxes and waving sheets under a soft lamp
-and the sky.
+"""A small ray tracer in NumPy: painted balls and boxes under a soft lamp and the sky.
 
 It shares no formula with the rasterizer, so that its images are an independent ground truth. A
 scene is a tuple of primitives; a scene that moves is a function from time to such a tuple.
@@ -28,8 +27,6 @@ _LAMP_SIZE = 0.9
 _SKY = (0.46, 0.50, 0.56)
 _GROUND = (0.20, 0.17, 0.15)
 _LAMPLIGHT = (0.80, 0.74, 0.66)
-_MARCH_STEPS = 40
-_BISECTIONS = 18
 _SURFACE = 3e-3  # world units by which a surface may seem to lie before one of its own points
 
 
@@ -130,119 +127,7 @@ class Box:
         return Sphere(self.center, min(self.half_extents), self.paint).occlusion(points, normals)
 
 
-@dataclass(frozen=True)
-class Wave:
-    """A plane wave ``amplitude * sin(wave_vector . (u, v) + phase)``; ``wave_vector`` in radians
-    per world unit."""
-
-    amplitude: float
-    wave_vector: tuple[float, float]
-    phase: float = 0.0
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """A thin cloth, seen from both sides: its material point (u, v) lies at ``center + (u, v,
-    height(u, v))``.
-
-    The height is the sum of ``waves``: moving their phases moves the cloth, while its paint keeps
-    to (u, v). The paint gets (u, v, 0) divided by the half extents.
-    """
-
-    center: tuple[float, float, float]
-    half_extents: tuple[float, float]
-    waves: tuple[Wave, ...]
-    paint: Paint
-    gloss: float = 0.05
-
-    def height(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """(R,) world units above ``center``."""
-        total = np.zeros(np.broadcast(u, v).shape, np.float32)
-        for wave in self.waves:
-            ku, kv = f32(wave.wave_vector)
-            total += np.float32(wave.amplitude) * np.sin(ku * u + kv * v + np.float32(wave.phase))
-        return total
-
-    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Marches through the cloth's bounding box until the ray changes sides, then bisects."""
-        start = np.broadcast_to(origins - f32(self.center), directions.shape)
-        bound = f32([*self.half_extents, sum(abs(wave.amplitude) for wave in self.waves) + 1e-3])
-        enter, leave = _through_box(start, directions, bound)
-        enter = np.maximum(enter, np.float32(1e-4))
-        distances = np.full(len(directions), np.inf, np.float32)
-        inside = np.flatnonzero(enter < leave)
-        if len(inside):
-            distances[inside] = self._crossing(
-                start[inside], directions[inside], enter[inside], leave[inside]
-            )
-        return distances
-
-    def _crossing(
-        self, start: np.ndarray, directions: np.ndarray, enter: np.ndarray, leave: np.ndarray
-    ) -> np.ndarray:
-        """(R,) first distance between ``enter`` and ``leave`` at which the ray pierces the cloth,
-        or inf."""
-
-        def is_above(rays: np.ndarray, distance: np.ndarray) -> np.ndarray:
-            x, y, z = (start[rays, axis] + distance * directions[rays, axis] for axis in range(3))
-            return z > self.height(x, y)
-
-        step = (leave - enter) / np.float32(_MARCH_STEPS)
-        pending = np.arange(len(start))
-        first_side = is_above(pending, enter)
-        far = np.full(len(start), np.inf, np.float32)
-        for k in range(1, _MARCH_STEPS + 1):
-            distance = enter[pending] + np.float32(k) * step[pending]
-            crossed = is_above(pending, distance) != first_side[pending]
-            far[pending[crossed]] = distance[crossed]
-            pending = pending[~crossed]
-        hit = np.flatnonzero(np.isfinite(far))
-        high = far[hit]
-        low = far[hit] - step[hit]
-        for _ in range(_BISECTIONS):
-            middle = np.float32(0.5) * (low + high)
-            before = is_above(hit, middle) == first_side[hit]
-            low = np.where(before, middle, low)
-            high = np.where(before, high, middle)
-        far[hit] = high
-        return far
-
-    def local(self, points: np.ndarray) -> np.ndarray:
-        """(R, 3) material coordinates (u, v, 0), each divided by the half extent."""
-        flat = (points - f32(self.center))[:, :2] / f32(self.half_extents)
-        return np.concatenate([flat, np.zeros_like(flat[:, :1])], axis=1)
-
-    def placed(self, local: np.ndarray) -> np.ndarray:
-        u, v = (local[:, :2] * f32(self.half_extents)).T
-        return np.stack([u, v, self.height(u, v)], axis=1) + f32(self.center)
-
-    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
-        local = random.uniform(-1.0, 1.0, (count, 3))
-        local[:, 2] = 0.0
-        return local.astype(np.float32)
-
-    def normals(self, points: np.ndarray) -> np.ndarray:
-        """(R, 3) unit normals of the upper side at surface points."""
-        u, v, _ = (points - f32(self.center)).T
-        normals = np.stack([np.zeros_like(u), np.zeros_like(u), np.ones_like(u)], axis=-1)
-        for wave in self.waves:
-            ku, kv = f32(wave.wave_vector)
-            slope = np.float32(wave.amplitude) * np.cos(ku * u + kv * v + np.float32(wave.phase))
-            normals[:, 0] -= slope * ku
-            normals[:, 1] -= slope * kv
-        return _unit(normals)
-
-    def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(R,) fraction of the sky hidden: the form factor, for a point on its axis, of a level
-        disk of equal area."""
-        offset = f32(self.center) - points
-        squared = np.maximum(_dot(offset, offset), 1e-12)
-        cosines = np.maximum(_dot(normals, offset), 0.0) * np.abs(offset[:, 2]) / squared
-        spread = np.float32(4.0 * self.half_extents[0] * self.half_extents[1] / np.pi)
-        return cosines * spread / (squared + spread)
-
-
-Primitive = Sphere | Box | Sheet
+Primitive = Sphere | Box
 
 
 @dataclass(frozen=True)
@@ -286,7 +171,7 @@ def render_scene(
             [[_LAMP_SIZE * (x - 0.5), _LAMP_SIZE * (y - 0.5), 0.0] for x, y in places], np.float32
         )
         lamps = f32(scene.lamp) + moved
-        hit, rgb = _trace(scene, origin, directions, np.repeat(lamps, size * size, axis=0))
+        hit, rgb = trace(scene, origin, directions, np.repeat(lamps, size * size, axis=0))
         for own in range(len(places)):
             here = hit // (size * size) == own
             pixels = hit[here] - own * size * size
@@ -295,16 +180,6 @@ def render_scene(
     straight = color / np.maximum(hits, 1.0)[:, None]
     rgba = np.concatenate([straight, hits[:, None] / samples**2], axis=1)
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
-
-
-def colours_along(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return (R, 3) float32 sRGB colours of rays from ``origin`` (3,), black where they hit
-    nothing; a point lamp."""
-    rgb = np.zeros((len(directions), 3), np.float32)
-    lamps = np.broadcast_to(f32(scene.lamp), directions.shape)
-    hit, colours = _trace(scene, f32(origin), directions.astype(np.float32), lamps)
-    rgb[hit] = colours
-    return rgb
 
 
 def render_things(
@@ -343,7 +218,7 @@ def nearest_things(
     return distances.argmin(axis=0), distances.min(axis=0)
 
 
-def _trace(
+def trace(
     scene: Scene, origin: np.ndarray, directions: np.ndarray, lamps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return indices of the rays that hit something (R_hit,), and the colours there: sRGB (R_hit,
@@ -374,8 +249,6 @@ def _shade(
     """(R, 3) linear radiance: sky light less what neighbours occlude, Lambert and Blinn-Phong light
     of the lamp."""
     normals = primitive.normals(points)
-    if isinstance(primitive, Sheet):  # its upper side, whichever is seen
-        normals = np.where(_dot(normals, directions)[:, None] > 0, -normals, normals)
     to_lamp = _unit(lamps - points)
     facing = np.maximum(_dot(normals, to_lamp), 0.0)
     lit = facing > 0

@@ -14,9 +14,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.raytrace import Box, Paint, Scene, Sheet, Sphere, Wave, f32
+from dyngs.data.synthetic.raytrace import Box, Paint, Scene, Sphere, f32
 
-SceneName = Literal["spin", "wave", "room", "roll"]
+SceneName = Literal["spin", "room", "roll"]
 """The scenes that move."""
 
 Rgb = tuple[float, float, float]
@@ -64,15 +64,13 @@ def scene_at(name: SceneName, time: float) -> Scene:
 
     - ``spin``: a die turns by 100 degrees on a plate and a ball rolls about it along 130 degrees of
       a circle.
-    - ``wave``: a cloth ripples over a plate with three still things; after time 1 it is as at time
-      0.
     - ``room``: a furnished corner, opaque in all directions, where one ball hops across the floor.
     - ``roll``: a striped ball alone rolls along a circle on a plate, turning 2.5 times.
 
     Raises:
         DyngsError: no such scene.
     """
-    moving = {"spin": _spin, "wave": _wave, "room": _room, "roll": _roll}
+    moving = {"spin": _spin, "room": _room, "roll": _roll}
     if name in moving:
         return moving[name](time)
     raise DyngsError(
@@ -106,34 +104,6 @@ def _spin(time: float) -> Scene:
         ),
         faint=_FAINT,
         num_static=2,
-    )
-
-
-def _wave(time: float) -> Scene:
-    turn = 2 * np.pi * time
-    waves = (Wave(0.115, (5.2, 1.6), -turn), Wave(0.045, (-2.4, 6.0), -turn + 1.0))
-    return Scene(
-        (
-            _plate((0.72, 0.75, 0.74), (0.12, 0.20, 0.20)),
-            Sphere(
-                (0.74, -0.74, -0.16),
-                0.18,
-                _swirl((0.85, 0.20, 0.12), (0.95, 0.80, 0.55)),
-                gloss=0.5,
-            ),
-            Sphere(
-                (-0.74, 0.74, -0.12), 0.22, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.5
-            ),
-            Box(
-                (-0.76, -0.76, -0.20),
-                (0.14, 0.14, 0.14),
-                _framed((0.10, 0.34, 0.26), (0.86, 0.62, 0.30)),
-                yaw=0.4,
-            ),
-            Sheet((0.0, 0.0, 0.16), (0.74, 0.56), waves, _carpet()),
-        ),
-        faint=_FAINT,
-        num_static=4,
     )
 
 
@@ -351,31 +321,5 @@ def _die() -> Paint:
         is_edge = np.maximum(np.abs(x), np.abs(y)) > 0.93
         rgb = np.where(is_edge[:, None], np.float32(0.6) * colors[axis], colors[axis])
         return np.where(is_pip[:, None], f32((0.96, 0.94, 0.88)), rgb)
-
-    return paint
-
-
-def _carpet() -> Paint:
-    """Nested lozenges within a toothed border; each corner has its own colour, so that no part
-    looks like another."""
-    border = f32((0.50, 0.07, 0.08))
-    cream = f32((0.92, 0.82, 0.62))
-    navy = f32((0.06, 0.14, 0.34))
-    corners = np.array(
-        [[0.72, 0.16, 0.12], [0.10, 0.42, 0.40], [0.86, 0.54, 0.12], [0.40, 0.18, 0.42]], np.float32
-    )
-
-    def paint(local: np.ndarray) -> np.ndarray:
-        u = local[:, 0]
-        v = local[:, 1]
-        ring = np.floor((np.abs(u) + np.abs(v)) * 4.0).astype(np.int64)
-        field = np.where((ring % 2 == 0)[:, None], cream, corners[(u > 0) + 2 * (v > 0)])
-        field = np.where((ring == 0)[:, None], navy, field)
-        edge = np.maximum(np.abs(u), np.abs(v))
-        tooth = (
-            np.floor(np.where(np.abs(u) > np.abs(v), v * 7.0, u * 9.0)).astype(np.int64) % 2 == 0
-        )
-        rim = np.where((tooth & (edge < 0.97))[:, None], cream, border)
-        return np.where((edge > 0.84)[:, None], rim, field)
 
     return paint

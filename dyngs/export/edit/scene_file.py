@@ -28,6 +28,7 @@ from dyngs.export.splat_files import (
     write_moving,
 )
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import (
     all_suffixes,
     format_of,
@@ -44,7 +45,6 @@ from dyngs.io.formats.splat_file import SplatFile, drawing_options
 from dyngs.runs.frame import RunFrame
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened, open_scene, opened_scene
-from dyngs.static.scene import StaticScene
 
 Tell = Callable[[str], None]
 

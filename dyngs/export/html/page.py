@@ -18,19 +18,19 @@ from dyngs.data.aim import look_at_point
 from dyngs.data.capture import Capture, View
 from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
-from dyngs.export.chosen_path import front_of, orbit_around, points_at, view_to_show
+from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
 from dyngs.export.html.element import element_script, text_of
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
 from dyngs.export.html.template import filled, script_safe, source_hash
+from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.static.levels import LevelScene
-from dyngs.static.scene import StaticScene
 
 PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # in a folder for a web server
 # pixels of the first view that a place at its target may be off where motion is fitted
@@ -193,8 +193,7 @@ def _views(opened: Opened) -> tuple[list[Cameras], list[float]]:
     views = [ring.select(i) for i in range(_RING)]
     if opened.person is None:
         return views, _middle(opened)
-    wide = orbit_around(opened, _FRONT_RING)
-    return [wide.select(front_of(opened, wide)), *views], look_at_point(ring).tolist()
+    return [in_front_of(opened).select(1), *views], look_at_point(ring).tolist()
 
 
 def _middle(opened: Opened) -> list[float]:

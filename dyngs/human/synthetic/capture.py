@@ -49,11 +49,6 @@ _RADIUS = 3.5  # radius of the ring of cameras, m
 _UNSTEADY = 0.08
 _TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
 
-POINTS = 600  # on the surface of a person, whose tracks are known
-_SKIN, _SEEN_SIZE = 0.02, 400
-"""A point is seen if the surface in its pixel, of an image of that size, is as near to the camera,
-up to this, m."""
-
 
 @dataclass(frozen=True)
 class Lamp:
@@ -167,67 +162,6 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     return out
 
 
-def write_walking_capture(
-    out: Path, options: HumanOptions = HumanOptions(num_frames=48, num_test=12)
-) -> Path:
-    """Write images of a walking person in the layout of D-NeRF, each time seen by one camera
-    elsewhere on the ring.
-
-    Files: ``SPLIT/r_III.png`` as of ``write_human_capture``, ``transforms_SPLIT.json`` with
-    ``time`` in [0, 1], and ``true_tracks.npz``. Test images lie midway between training times.
-    Raises DyngsError: options out of range.
-    """
-    if min(options.size, options.samples) < 1 or not 0 < options.num_test < options.num_frames:
-        raise DyngsError(
-            "a walking person needs size and samples of at least 1, and more times than test images"
-        )
-    body = default_template()
-    outfit = random_outfit(options.seed, options.usual_clothes)
-    times = np.linspace(0.0, 1.0, 2 * options.num_frames - 1)
-    motion = walk(body, len(times))
-    motion = replace(motion, trans=outfit.size * motion.trans, scale=outfit.size * motion.scale)
-    meshes = list(_posed_meshes(dress_body(body, outfit), motion, paint_texture(body, outfit)))
-    order = np.random.default_rng(options.seed).permutation(options.num_frames)
-    between = 2 * (np.arange(options.num_test) * (options.num_frames - 1) // options.num_test) + 1
-    around, midway = _cameras(replace(options, num_cameras=options.num_frames))
-    shots = {
-        "train": [*zip(range(0, len(times), 2), (around[int(i)] for i in order), strict=True)],
-        "test": [*zip(between.tolist(), midway.values(), strict=True)],
-    }
-    taken: list[tuple[str, int, np.ndarray]] = []
-    with new_folder(out) as started:
-        for split, own in shots.items():
-            names = [f"{split}/r_{i:03d}" for i in range(len(own))]
-            frames = [
-                _Frame(f"{name}.png", meshes[row], pose, {"time": float(times[row])})
-                for name, (row, pose) in zip(names, own, strict=True)
-            ]
-            _write_frames(started, split, frames, options)
-            taken += [(name, row, pose) for name, (row, pose) in zip(names, own, strict=True)]
-        write_true_tracks(started, _tracks(meshes, times, taken, options))
-    return out
-
-
-def _tracks(
-    meshes: Sequence[PosedMesh],
-    times: np.ndarray,
-    taken: Sequence[tuple[str, int, np.ndarray]],
-    options: HumanOptions,
-) -> TrueTracks:
-    """Return the tracks of points of the surface; ``taken``: name, row of ``times`` and (4, 4) pose
-    of each view."""
-    make = np.random.default_rng(options.seed)
-    first = meshes[0].vertices[meshes[0].faces]
-    areas = np.linalg.norm(np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0]), axis=1)
-    faces = meshes[0].faces[make.choice(len(areas), POINTS, p=areas / areas.sum())]
-    corners = make.dirichlet(np.ones(3), POINTS)
-    points = np.stack([interpolate(corners, mesh.vertices[faces]) for mesh in meshes])
-    visible = [_seen(meshes[row], points[row], pose) for _, row, pose in taken]
-    names = np.array([name for name, *_ in taken])
-    rows = np.array([row for _, row, _ in taken], np.int64)
-    return TrueTracks(points.astype(np.float32), times, names, rows, np.stack(visible))
-
-
 def _keypoints(
     body: BodyTemplate,
     motion: Motion,
@@ -256,14 +190,6 @@ def _keypoints(
         np.array(rows, np.int64),
         np.stack(visible),
     )
-
-
-def _seen(mesh: PosedMesh, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """Return (P,) bool: points (P, 3) in the image to which nothing of the mesh is nearer than
-    ``_SKIN``."""
-    index, depth = _pixels_of(points, world_from_cam, _SEEN_SIZE)
-    near = _surface(mesh, world_from_cam, _SEEN_SIZE)[1]
-    return (index >= 0) & (depth < near[index] + _SKIN)
 
 
 def _pixels_of(

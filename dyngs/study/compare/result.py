@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.api.train import num_cores
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, show
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import evaluate_run, images_of_split
@@ -106,7 +106,7 @@ class Measured:
         )
         said_path = self.bench.said_path(entry.name)
         said_path.parent.mkdir(parents=True, exist_ok=True)
-        print(f"training {entry.name}: {limit}", flush=True)
+        show(f"training {entry.name}: {limit}")
         with said_path.open("a", encoding="utf-8") as said, redirect_stdout(said):
             finished(entry.config, folder, [curve])
         side = load_resolved(folder).data.longest_side

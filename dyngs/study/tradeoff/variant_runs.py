@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.api.prune import prune_run
+from dyngs.api.scene_file import num_bytes_exact, write_scene_file
 from dyngs.api.train import num_cores
 from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.compress.prune.stage import pruning
@@ -16,7 +17,6 @@ from dyngs.config.schema import section_class
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
-from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.gaussians.restored import restored_model
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.ops.native import kernel_threads

@@ -13,7 +13,5 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """24 views of an object before nothing, 24 px."""
     folder = tmp_path_factory.mktemp("fields") / "capture"
-    write_still_capture(
-        folder, StillOptions(size=24, num_train=24, num_test=2, samples=1, distance=4.0)
-    )
+    write_still_capture(folder, StillOptions(size=24, num_train=24, num_test=2, samples=1))
     return folder

@@ -20,6 +20,7 @@ from dyngs.compress.storage.precision import (
 from dyngs.core.state import part_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.scene_tensors import (
     MAX_COARSENESS,
     TensorKind,
@@ -28,7 +29,6 @@ from dyngs.runs.scene_tensors import (
     drawable,
     restored,
 )
-from dyngs.static.scene import StaticScene
 
 
 def tensors() -> dict[str, Tensor]:

@@ -16,7 +16,6 @@ from dyngs.core.state import tensors_of
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.field import deformed
 from dyngs.deform.fields import field_state, restored_field
-from dyngs.gaussians import TopologyEdit
 
 CENTERS = torch.tensor([[0.2, -0.1, 0.3], [-0.4, 0.0, 0.1]])
 RADII = torch.tensor([0.2, 0.3])
@@ -83,16 +82,6 @@ def test_bodies_turn_into_the_light_and_out_of_it() -> None:
         torch.testing.assert_close(found.colors - alone.colors, lit, atol=1e-5, rtol=0)
 
 
-def test_rows_alone_are_computed_alike() -> None:
-    field = field_of()
-    means = cloud().means
-    rows = torch.tensor([8, 0, 3])
-    some = field.offsets(means, 0.37, rows)
-    every = field.offsets(means, 0.37).select(rows)
-    for name, x in vars(some).items():
-        torch.testing.assert_close(x, getattr(every, name), rtol=0, atol=1e-6)
-
-
 def test_gradients_reach_the_motion_and_the_gaussians() -> None:
     field = field_of()
     means = cloud().means.requires_grad_()
@@ -114,13 +103,6 @@ def test_gradients_reach_the_motion_and_the_gaussians() -> None:
     before = [x.detach().clone() for x in field.leaves]
     field.step(1, 0.0)
     assert sum(not torch.equal(x, y) for x, y in zip(field.leaves, before, strict=True)) >= 3
-
-
-def test_what_is_born_belongs_to_its_parents_body() -> None:
-    edited = field_of().edited(
-        TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False]))
-    )
-    assert edited.rest.labels.tolist() == [1, 1, -1]
 
 
 def stored(field: BodyField) -> dict[str, Tensor]:
@@ -158,31 +140,3 @@ def test_a_forged_state_is_refused(name: str, change: Callable[[Tensor], Tensor 
         tensors[name] = forged
     with pytest.raises((KeyError, ValueError)):
         restored_field(tiny_options("control_nodes"), tensors, 9)
-
-
-@pytest.mark.parametrize(
-    ("window", "learned"), [((0.3, 0.7), (3, 4)), ((0.35, 0.45), (3,)), ((0.0, 1.0), range(8))]
-)
-def test_what_the_window_of_times_hardly_shows_stays_as_it_was_found(
-    window: tuple[float, float], learned: tuple[int, ...] | range
-) -> None:
-    """Of 8 control points, that is 5 pieces, those that peak in the window are learned.
-
-    Adam, which makes steps of one size however weak the gradients are, once took paths a ball's
-    width away.
-    """
-    field = field_of(points=8)
-    means = cloud().means
-    before = {name: x.detach().clone() for name, x in field.parameters.values().items()}
-    for step in range(1, 4):
-        for time in torch.linspace(*window, 7).tolist():
-            field.offsets(means, time).means.square().sum().backward()
-        field.rest_outside_(window)
-        field.step(step, 0.0)
-    for name in ("places", "quats"):
-        x = field.parameters[name].detach()
-        moved = (x - before[name]).abs().amax(dim=(0, 2)) > 0
-        if name == "places":
-            assert torch.nonzero(moved)[:, 0].tolist() == list(learned)
-        else:
-            assert set(torch.nonzero(moved)[:, 0].tolist()) <= set(learned)

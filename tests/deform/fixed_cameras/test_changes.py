@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from static_balls import BLACK, SIZE, Ball, cameras, drawn, filmed
+from static_balls import BLACK, Ball, cameras, drawn, filmed
 
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.changes import LONGEST_SIDE, changes, footage_of, median_image
+from dyngs.deform.fixed_cameras.changes import LONGEST_SIDE, changes, footage_of
 
 TIMES = tuple(i / 8 for i in range(9))
 
@@ -27,11 +27,6 @@ def with_patch(factor: tuple[float, float, float], at: int = 0) -> np.ndarray:
         (images[at, 20:40, 20:40] * np.array(factor)).clip(0, 255).astype(np.uint8)
     )
     return images
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.01, 0.04])
-def test_noise_is_no_change(noise: float) -> None:
-    assert changes(still(noise)).mean() < 1e-3
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
@@ -57,15 +52,6 @@ def test_a_shadow_is_none_of_it() -> None:
         assert found.sum() < 1.2 * 20 * 20
 
 
-def test_holes_are_filled_and_specks_dropped() -> None:
-    images = with_patch((0.9, 0.3, 0.3))
-    images[0, 28:32, 28:32] = still()[0, 28:32, 28:32]
-    images[0, 5, 5] = 255
-    found = changes(images)
-    assert found[0, 22:38, 22:38].all()
-    assert not found[0, :10, :10].any()
-
-
 def test_large_images_are_shrunk_and_masks_kept() -> None:
     width = 2 * LONGEST_SIDE
     camera = cameras(1)[0]
@@ -85,11 +71,3 @@ def test_large_images_are_shrunk_and_masks_kept() -> None:
     assert footage_of(images, BLACK, total=8000).images.shape[2] == LONGEST_SIDE // 2
     with pytest.raises(ValueError, match="no images"):
         footage_of([], BLACK)
-
-
-def test_the_median_is_what_is_still() -> None:
-    wall = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0))
-    passed = wall.clone()
-    passed[1] = 0.0
-    assert torch.equal(median_image([wall, passed, wall]), wall)
-    assert SIZE >= 32

@@ -49,27 +49,3 @@ def test_what_one_of_eight_cameras_does_not_see_is_found() -> None:
         found = blobs_in(silhouettes_at(footage, 1.0), LOW, HIGH)
         assert len(found) == number
         assert all(np.linalg.norm(blob.center - [0.1, 0.0, 0.0]) < 0.05 for blob in found)
-
-
-def test_masked_cameras_do_not_count() -> None:
-    times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
-    footage = filmed(lambda t: [Ball((0.1, 0.0, 0.0))] if t == 1.0 else [], times, 6)
-    for one in footage[:3]:
-        one.changed[:], one.counted[:] = False, False
-    (found,) = blobs_in(silhouettes_at(footage, 1.0), LOW, HIGH)
-    assert np.linalg.norm(found.center - [0.1, 0.0, 0.0]) < 0.1
-
-
-def test_nothing_is_found_where_nothing_moves() -> None:
-    assert hulls() == []
-    assert blobs_in([], LOW, HIGH) == []
-
-
-def test_a_large_box_does_not_matter() -> None:
-    """What is far off is not divided."""
-    times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
-    footage = filmed(lambda t: [Ball((0.1, 0.0, 0.0))] if t == 1.0 else [], times, 6)
-    found = blobs_in(silhouettes_at(footage, 1.0), 8 * LOW, 8 * HIGH)
-    largest = max(found, key=lambda blob: len(blob.cubes))
-    assert np.linalg.norm(largest.center - [0.1, 0.0, 0.0]) < 0.05
-    assert largest.radius == pytest.approx(0.2, rel=0.25)

@@ -43,15 +43,3 @@ def test_seeds_cover_a_ball_at_each_time_and_pay() -> None:
         beside = now.replace(means=now.means + torch.tensor([0.0, 0.9, 0.0]))
         assert not pays(beside, one.time, footage)
     assert not pays(moments[0].gaussians, TIMES[-1], footage)
-
-
-def test_fewer_seeds_are_larger() -> None:
-    footage = filmed(lambda t: [ball_at(t)], TIMES, 7)
-    (track,) = found_tracks(footage, *BOX)
-    many, few = (
-        moments_of(track, footage, thinned, num_terms=1)[3].gaussians for thinned in (2.0, 18.0)
-    )
-    assert 8 < len(many) / len(few) < 10
-    torch.testing.assert_close(
-        few.scales[0, 0] / many.scales[0, 0], torch.tensor(3.0), rtol=0.05, atol=0
-    )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import pytest
 import torch
 from static_balls import Ball, Balls, filmed
@@ -31,19 +29,6 @@ def test_one_ball_begins_at_each_time() -> None:
         now = [one for one in found.moments if one.time == time]
         center = torch.cat([one.gaussians.means for one in now]).median(0).values
         assert (center - torch.tensor(crossing(time))).norm() < 0.1
-
-
-def test_two_balls_share_the_limit() -> None:
-    """One of which comes only when half of the clip is over."""
-    blue = (0.1, 0.2, 0.9)
-    found = started(
-        lambda t: [Ball(crossing(t))] + [Ball((0.2, 0.0, 2 * t - 1.7), 0.15, blue)] * (t > 0.5)
-    )
-    assert found.finding is not None
-    assert re.search("found at 12, [456] of 12 times", found.finding), (
-        "it may be lost where it is near the other"
-    )
-    assert 100 < sum(len(one.gaussians) for one in found.moments) <= 2 * 600
 
 
 @pytest.mark.parametrize(("count", "limit"), [(6, 600), (1, 600), (6, 0)])

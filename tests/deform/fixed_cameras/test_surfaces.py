@@ -14,7 +14,6 @@ TIMES = tuple(i / 5 for i in range(6))
 CENTER = torch.tensor([0.0, 0.1, 0.1])
 RADIUS = 0.4
 RED = (0.9, 0.2, 0.1)
-GREEN = (0.1, 0.9, 0.2)
 INSIDE = 0.35  # Radius of the Gaussians, which are blurred: none shows what is beside the ball
 
 
@@ -50,17 +49,3 @@ def test_a_ball_that_is_blue_at_a_time_gets_blue_gaussians_then_just_before_its_
     assert not found.velocity.any()
     fewer = surface_changes(footage, shell(), RenderOptions(), 50)
     assert sum(len(one.gaussians) for one in fewer) <= 50
-
-
-def test_what_a_passing_ball_hides_has_not_changed() -> None:
-    """Another place is hidden from each camera: the median over cameras is still."""
-    footage = filmed(
-        lambda t: (
-            [Ball((0.0, 0.1, 0.1), RADIUS, RED)]
-            + [Ball((0.0, 0.1, 1.0), 0.2, GREEN)] * (t == TIMES[3])
-        ),
-        TIMES,
-        noise=0.0,
-    )
-    found = surface_changes(footage, shell(), RenderOptions(), 1000)
-    assert sum(len(one.gaussians) for one in found) < 20

@@ -15,7 +15,7 @@ from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.export.cameras import write_cameras
-from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.edit.crop import Sphere
 from dyngs.export.edit.frame import Frame, geo_frame
 from dyngs.export.edit.run_folder import at_end, write_edited_run

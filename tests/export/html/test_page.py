@@ -41,8 +41,8 @@ from dyngs.export.html.page import MOST_VIEWS, PAGE, write_folder, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run, opened_scene
-from dyngs.static.scene import StaticScene
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
 def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
     write(still_scene(), tmp_path / "page.html", large(camera(), 6))
     page = browser.open((tmp_path / "page.html").as_uri(), 320, 240, touch=True)
-    page.wait_for("window.dyngs !== undefined")
+    page.wait_for("window.dyngs?.core !== undefined")
     assert page.evaluate("dyngs.parts.bar.hidden")
     before = page.evaluate("[dyngs.core.camera.yaw, dyngs.core.camera.distance]")
     session = page.driven.context.new_cdp_session(page.driven)

@@ -51,25 +51,6 @@ def test_masked_pixels_and_those_of_weight_0_do_not_count() -> None:
     torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)
 
 
-def test_without_pixels_it_is_the_identity() -> None:
-    image, rendering = image_and_rendering()
-    found = fitted_affine([(replace(image, mask=torch.zeros(60, 80)), rendering)], BLACK)
-    torch.testing.assert_close(found, torch.eye(3, 4))
-
-
-def test_saturated_pixels_do_not_darken() -> None:
-    """A third of the pixels would be brighter than white after twice the exposure, and were cut
-    off."""
-    image, rendering = image_and_rendering()
-    twice = 2 * rendering.rgb[0]
-    found = fitted_affine(
-        [(replace(image, rgb_premultiplied=(1.15 * twice).clamp_max(1.0)), rendering)], BLACK
-    )
-    gain = found[:, :3].sum(1) + found[:, 3] / 0.4
-    assert bool((twice * 1.15 > 1).any())
-    torch.testing.assert_close(gain, torch.full((3,), 2.3), atol=0.12, rtol=0)
-
-
 def test_channels_that_are_brighter_than_white_are_left_out_one_by_one() -> None:
     """As least squares over the pixels of each channel that are kept, with the ridge as two more
     equations."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.bake import DIRECTIONS, sphere, with_harmonics
+from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.rendering import Shader
 from dyngs.ops.harmonics import evaluate_harmonics
 
@@ -53,18 +53,3 @@ def test_the_error_is_what_cannot_be_fitted() -> None:
     )
     assert baked.error == pytest.approx(0.5)
     assert with_harmonics(gaussians, half, 3).error < 0.25
-
-
-def test_no_gaussians() -> None:
-    nobody = random_scene(n=3, degree=0).gaussians.select(torch.zeros(0, dtype=torch.long))
-    baked = with_harmonics(nobody, harmonics_shader(nobody.sh, 0), 3)
-    assert baked.gaussians.sh.shape == (0, 16, 3)
-    assert baked.error == 0
-
-
-def test_directions_are_even() -> None:
-    directions = sphere(DIRECTIONS)
-    torch.testing.assert_close(directions.norm(dim=1), torch.ones(DIRECTIONS, dtype=torch.float64))
-    assert directions.mean(0).abs().max() < 0.01
-    nearest = (directions @ directions.T - 2 * torch.eye(DIRECTIONS)).amax(1).acos()
-    assert nearest.min() > 0.5 * nearest.max()

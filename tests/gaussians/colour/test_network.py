@@ -11,15 +11,12 @@ import torch
 from scenes import random_scene
 from torch import Tensor
 
-from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import (
     ColourNetwork,
     RestFrame,
-    box_around,
-    network_of,
 )
-from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.gaussians.rendering import render
 from dyngs.ops.perceptron import Layer, reference_perceptron
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.shading import Sight, num_inputs
@@ -90,36 +87,6 @@ def test_colours_do_not_move_gaussians() -> None:
         assert (x.grad is None) == (name != "sh"), name
 
 
-def test_gradients_are_those_of_finite_differences() -> None:
-    scene = random_scene(n=4, degree=0)
-    net = network(last=0.05)
-    bright = scene.gaussians.sh + 3
-    shown = torch.ones(2, 4, 2, dtype=torch.int32)  # far from the clamp
-
-    def shades(sh: Tensor, *parts: Tensor) -> Tensor:
-        layers = tuple(Layer(*parts[i : i + 2]) for i in (0, 2))
-        shader = replace(net, layers=layers).shader(0.4)
-        return shader(scene.gaussians.replace(sh=sh), scene.cameras, shown)
-
-    parts = [x.clone().requires_grad_() for layer in net.layers for x in (layer.weight, layer.bias)]
-    assert torch.autograd.gradcheck(shades, (bright.requires_grad_(), *parts))
-
-
-@pytest.mark.parametrize("sees_time", [False, True])
-def test_time_is_seen_if_it_should_be_and_clamped(sees_time: bool) -> None:
-    scene = random_scene(n=5)
-    net = network(sees_time=sees_time)
-    shown = torch.ones(2, 5, 2, dtype=torch.int32)
-
-    def at(time: float | None) -> Tensor:
-        return net.shader(time)(plain(scene.gaussians), scene.cameras, shown)
-
-    assert torch.equal(at(0.2), at(0.9)) != sees_time
-    assert torch.equal(at(None), at(0.0))
-    assert torch.equal(at(1.0), at(7.0))
-    assert torch.equal(at(0.0), at(-1.0))
-
-
 def test_colours_turn_with_a_body() -> None:
     """A body and a camera turned together look the same, if the network is told how the body was at
     rest."""
@@ -147,59 +114,3 @@ def test_colours_turn_with_a_body() -> None:
     )
     now = net.shader(None, RestFrame(gaussians.means, turn))(moved, cameras, shown)
     torch.testing.assert_close(now, at_rest(gaussians, scene.cameras, shown))
-
-
-def test_a_normal_has_no_sign() -> None:
-    """A quarter turn of a disc about its own plane's axis by pi turns the normal round; the colours
-    stay."""
-    scene = random_scene(n=5)
-    net = network()
-    gaussians = plain(scene.gaussians)
-    flat = gaussians.replace(
-        log_scales=torch.tensor([[0.0, 0.0, -5.0]], dtype=torch.float64).expand(5, 3)
-    )
-    a, b, c, d = flat.quats.unbind(1)
-    # times i: by pi about its own x axis
-    flipped = flat.replace(quats=torch.stack([-b, a, d, -c], 1))
-    shown = torch.ones(2, 5, 2, dtype=torch.int32)
-    colors = [net.shader(0.0)(x, scene.cameras, shown) for x in (flat, flipped)]
-    torch.testing.assert_close(colors[0], colors[1])
-
-
-@pytest.mark.parametrize("count", [0, 1, 300])
-def test_the_box_holds_all_but_the_outermost(count: int) -> None:
-    means = torch.randn(count, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
-        [1.0, 5.0, 0.0]
-    )
-    if count > 100:
-        means[0] = 1e6
-    center, half_size = box_around(means)
-    assert (half_size > 0).all()
-    inside = ((means - center).abs() <= half_size * 1.001).all(1)
-    assert inside.float().sum() >= 0.9 * count
-    assert half_size.max() < 1e3
-
-
-def test_state_goes_round() -> None:
-    net = network(sees_time=False)
-    state = {"box": net.box, "sees": torch.tensor([False, True])}
-    for i, layer in enumerate(net.layers):
-        state |= {
-            f"weight{i}": layer.weight,
-            f"bias{i}": layer.bias,
-            f"exp_avg.weight{i}": layer.weight,
-        }
-    assert network_of(state) == net
-    assert network_of({"frozen": torch.zeros(3)}) is None
-    assert net.num_values == 6 + 8 * 13 + 8 + 3 * 8 + 3
-
-
-def test_nothing_to_draw() -> None:
-    scene = random_scene(n=3)
-    nobody = plain(scene.gaussians).select(torch.zeros(0, dtype=torch.long))
-    assert render(
-        nobody, scene.cameras, RenderOptions(), shader=network().shader(None)
-    ).rgb.shape == (2, 29, 37, 3)
-    none = Cameras(scene.cam_from_world[:0], scene.intrinsics[:0], 4, 4)
-    empty = torch.zeros(0, 3, 2, dtype=torch.int32)
-    assert network().shader(None)(plain(scene.gaussians), none, empty).shape == (0, 3, 3)

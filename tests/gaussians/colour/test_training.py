@@ -20,7 +20,6 @@ from dyngs.config import (
     NetworkColour,
     RandomInit,
     RunConfig,
-    ShColour,
     StaticModel,
     TrainConfig,
 )
@@ -30,14 +29,10 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.colour.training import (
     AutoTraining,
-    ColourTraining,
     NetworkTraining,
-    TrainingLooks,
     opacity_entropy,
     rate_factor,
 )
-from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.gaussians.restored import restored_scene
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 
@@ -61,41 +56,6 @@ def stored(learner: NetworkTraining) -> dict[str, Tensor]:
     }
 
 
-def test_plain_colours_do_nothing() -> None:
-    plain = ColourTraining(ShColour())
-    assert plain.network is None
-    assert plain.penalties(gaussians()) == {}
-    assert plain.optimize(1) == 0
-    assert plain.state() == {}
-    assert plain.frozen_rest() is None
-    assert not plain.holds_out(5, 1)
-
-
-def test_an_untrained_network_shows_the_base_colours() -> None:
-    camera = random_scene(views=1).to(torch.float32).cameras
-    drawn = [
-        render(gaussians(), camera, shader=s).rgb for s in (None, colours().network.shader(0.4))
-    ]
-    # base + 0 in another order of float32 sums
-    torch.testing.assert_close(drawn[0], drawn[1], rtol=0, atol=1e-6)
-
-
-def test_it_learns_what_depends_on_the_view() -> None:
-    """Base colours fixed: only the network can tell the two views apart."""
-    cameras = random_scene(views=2).to(torch.float32).cameras
-    shown = torch.ones(2, 30, 2, dtype=torch.int32)
-    target = torch.tensor([0.2, 0.8])[:, None, None]
-    learner = colours(lr=0.1)
-    drawn = gaussians()
-    losses = []
-    for step in range(1, 61):
-        error = (learner.network.shader(0.5)(drawn, cameras, shown) - target).square().mean()
-        error.backward()
-        losses.append(float(error.detach()))
-        assert learner.optimize(step) == 0
-    assert losses[-1] < 0.1 * losses[0]
-
-
 def test_the_rate_warms_up_and_falls_by_thirds() -> None:
     factors = [rate_factor(step, 1200) for step in range(1, 1201)]
     assert factors[49] == pytest.approx(0.5)
@@ -103,16 +63,6 @@ def test_the_rate_warms_up_and_falls_by_thirds() -> None:
     assert factors[200] == pytest.approx(1 / 3)
     assert factors[600] == pytest.approx(1 / 9)
     assert factors[1199] == pytest.approx(1 / 27)
-
-
-def test_a_bad_gradient_is_left_out_and_counted() -> None:
-    learner = colours()
-    before = stored(learner)
-    learner.network.layers[-1].bias.grad = torch.tensor([1.0, float("nan"), 1.0])
-    assert learner.optimize(1) == 1
-    after = stored(learner)
-    assert (after["bias2"] != before["bias2"]).tolist() == [True, False, True]
-    assert all(x.isfinite().all() for x in after.values() if x.is_floating_point())
 
 
 def test_state_goes_round_and_training_goes_on_alike() -> None:
@@ -137,31 +87,6 @@ def test_state_goes_round_and_training_goes_on_alike() -> None:
     found = network_of(stored(whole))
     assert found is not None
     assert torch.equal(found.layers[1].weight, whole.network.layers[1].weight)
-
-
-def test_every_eighth_view_is_held_out_until_it_is_measured() -> None:
-    colours = AutoTraining(AutoColour(), 100, 20)
-    assert [i for i in range(20) if colours.holds_out(i, 60)] == [5, 13]
-    assert not any(colours.holds_out(i, 61) for i in range(20))
-    assert measured_steps(colours) == [60]
-    few = AutoTraining(AutoColour(), 100, 5)
-    assert not few.held_out
-    assert measured_steps(few) == [], "too few views to spare one"
-
-
-def measured_steps(colours: AutoTraining) -> list[int]:
-    """Steps of 100 after which views are looked at; here there are none to look at."""
-    looked: list[int] = []
-    for step in range(101):
-
-        def looks(step: int = step) -> TrainingLooks:
-            looked.append(step)
-            return TrainingLooks((), lambda _: iter(()), RenderOptions(), torch.zeros(3))
-
-        found = colours.measured(step, looks)
-        assert (found is None) == (step not in looked)
-        assert found is None or (found.rows is None and "all harmonics stay" in found.text)
-    return looked
 
 
 def test_the_frozen_follow_the_set_and_go_round() -> None:
@@ -193,22 +118,6 @@ def test_the_entropy_and_its_gradient_are_finite_and_right(logit: float) -> None
     assert 0 <= float(value.detach()) <= 1 / torch.e + 1e-12
     assert x.grad is not None
     torch.testing.assert_close(x.grad, -(log + 1) * o * torch.sigmoid(-x.detach()))
-
-
-def test_the_entropy_pushes_away_from_one_over_e() -> None:
-    logits = torch.tensor([0.2, 0.3, 0.45, 0.6]).logit().requires_grad_()
-    opacity_entropy(logits).backward()
-    assert logits.grad is not None
-    assert (logits.grad > 0).tolist() == [True, True, False, False], (
-        "a step down the gradient makes the faint fainter"
-    )
-
-
-def test_the_entropy_is_weighted_and_of_nothing_zero() -> None:
-    some = gaussians()
-    (term,) = ColourTraining(ShColour(opacity_entropy=0.5)).penalties(some).values()
-    assert float(term) == pytest.approx(0.5 * float(opacity_entropy(some.logit_opacities)))
-    assert float(opacity_entropy(torch.zeros(0))) == 0
 
 
 MEASURED_AFTER = 24
@@ -295,22 +204,3 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
         assert frozen is not None
         assert 0 < int(frozen.sum()) < len(frozen) == len(sh)
         assert torch.equal((sh[:, 1:] == 0).flatten(1).all(1), frozen)
-
-
-def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> None:
-    """And what was trained is drawn with it."""
-    trainer = _coloured(seven_views, COLOURS["network"])
-    for _ in range(30):
-        trainer.step()
-    assert trainer.model.scene.gaussians.sh_degree == 0
-    scene = restored_scene(trainer.checkpoint(), trainer.config.model)
-    network = trainer.model.colours.network
-    assert network is not None
-    camera = trainer.images[0].cameras
-    gaussians = trainer.model.scene.gaussians.detach()
-    shader = network.shader(None, None)
-    drawn = scene.render(camera, options=RenderOptions(), background=torch.zeros(3)).rgb
-    assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
-    assert not torch.equal(drawn, render(gaussians, camera).rgb)
-    assert scene.colour is not None
-    assert scene.num_colour_values == 3 * len(gaussians) + scene.colour.num_values

@@ -20,7 +20,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.static.scene import StaticScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.training.corrections.camera_refinement import (
     MIN_POSES,
     STARTS,

@@ -22,6 +22,8 @@ from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.static_scene import Sides, StaticScene
+from dyngs.gaussians.static_training import StaticTraining
 from dyngs.human.predict.gps.pairs import MAX_ANGLE, Pair, lessons, neighbours, well_spread
 from dyngs.human.predict.gps.rectification import RectifiedPair, cropped, is_inside, rectified
 from dyngs.human.predict.gps.surface import GpsNetwork, gaussians_of, offset_loss
@@ -38,9 +40,6 @@ from dyngs.models.prediction import (
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
-from dyngs.static.scene import StaticScene
-from dyngs.static.sides import Sides
-from dyngs.static.training import StaticTraining
 
 DECAY = 0.9
 """Weight of the error of an iteration relative to the next."""

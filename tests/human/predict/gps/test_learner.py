@@ -25,12 +25,12 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.predict.gps.learner import learner, predictor
 from dyngs.human.predict.gps.pairs import neighbours
 from dyngs.human.synthetic.people import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.static.scene import StaticScene
 from dyngs.training.prediction import network_trainer
 
 

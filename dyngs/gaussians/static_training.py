@@ -1,5 +1,6 @@
 """Training of a static scene: on every image, with its 3D filter kept up to date, and rid of what
-no image shows."""
+no image shows.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +22,11 @@ from dyngs.gaussians.optimizer import Still
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
-from dyngs.static.scene import StaticScene
 
 # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
 SURVEYED = 200

@@ -10,10 +10,10 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
+from dyngs.api.scene_file import write_scene_file
 from dyngs.compress.storage.precision import Precision
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import prefixed, tensors_of
-from dyngs.export.scene_file import write_scene_file
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.runs.checkpoint import latest_checkpoint, load_run, save_checkpoint
 

@@ -18,15 +18,15 @@ from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.export.camera_paths.path import CameraPath, write_path
-from dyngs.export.chosen_path import PathOptions, choose_path, orbit_around, view_to_show
+from dyngs.export.camera_paths import CameraPath, write_path
+from dyngs.export.choose_path import PathOptions, choose_path, orbit_around, view_to_show
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
-from dyngs.static.scene import StaticScene
 from dyngs.training.new_trainer import assemble
 
 MODEL = HumanModel(resolution=24, sh_degree=0, fit=False)
@@ -78,23 +78,6 @@ def test_up_counts_for_runs(path: str, moving_run: Opened) -> None:
         downs = poses[:, 1, :3]
         torch.testing.assert_close(rights @ torch.tensor(up), torch.zeros(3), atol=1e-6, rtol=0)
         assert (downs @ torch.tensor(up) < 0).all()
-
-
-def test_times_of_a_still_run_are_accepted_with_a_note(still_run: Opened) -> None:
-    path = choose_path(still_run, PathOptions("orbit", 3, times=(0.0, 0.5, 1.0)))
-    assert len(path) == 3
-    assert "nothing moves" in path.notes[0]
-
-
-def test_times_outside_are_clamped_with_one_warning(moving_run: Opened) -> None:
-    for options in (
-        PathOptions("orbit", 3, times=(-1.0, 0.5, 9.0)),
-        PathOptions(None, times=(-1.0, 0.5, 9.0)),
-    ):
-        path = choose_path(moving_run, options)
-        assert path.times == (0.0, 0.5, 1.0)
-        assert len(path.warnings) == 1
-        assert "clamped" in path.warnings[0]
 
 
 def test_times_of_a_file_are_overridden(moving_run: Opened, tmp_path: Path) -> None:
@@ -210,12 +193,6 @@ def test_a_single_gaussian_is_in_view_whole() -> None:
     size = math.exp(-3)
     distance = float((orbit_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
     assert size < distance < 10 * size
-
-
-def test_an_unknown_path_is_named(tmp_path: Path) -> None:
-    file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians())).path
-    with pytest.raises(DyngsError, match="no camera path 'circle'"):
-        choose_path(open_scene(file), PathOptions("circle"))
 
 
 @pytest.mark.parametrize(

@@ -12,22 +12,16 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
-from dyngs.export.camera_paths.along import path_along
-from dyngs.export.camera_paths.orbit import (
-    frame_orbit_for_points,
-    orbit_of,
-    orbit_path,
-    spiral_path,
-)
-from dyngs.export.camera_paths.path import (
+from dyngs.export.camera_paths import (
     CameraPath,
     path_file,
+    pick_cameras,
     read_path,
     resize_cameras,
-    static_path,
     with_times,
 )
 from dyngs.export.images import file_stems
+from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
@@ -37,8 +31,7 @@ from dyngs.runs.opened import Opened, cameras_for_paths, split_views
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
-_SAMPLED_TIMES = 8  # times of a motion whose Gaussians the images of an orbit must hold
-_RING = 24
+_RING = 24  # cameras around a scene, among which the one in front of a person is looked for
 
 
 @dataclass(frozen=True)
@@ -71,11 +64,18 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     times = options.times
     if opened.captured is None:
         _require_fitting(opened, options)
-    path = (
-        _fixed_camera(opened, options)
-        if options.path is None
-        else _moving(opened, options.path, options)
-    )
+    if options.path is None:
+        path = _fixed_camera(opened, options)
+    else:
+        file = path_file(options.path)
+        if file is None:
+            path = _placed(opened, options.path, options)
+        else:
+            path = read_path(file, opened.world_offset, options.size)
+            path = replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
+        if times is not None:
+            path = replace(path, warnings=())
+            path = with_times(path, times * len(path) if len(times) == 1 else times)
     notes = path.notes
     if scene.is_static and times is not None:
         notes = (*notes, "nothing moves in this run: it looks the same at all times")
@@ -97,17 +97,15 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
     split, from 0. ``split``: None looks for a name in all, for a number in the first that has
     views. Raises DyngsError: no such view or split.
     """
-    order = (
-        [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
-    )
+    order = [split] if split else [s for s in ("test", "val", "train") if capture.splits.get(s)]
     candidates = [split_views(capture, s) for s in order]
+    first = candidates[0]
     if name is None:
-        return candidates[0][0]
+        return first[0]
     for views in candidates:
         for view, stem in zip(views, file_stems([view.name for view in views]), strict=True):
             if name in (view.name, stem):
                 return view
-    first = candidates[0]
     if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(first):
         return first[int(name)]
     raise DyngsError(
@@ -124,7 +122,7 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
     """
     scene = opened.renderable
     moves = opened.person is not None and not scene.is_static
-    times = np.linspace(0, 1, _SAMPLED_TIMES).tolist() if moves else [None]
+    times = np.linspace(0, 1, 8).tolist() if moves else [None]
     means = torch.cat([points_at(scene, time) for time in times]).cpu().numpy()
     x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
     least = 0.0
@@ -139,12 +137,15 @@ def points_at(scene: Renderable, time: float | None = None) -> Tensor:
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
-def front_of(opened: Opened, ring: Cameras) -> int:
-    """Return which camera of an orbit sees a person's front; 0 for other scenes."""
-    if opened.person is None:
-        return 0
-    facing = axis_angle_to_matrix(opened.person.clip.poses[0, 0])[:, 2]
-    return int((ring.centers @ facing).argmax())
+def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+    """Return three neighbours on a circle around a scene, of which the second sees a person's
+    front."""
+    ring = orbit_around(opened, _RING, size)
+    front = 0
+    if opened.person is not None:
+        facing = axis_angle_to_matrix(opened.person.clip.poses[0, 0])[:, 2]
+        front = int((ring.centers @ facing).argmax())
+    return pick_cameras(ring, [(front + i) % _RING for i in (-1, 0, 1)])
 
 
 def _require_fitting(opened: Opened, options: PathOptions) -> None:
@@ -164,63 +165,40 @@ def _require_fitting(opened: Opened, options: PathOptions) -> None:
 
 
 def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
+    times = opened.renderable.times
     if opened.captured is None:
-        ring = orbit_around(opened, _RING, options.size or DEFAULT_SIZE)
-        camera = ring.select(front_of(opened, ring))
-        times = opened.renderable.times
+        camera = in_front_of(opened, options.size or DEFAULT_SIZE).select(1)
     else:
         view = view_to_show(opened.capture, options.view, options.split)
         (camera,) = training_cameras([view], opened.config.data)
-        times = (view.time or 0.0,) if opened.fps is None else opened.renderable.times
-    return static_path(camera, times if options.times is None else options.times)
-
-
-def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
-    file = path_file(name)
-    if file is None:
-        found = _placed(opened, name, options)
-    else:
-        found = read_path(file, opened.world_offset, options.size)
-        found = replace(found, cameras=opened.frame.inverse().cameras(found.cameras))
-    if options.times is None:
-        return found
-    times = options.times * len(found) if len(options.times) == 1 else options.times
-    return with_times(replace(found, warnings=()), times)
+        times = (view.time or 0.0,) if opened.fps is None else times
+    times = times if options.times is None else options.times
+    return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
 
 
 def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by
     the scene."""
-    frames = options.num_frames or (
-        DEFAULT_FRAMES if opened.fps is None else len(opened.renderable.times)
-    )
+    scene = opened.renderable
+    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(scene.times))
     up = None if opened.stated_up is None else opened.direction_of(opened.stated_up)
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
         if name == "orbit":
             return CameraPath(orbit_around(opened, frames, size))
-        ring = orbit_around(opened, _RING, size)
-        arc = [(front_of(opened, ring) + i) % _RING for i in (-1, 0, 1)]
-        near = replace(
-            ring, cam_from_world=ring.cam_from_world[arc], intrinsics=ring.intrinsics[arc]
-        )
-        return CameraPath(spiral_path(near, frames))
+        return CameraPath(spiral_path(in_front_of(opened, size), frames))
     views = opened.capture.splits["train"]
     cameras = cameras_for_paths(views, opened.config.data)
-    match name:
-        case "orbit":
-            orbit = orbit_of(cameras, up)
-            if opened.person is None or orbit.width is None:
-                return CameraPath(orbit_path(cameras, frames, up), notes=orbit.notes)
-            notes = ("the person was filmed from one side: the orbit goes all around them",)
-            return CameraPath(
-                orbit_around(opened, frames, (cameras.width, cameras.height)), notes=notes
-            )
-        case "spiral":
-            return CameraPath(spiral_path(cameras, frames, up))
-        case _:
-            times = [view.time for view in views if view.time is not None]
-            clip = (
-                len(times) == len(views) and not opened.renderable.is_static and opened.fps is None
-            )
-            return path_along(cameras, frames, times if clip else None, up)
+    if name == "spiral":
+        return CameraPath(spiral_path(cameras, frames, up))
+    if name == "along":
+        times = [view.time for view in views if view.time is not None]
+        is_clip = len(times) == len(views) and not scene.is_static and opened.fps is None
+        return path_along(cameras, frames, times if is_clip else None, up)
+    path, is_all_around = orbit_path(cameras, frames, up)
+    if opened.person is None or is_all_around:
+        return path
+    around = orbit_around(opened, frames, (cameras.width, cameras.height))
+    return CameraPath(
+        around, notes=("the person was filmed from one side: the orbit goes all around them",)
+    )

@@ -1,13 +1,26 @@
-"""A scene of polyhedra and letters whose faces have one colour each, and where the edges of its
-images truly are."""
+"""A capture of polyhedra and letters whose faces have one colour each, and where the edges of its
+images truly are.
+
+    python benchmarks/polyhedra.py FOLDER --size 200
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+from dyngs.data.synthetic.captures import (
+    DISTANCE,
+    Shot,
+    StillOptions,
+    hemisphere_cameras,
+    orbit_cameras,
+    write_split,
+)
 from dyngs.data.synthetic.raytrace import (
     Box,
     Paint,
@@ -18,6 +31,8 @@ from dyngs.data.synthetic.raytrace import (
     nearest_things,
     sampled_rays,
 )
+from dyngs.io.outputs import new_folder
+from dyngs.io.write import write_image
 
 Rgb = tuple[float, float, float]
 _FACES = 64  # More than any primitive has, for numbers of faces
@@ -203,3 +218,43 @@ def true_edges(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int
         edge |= np.pad(differs, [(0, int(a == axis)) for a in (0, 1)])
         edge |= np.pad(differs, [(int(a == axis), 0) for a in (0, 1)])
     return edge.astype(np.uint8) * 255
+
+
+CLOSE = 0.4  # Distance of close-ups, in that of the other cameras
+
+
+def write_polyhedra_capture(out: Path, options: StillOptions) -> Path:
+    """Write images of ``polyhedra`` as ``write_still_capture`` does; returns ``out``.
+
+    The split val has as many close-ups as test has images, from 40 % of the distance.
+    ``edges/SPLIT/r_000.png`` is white where the true edges of the images of test and val are.
+    """
+    scene = polyhedra()
+    close = CLOSE * DISTANCE
+    splits = {
+        "train": hemisphere_cameras(options.num_train, DISTANCE, options.seed),
+        "val": orbit_cameras(options.num_test, close, elevation_deg=33.0, start_deg=10.0),
+        "test": orbit_cameras(options.num_test, DISTANCE, elevation_deg=28.0, start_deg=0.0),
+    }
+    with new_folder(out) as started:
+        for split, poses in splits.items():
+            shots = [Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            write_split(started, split, shots, lambda _: scene, options)
+            for shot in shots if split != "train" else ():
+                edges = true_edges(scene, shot.world_from_cam, options.size, options.samples)
+                write_image(started / "edges" / f"{shot.name}.png", edges)
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--size", type=int, default=128)
+    given = parser.parse_args()
+    print(write_polyhedra_capture(given.folder, StillOptions(size=given.size)))
+
+
+if __name__ == "__main__":
+    main()

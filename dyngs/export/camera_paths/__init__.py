@@ -1,1 +1,0 @@
-"""Camera paths: placed by cameras or points, smoothed, interpolated, read and written."""
