@@ -16,9 +16,9 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import as_static
+from dyngs.api.choose import Choice, as_static, choose, explained_pixels
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig, DynamicModel
+from dyngs.config import Config, DataConfig, DynamicModel, RunConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -30,7 +30,10 @@ from dyngs.data.synthetic.captures import (
 from dyngs.gaussians.rendering import render
 from dyngs.training.trainer import Trainer
 
-LONG = "train.steps=200_000"
+
+def without_name(config: Config) -> Config:
+    """The config without what the preset of another kind calls its runs."""
+    return config.model_copy(update={"run": RunConfig()})
 
 
 def preset(root: Path, *keys: str, name: str = "dynamic") -> Config:
@@ -52,7 +55,19 @@ def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
 
 def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> None:
     with pytest.raises(DyngsError, match=r"no times.*configs/static.yaml.*data\.times=order"):
-        decided(preset(still))
+        choose(preset(still), read_capture(DataConfig(root=still)))
+
+
+def test_half_is_explained_and_neither_image_is_favoured() -> None:
+    truth = torch.zeros(10, 10, 3)
+    one = truth.clone()
+    other = truth.clone()
+    one[:5] = 1.0
+    other[5:] = 1.0
+    other[0] = 1.0
+    counts = explained_pixels(one, other, truth, None)
+    assert torch.equal(counts, explained_pixels(other, one, truth, None))
+    assert counts[1:].all()
 
 
 @pytest.mark.parametrize(
@@ -109,13 +124,9 @@ def write_rolling_ball(root: Path) -> None:
 
 @pytest.mark.parametrize(("moves", "steps"), [(True, 200), (False, 300)])
 def test_never_worse_than_static(
-    moves: bool,
-    steps: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    moves: bool, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A real trial: motion wins where something moves, the static model where nothing does."""
+    """Motion wins real pilot runs where something moves, the static model where nothing does."""
     root = tmp_path / "capture"
     keys = ["init.num_random=200", "model.num_random_moving=60"]
     if moves:
@@ -123,23 +134,19 @@ def test_never_worse_than_static(
     else:
         write_still_capture(root, StillOptions(size=24, num_train=48, num_test=1, samples=1))
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
-    monkeypatch.setattr(module, "TRIAL_STEPS", steps)
-    config = preset(
-        root, "train.steps=20_000", *keys, "colour.kind=sh", "model.deform.move_opacities=false"
-    )
-    best, (choice,) = decided(config)
+    monkeypatch.setattr(module, "MOTION", replace(module.MOTION, steps=steps))
+    config = preset(root, "train.steps=20_000", *keys, "colour.kind=sh")
+    best, (choice,), _ = choose(config, read_capture(config.data))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
-    assert f"model.kind=dynamic {'' if moves else 'not '}taken: " in capsys.readouterr().out
 
 
-def test_a_trial_that_is_interrupted_leaves_nothing_and_has_the_same_end_again(
+def test_interrupted_pilot_runs_leave_nothing_and_repeat(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_rolling_ball(tmp_path / "capture")
-    monkeypatch.setattr(module, "TRIAL_STEPS", 12)
+    monkeypatch.setattr(module, "MOTION", replace(module.MOTION, steps=12, spent=1000))
     monkeypatch.setattr(module, "FEWEST_MOVING", 1)
-    monkeypatch.setattr(module, "TRIAL_SPENT", 1000)
     run = tmp_path / "run"
     real = Trainer.step
     config = preset(tmp_path / "capture", "train.steps=12", "init.num_random=40", f"run.dir={run}")
@@ -153,5 +160,31 @@ def test_a_trial_that_is_interrupted_leaves_nothing_and_has_the_same_end_again(
         with pytest.raises(KeyboardInterrupt, match="nothing is written"):
             train(config)
     assert not list(run.glob("*"))
-    chosen = [decided(config) for _ in range(2)]
-    assert replace(chosen[0][1][0], seconds=0) == replace(chosen[1][1][0], seconds=0)
+    capture = read_capture(config.data)
+    first, second = (choose(config, capture)[1][0] for _ in range(2))
+    assert replace(first, seconds=0) == replace(second, seconds=0)
+
+
+def test_a_clear_gain_is_taken_and_noise_is_not(
+    still: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two open settings, each tried on top of those before it."""
+    gains = {"camera.refine=always": 1.0, "train.exposure=always": 0.01}
+    compared = list[tuple[str, str]]()
+
+    def compare(text: str, both: Any, *_: Any, **__: Any) -> Choice:
+        compared.append((text, both[0].camera.refine))
+        taken = gains[text] > 0.05
+        return Choice(text, 8, 20.0, gains[text], 0.1, 1000, 1.0, taken)
+
+    monkeypatch.setattr(module, "_compared", compare)
+    keys = (
+        "train.steps=200_000",
+        "camera.refine=auto",
+        "train.exposure=auto",
+        "data.longest_side=8",
+    )
+    config = preset(still, *keys, name="static")
+    best, choices, _ = choose(config, read_capture(config.data))
+    assert compared == [("camera.refine=always", "never"), ("train.exposure=always", "always")]
+    assert (best.camera.refine, best.train.exposure, len(choices)) == ("always", "never", 2)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from tiny_fields import busy_config, tiny_options, write_tiny_capture
+from tiny_fields import tiny_options
 
 from dyngs.api.train import train
 from dyngs.config import (
@@ -27,8 +25,7 @@ from dyngs.config import (
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.training.limits import most_gaussians, require_possible, room, within_cap
+from dyngs.training.limits import require_possible, room, within_cap
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
@@ -85,40 +82,6 @@ def test_none_are_added_beyond_a_cap(
     assert largest_count(assemble(limited(config, max_gaussians=cap))) == most
 
 
-def test_a_cap_holds_where_motion_adds_some(tmp_path: Path) -> None:
-    config = busy_config(
-        write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "control_nodes"
-    )
-    assert isinstance(config.model, DynamicModel)
-    free = largest_count(assemble(config))
-    cap = free - config.model.num_random_moving
-    trainer = assemble(limited(config, max_gaussians=cap))
-    assert cap - config.model.num_random_moving <= largest_count(trainer) <= cap
-    assert trainer.num_moving > 0
-
-
-def test_without_limits_the_run_is_the_same(still: Path, tmp_path: Path) -> None:
-    config = still_config(still, tmp_path / "free")
-    assert within_cap(config, 0) is config
-    wide = timed(limited(still_config(still, tmp_path / "wide"), max_gaussians=10**6), 1000.0)
-    free, kept = (checkpoint_paths(train(c))[-1].read_bytes() for c in (config, wide))
-    assert free == kept, "limits that are far away change nothing"
-
-
-@given(cap=st.integers(1, 10**7), own=st.integers(1, 10**7))
-def test_limits_only_lower_and_are_settled_at_once(cap: int, own: int) -> None:
-    base = NOTHING.model_copy(
-        update={"strategy": DefaultStrategy(max_gaussians=own), "model": DynamicModel()}
-    )
-    config = within_cap(limited(base, max_gaussians=cap), 5)
-    assert isinstance(config.model, DynamicModel)
-    assert config.strategy.max_gaussians + config.model.num_random_moving <= min(
-        cap, own + DynamicModel().num_random_moving
-    )
-    assert 1 <= config.strategy.max_gaussians <= own
-    assert within_cap(config, 5) == config
-
-
 def test_room_grows_with_the_size_and_shrinks_with_what_is_stored() -> None:
     assert room(NOTHING, 0, 5.0) == pytest.approx(5e6 / (16 + 0.35 * 45), abs=1)
     assert room(NOTHING, 0, 10.0) == pytest.approx(2 * room(NOTHING, 0, 5.0), abs=1)
@@ -161,12 +124,6 @@ def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     ):
         require_possible(timed(NOTHING.model_copy(update={"model": HumanPredictorModel()}), 5.0))
     assert not (tmp_path / "run").exists()
-
-
-def test_the_lowest_limit_counts() -> None:
-    assert most_gaussians(NOTHING, 0) is None
-    assert most_gaussians(limited(max_gaussians=1000, max_mb=5.0), 0) == 1000
-    assert most_gaussians(limited(max_gaussians=10**6, max_mb=5.0), 0) == room(NOTHING, 0, 5.0)
 
 
 @pytest.mark.parametrize("preset", ["human", "human_predictor"])

@@ -29,11 +29,8 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.models.renderable import Rendering
-from dyngs.ops.loss import l1_ssim_loss
-from dyngs.training.corrections.robust import EVERY, WARM_UP, RobustMasks
+from dyngs.training.corrections.robust import WARM_UP, RobustMasks
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
@@ -78,17 +75,6 @@ def test_what_stands_in_front_of_some_views_is_left_out() -> None:
         assert bool((image.mask[far] == 1).all())
 
 
-def test_it_has_no_gradient() -> None:
-    image = busy_wall()[1]
-    drawn = [learned(x.cameras) for x in busy_wall()]
-    mask = masked_images(busy_wall(), drawn)[1].mask
-    rendered = drawn[1].requires_grad_()
-    l1_ssim_loss(rendered, image.rgb_premultiplied, 0.2, mask).backward()
-    assert rendered.grad is not None
-    assert not bool(rendered.grad[ROWS, COLUMNS].any())
-    assert bool(rendered.grad[0].any())
-
-
 def test_nothing_is_left_out_where_views_agree() -> None:
     images = busy_wall(())
     found = masked_images(images, [learned(image.cameras) for image in images])
@@ -115,25 +101,6 @@ def test_all_counts_while_the_run_warms_up() -> None:
     assert masks.masked(1, AFTER - 1, images[1], drawn, BLACK, with_depth) is images[1]
 
 
-def test_a_image_is_looked_at_now_and_then_and_its_mask_stays_in_between() -> None:
-    images = busy_wall()
-    masks = masks_of(images)
-    drawn = learned(images[1].cameras)
-    found: list[Tensor] = []
-    looks: list[int] = []
-
-    def counted(cameras: Cameras) -> Rendering:
-        looks.append(len(found))
-        return with_depth(cameras)
-
-    for _ in range(EVERY + 1):
-        mask = masks.masked(1, AFTER, images[1], drawn, BLACK, counted).mask
-        assert mask is not None
-        found.append(mask)
-    assert looks == [0, EVERY]
-    assert all(torch.equal(mask, found[0]) for mask in found)
-
-
 def test_the_images_own_mask_stays() -> None:
     own = torch.ones(SIZE[1], SIZE[0])
     own[:, :10] = 0
@@ -145,19 +112,6 @@ def test_the_images_own_mask_stays() -> None:
         assert not bool(mask[:, :10].any())
     assert not bool(found[1].mask[ROWS, COLUMNS].any())  # type: ignore[index]
     assert torch.equal(found[0].mask, own)  # type: ignore[arg-type]
-
-
-def test_smaller_images_have_the_same_cells() -> None:
-    images = busy_wall()
-    masks = masks_of(images)
-    masks.masked(1, AFTER, images[1], learned(images[1].cameras), BLACK, with_depth)
-    half = images[1].shrunk(2)
-    mask = masks.masked(1, AFTER, half, half.rgb_premultiplied, BLACK, with_depth).mask
-    assert mask is not None
-    assert mask.shape == (SIZE[1] // 2, SIZE[0] // 2)
-    assert not bool(
-        mask[ROWS.start // 2 : ROWS.stop // 2, COLUMNS.start // 2 : COLUMNS.stop // 2].any()
-    )
 
 
 @pytest.mark.parametrize(
@@ -199,15 +153,3 @@ def test_a_resumed_run_has_the_same_bytes(still: Path) -> None:
     assert ends[0].keys() == ends[1].keys()
     assert "robust.left_out" in ends[0]
     assert all(torch.equal(x, ends[1][name]) for name, x in ends[0].items())
-
-
-@pytest.mark.parametrize("choice", ["never", "auto"])
-def test_without_masks_nothing_is_kept_for_them(still: Path, choice: str) -> None:
-    """Auto is decided before a run begins."""
-    trainer = trainer_of(still, choice)
-    assert trainer.robust is None
-    assert not any(name.startswith("robust") for name in trainer.checkpoint().tensors)
-
-
-def test_what_moves_has_none(moving: Path) -> None:
-    assert trainer_of(moving, "always", DynamicModel(sh_degree=0)).robust is None
