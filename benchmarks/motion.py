@@ -56,10 +56,10 @@ from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
-from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count

@@ -24,6 +24,7 @@ from fuzz.worker import STANDARD, Limits, run_child
 
 CORPUS = Path(__file__).resolve().parent / "corpus"
 MOST_PER_PROCESS = 2000
+LONGEST_WAIT = 300.0  # seconds in which a worker may report nothing, on a busy machine
 """Cases after which a worker is replaced, which bounds its leaks."""
 
 
@@ -78,6 +79,12 @@ def cases(
 def cpu_seconds() -> float:
     """Return the processor time of this process and of the children it has waited for."""
     return sum(os.times()[:4])
+
+
+def cpu_seconds_of(worker: int) -> float:
+    """Return the processor time of a running process."""
+    fields = Path(f"/proc/{worker}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def stored_cases(name: str, seeds: dict[str, Case]) -> dict[str, Case]:
@@ -159,12 +166,23 @@ def _verdicts(
     out: int, worker: int, folder: Path, limits: Limits, until: float
 ) -> Iterator[tuple[int | None, Verdict]]:
     begun, rest = None, b""
+    is_ready = False
+    processor = cpu_seconds_of(worker)
+    since = time.monotonic()
     while True:
-        ready, _, _ = select.select([out], [], [], 10 * limits.seconds)
+        ready, _, _ = select.select([out], [], [], min(1.0, limits.seconds))
         if not ready:
-            os.kill(worker, signal.SIGKILL)
-            yield begun, Verdict(Outcome.FAILED, "hangs", _tail(folder))
-            return
+            # The start of the worker counts for no case, however long it takes.
+            used = cpu_seconds_of(worker) - processor if is_ready else 0.0
+            waited = time.monotonic() - since
+            if used > 2 * limits.seconds or waited > LONGEST_WAIT:
+                os.kill(worker, signal.SIGKILL)
+                yield begun, Verdict(Outcome.FAILED, "hangs", _tail(folder))
+                return
+            continue
+        is_ready = True
+        processor = cpu_seconds_of(worker)
+        since = time.monotonic()
         data = os.read(out, 1 << 16)
         if not data:
             _, status = os.waitpid(worker, 0)

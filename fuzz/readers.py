@@ -235,8 +235,8 @@ def two_images(root: Path) -> Capture:
 
 def read_splats(root: Path) -> object:
     """Read a file of Gaussians, render it, and write it as another one."""
+    from dyngs.gaussians.rendering import splat_options
     from dyngs.io.formats.formats import known_format, read_splats, write_splats
-    from dyngs.io.formats.splat_file import splat_options
 
     path = next((p for p in sorted(root.iterdir()) if known_format(p) is not None), root / "a.ply")
     splat = read_splats(path)
@@ -290,8 +290,8 @@ def read_a_path(root: Path) -> object:
 
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
-    from dyngs.study.tradeoff.measure import read_measurement
-    from dyngs.study.tradeoff.table import table_rows
+    from dyngs.study.measure import read_measurement
+    from dyngs.study.sweep import table_rows
 
     measurement = read_measurement(only(root))
     return table_rows([measurement]), measurement
@@ -301,8 +301,8 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.tradeoff.table import parse_requirements
-    from dyngs.study.tradeoff.variants import parse_variations
+    from dyngs.study.sweep import parse_requirements
+    from dyngs.study.variants import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (

@@ -117,7 +117,7 @@ def safetensors_changed(data: bytes, rng: Random) -> bytes:
 
 def dyngs_changed(data: bytes, rng: Random) -> bytes:
     """Return a ``scene.dyngs`` after one mutation, mostly with the right checksum."""
-    from dyngs.runs.scene_file import MAGIC, MAX_HEADER, compressed, decompressed
+    from dyngs.runs.stored_file import MAGIC, MAX_HEADER, compressed, decompressed
 
     if rng.random() < 0.1:
         return bytes_changed(data, rng)

@@ -30,7 +30,7 @@ from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.io.tensor_file import write_tensors
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.runs.scene_file import encoded
+from dyngs.runs.stored_file import encoded
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
@@ -412,15 +412,15 @@ def write_keyframes(root: Path) -> None:
 
 def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
-    from dyngs.study.speed import Quartiles, Speed
-    from dyngs.study.tradeoff.measure import Measurement
-    from dyngs.study.tradeoff.measure import write_measurement as write
-    from dyngs.study.tradeoff.variants import Variant
+    from dataclasses import asdict
+
+    from dyngs.study.measure import Measurement, Quartiles, Speed
+    from dyngs.study.runs import write_stored
 
     speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))
-    write(
-        root / "a.json", Measurement(Variant(prune=0.5), 3, 30.0, 0.9, 0.1, 100, 1.5, 20.0, speed)
-    )
+    scores = (3, 30.0, 0.9, 0.1, 29.0, None, 100, 1.5, 20.0, 7, 1.5)
+    point = Measurement("prune=0.5", {"prune": 0.5}, *scores, speed=speed)
+    write_stored(root / "a.json", asdict(point))
 
 
 def write_words(root: Path) -> None:

@@ -44,7 +44,7 @@ class Limits:
     """Limits of one case.
 
     Attributes:
-        seconds: processor time; ten times as much wall time.
+        seconds: processor time.
         memory_mb: memory beyond that of the process before the case, of address space and of
             resident memory.
     """
@@ -66,6 +66,7 @@ def run_child(
         own = (folder / "box" / "capture",) if reader.writes else ()
         guard = Guard((folder / "box" / "out", folder / "cache", folder / "tmp", *own))
         before: Case | None = None
+        _tell(pipe, [None])
         for number, case in cases:
             _tell(pipe, [number])
             case.write(folder / "box" / "capture", before)

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.core.state import prefixed, tensors_of
-from dyngs.deform.fields import field_state
-from dyngs.deform.windows import WindowedField
+from dyngs.deform.fields import WindowedField, field_state
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.runs.scene_file import (
+from dyngs.runs.stored_file import (
     _DTYPES,
     MAGIC,
     MAX_HEADER,
@@ -31,7 +30,7 @@ from dyngs.runs.scene_file import (
     _stored,
     compressed,
 )
-from dyngs.runs.scene_tensors import Coding, TensorKind
+from dyngs.runs.stored_tensors import Coding, TensorKind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

@@ -10,8 +10,8 @@ from tiny_fields import cloud, stirred_field, tiny_options
 from dyngs.config import DynamicModel, HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.core.state import State, part_of, tensors_of
+from dyngs.deform.fields import OPEN, WindowedField
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.windows import OPEN, WindowedField
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene

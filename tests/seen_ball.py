@@ -8,7 +8,7 @@ import torch
 from small_triangles import camera
 
 from dyngs.core.camera import Cameras
-from dyngs.gaussians.fusion import Seen
+from dyngs.gaussians.surface import Seen
 
 RADIUS, SIZE = 0.8, 48
 LOW = torch.full((3,), -1.0)

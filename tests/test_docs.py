@@ -56,7 +56,7 @@ NOT_RUN = {
     "view": "serves a page until it is stopped; tests/view opens it in a browser",
     "predict": "needs a trained network; tests/cli/test_predict.py has one",
     "prune": "fine-tunes a dozen candidates; tests/cli/test_prune.py does it with fewer steps",
-    "tradeoff": "measures dozens of variants; tests/cli/test_tradeoff.py does it with fewer",
+    "tradeoff": "measures dozens of variants; tests/cli/test_study.py does it with fewer",
 }
 """Commands that are only parsed, with the reason."""
 OTHER_PROGRAMS = {
@@ -185,8 +185,8 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times,
     presets."""
     from dyngs.export.camera_paths import parse_times, path_file
-    from dyngs.study.tradeoff.table import parse_goal, parse_requirements
-    from dyngs.study.tradeoff.variants import parse_variations
+    from dyngs.study.sweep import parse_goal, parse_requirements
+    from dyngs.study.variants import parse_variations
 
     for word in command.words:
         if word.startswith(("configs/", "benchmarks/", "examples/")):

@@ -30,7 +30,7 @@ from dyngs.core.errors import (
 from dyngs.io.fields import read_json_object
 from dyngs.io.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
-from dyngs.runs.scene_file import read_scene
+from dyngs.runs.stored_file import read_scene
 
 
 @pytest.mark.parametrize(
@@ -99,8 +99,8 @@ def test_no_message_can_steer_a_terminal() -> None:
 def test_what_the_command_line_quotes_is_short(text: str) -> None:
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.tradeoff.table import parse_requirements
-    from dyngs.study.tradeoff.variants import parse_variations
+    from dyngs.study.sweep import parse_requirements
+    from dyngs.study.variants import parse_variations
 
     for parse in (
         parse_frames,

@@ -39,9 +39,8 @@ from dyngs.data.synthetic.captures import (
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
-from dyngs.gaussians.densify import DefaultDensifier, Densifier
-from dyngs.gaussians.init import surroundings
-from dyngs.gaussians.mcmc import McmcDensifier
+from dyngs.gaussians.densify import DefaultDensifier, Densifier, McmcDensifier
+from dyngs.gaussians.start import surroundings
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
 from dyngs.models.views import resolved_background, training_cameras, training_times

@@ -23,9 +23,9 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.deform.control_nodes import Nodes, follow
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
 from dyngs.deform.fields import new_field
-from dyngs.deform.nodes import Nodes, follow
 from dyngs.gaussians import Gaussians
 from dyngs.ops.quaternions import identity_quat
 

@@ -17,7 +17,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, StateTensor, prefixed
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
-from dyngs.gaussians.adam import AdamState
+from dyngs.gaussians.parameters import AdamState
 from dyngs.models import kind as kinds
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Kind, RunStart

@@ -10,18 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from dyngs.api.scene_file import write_scene_file
-from dyngs.api.train import num_cores, train
-from dyngs.compress.prune.search import MOST_HELD_OUT, Promise, Search
+from dyngs.api.train import train
+from dyngs.compress.search import Promise, Search, unseen_images
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, show
-from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import require_folder
-from dyngs.data.times import evenly_spaced
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
-from dyngs.ops.native import kernel_threads
+from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -33,8 +31,8 @@ from dyngs.runs.checkpoint import (
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, LOG_NAME, require_empty
 from dyngs.runs.frame import FRAME_NAME
-from dyngs.runs.scene_file import write_scene
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.runs.stored_file import write_scene
+from dyngs.training.new_trainer import assemble
 
 SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise
 
@@ -134,20 +132,6 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     if not config.model.made_of_gaussians:
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to prune")
     return config
-
-
-def unseen_images(trainer: GaussianTrainer) -> list[Image]:
-    """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people
-    none.
-
-    They play other motions there, in which poses are not refined.
-    """
-    views = trainer.capture.splits.get("val", ())
-    if not views or trainer.config.model.is_posed:
-        return []
-    loader = ImageLoader(views, trainer.config.data)
-    loader.device = trainer.device
-    return [loader[i] for i in evenly_spaced(len(loader), MOST_HELD_OUT)]
 
 
 def _copy_start(run_dir: Path, folder: Path) -> None:

@@ -27,8 +27,8 @@ from dyngs.api.stages import (
     set_limits,
     share_views,
 )
-from dyngs.compress.prune.floaters import remove_floaters
-from dyngs.compress.prune.stage import prune_stage
+from dyngs.compress.floaters import remove_floaters
+from dyngs.compress.stage import prune_stage
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.conventions import ReportProgress, report_nothing
@@ -37,7 +37,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.lock import Held, writing
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
-from dyngs.ops.native import kernel_threads
+from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -427,11 +427,3 @@ def _newest(folder: Path) -> Checkpoint | None:
 def _num_threads(config: Config, processes: Processes) -> int:
     """Return the number of threads of the kernels in each process."""
     return config.run.threads or max(1, num_cores() // processes.local_size)
-
-
-def num_cores() -> int:
-    """Return the number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on Linux
-        return os.cpu_count() or 1

@@ -18,14 +18,13 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, NoReturn, TextIO
 
 from dyngs import __version__
 from dyngs.cli import (
     bench,
-    compare,
     config,
     convert,
     data,
@@ -38,7 +37,7 @@ from dyngs.cli import (
     predict,
     prune,
     render,
-    tradeoff,
+    study,
     train,
     view,
 )
@@ -57,26 +56,26 @@ _GPU_OUT_OF_MEMORY = "CUDA out of memory"
 _GPU_IS_FULL = "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
 _OF_DATA = ("inspect", "sfm", "fit", "motion", "synth")
 """Commands of ``dyngs data``."""
-_COMMANDS = {
-    "demo": demo,
-    "train": train,
-    "prune": prune,
-    "predict": predict,
-    "eval": evaluate,
-    "render": render,
-    "view": view,
-    "export": export,
-    "convert": convert,
-    "edit": edit,
-    "tradeoff": tradeoff,
-    "compare": compare,
-    "data": data,
-    "bench": bench,
-    "config": config,
-    "docs": docs,
-    "doctor": doctor,
+_COMMANDS: dict[str, Callable[[Any], None]] = {
+    "demo": demo.add_parser,
+    "train": train.add_parser,
+    "prune": prune.add_parser,
+    "predict": predict.add_parser,
+    "eval": evaluate.add_parser,
+    "render": render.add_parser,
+    "view": view.add_parser,
+    "export": export.add_parser,
+    "convert": convert.add_parser,
+    "edit": edit.add_parser,
+    "tradeoff": study.add_tradeoff_parser,
+    "compare": study.add_parser,
+    "data": data.add_parser,
+    "bench": bench.add_parser,
+    "config": config.add_parser,
+    "docs": docs.add_parser,
+    "doctor": doctor.add_parser,
 }
-"""The module of each command, in the order in which they are listed."""
+"""What adds each command, in the order in which they are listed."""
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
@@ -226,8 +225,8 @@ def make_parser(only: str = "") -> argparse.ArgumentParser:
     parser.add_argument("--quiet", action="store_true", help=about)
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in [_COMMANDS[only]] if only in _COMMANDS else _COMMANDS.values():
-        module.add_parser(commands)
+    for add_parser in [_COMMANDS[only]] if only in _COMMANDS else _COMMANDS.values():
+        add_parser(commands)
     return parser
 
 

@@ -125,14 +125,9 @@ def run_device(arguments: argparse.Namespace) -> list[str]:
     return [] if arguments.device is None else [f"run.device={arguments.device}"]
 
 
-def add_ray(parser: argparse.ArgumentParser) -> None:
-    about = (
-        "train several runs at once by Ray (pip install 'dyngs[ray]'), with so many cores for each, on this machine or "
-        "the cluster of RAY_ADDRESS, whose machines must share the files"
-    )
-    parser.add_argument(
-        "--ray", type=whole("a number of cores", 1, 1024), metavar="CORES", help=about
-    )
+def add_json(parser: argparse.ArgumentParser) -> None:
+    about = "print the result as JSON on stdout, all else on stderr"
+    parser.add_argument("--json", action="store_true", help=about)
 
 
 def add_split(

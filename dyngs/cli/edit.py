@@ -14,7 +14,7 @@ from dyngs.cli.output import print_written
 from dyngs.core.errors import DyngsError, as_word, show
 
 if TYPE_CHECKING:
-    from dyngs.export.edit.scene_file import Edits
+    from dyngs.api.edit import Edits
 
 _NEGATIVE = re.compile(r"-([xyz]$|\.?\d)")  # values of options that begin with a minus
 _EXIF = Path("exif")
@@ -86,9 +86,9 @@ def add_parser(commands: args.Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Edit, and print what was done and how the file differs from the scene."""
     with heavy_imports():
+        from dyngs.api.edit import edit_scene
         from dyngs.cli.splats import print_redrawn
         from dyngs.export.edit.crop import mesh_path
-        from dyngs.export.edit.scene_file import edit_scene
 
     source = args.run_of_scene_file(arguments.source)
     mesh = None if arguments.crop is None else mesh_path(arguments.crop)
@@ -112,9 +112,9 @@ def _note(text: str) -> None:
 def _edits(arguments: argparse.Namespace) -> Edits:
     """Return what the options ask for. Raises DyngsError: they do not go together, or are no points
     or numbers."""
+    from dyngs.api.edit import Edits
     from dyngs.export.edit.crop import region_of
     from dyngs.export.edit.frame import Frame, direction, geo_frame, number, point, scale_of
-    from dyngs.export.edit.scene_file import Edits
 
     alone = [
         f"--{name}" for name in ("up", "origin", "scale") if getattr(arguments, name) is not None

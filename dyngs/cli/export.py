@@ -416,7 +416,7 @@ def _export_tracks(
 def _export_dyngs(arguments: argparse.Namespace) -> int:
     """Write the run as a .dyngs file and print how much its images change."""
     from dyngs.api.scene_file import write_scene_file
-    from dyngs.compress.storage.measure import SMALLEST_CHANGE
+    from dyngs.compress.measure import SMALLEST_CHANGE
 
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:

@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -44,6 +45,11 @@ def print_messages(*, quiet: bool = False) -> None:
 def print_lines(text: str) -> None:
     """Print lines that may quote names of others, without anything that a terminal would obey."""
     print("\n".join(map(escaped, text.split("\n"))), flush=True)
+
+
+def results_alone(is_json: bool) -> AbstractContextManager[object]:
+    """Return a block in which all that is printed goes to stderr, where stdout is for JSON."""
+    return redirect_stdout(sys.stderr) if is_json else nullcontext()
 
 
 def print_notes(notes: Sequence[str], warnings: Sequence[str] = ()) -> None:

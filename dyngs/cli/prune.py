@@ -12,7 +12,7 @@ from dyngs.core.errors import DyngsError, as_word
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.compress.prune.search import Promise
+    from dyngs.compress.search import Promise
     from dyngs.evaluate.comparison import Cost
 
 MAX_LOSS = 0.2

@@ -1,1 +1,1 @@
-"""Fewer and smaller Gaussians: `prune/` (4DGS-1K) and `storage/` (the file `scene.dyngs`)."""
+"""Fewer Gaussians (4DGS-1K), cleaning, and the precision of the file `scene.dyngs`."""

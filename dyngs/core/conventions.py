@@ -22,6 +22,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import Enum
 
+import numpy as np
+
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic: ``rgb = SH_C0 * f_dc + 0.5``."""
 
@@ -48,3 +50,8 @@ class RasterizeMode(str, Enum):
 def num_sh_terms(degree: int) -> int:
     """Return the number of SH terms K of ``degree``."""
     return (degree + 1) ** 2
+
+
+def srgb_decoded(signal: np.ndarray) -> np.ndarray:
+    """Return the linear light of an sRGB signal in [0, 1]."""
+    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)

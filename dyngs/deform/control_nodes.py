@@ -16,7 +16,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -24,13 +25,158 @@ from torch import Tensor
 from dyngs.config import ControlNodesField
 from dyngs.core.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
-from dyngs.deform.decoder import head_sizes, offsets_of
-from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets
-from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
-from dyngs.deform.spline_fit import refitted
+from dyngs.deform.field import (
+    MAX_KEY_TIMES,
+    DeformationField,
+    FieldSetup,
+    Offsets,
+    head_sizes,
+    offsets_of,
+)
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.ops.nodes import SPAN, node_penalties, spline_motion
+from dyngs.ops.nodes import SPAN, cubic_fractions, node_penalties, spline_motion
+from dyngs.ops.quaternions import identity_quat, rotate
+from dyngs.ops.skinning import blend_skinning
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
+
+FOLLOWED = 4  # Nodes that a Gaussian follows
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Control nodes, and the ones that each of M points follows."""
+
+    positions: Tensor  # (S, 3) canonical
+    radii: Tensor  # (S,) of influence, world units: the mean distance to the nearest other nodes
+    followed: Tensor  # (M, B) indices of the nodes that each point follows, nearest first
+
+    def followed_by(self, rows: Tensor) -> Nodes:
+        return replace(self, followed=self.followed.index_select(0, rows))
+
+    def weights(self, means: Tensor) -> Tensor:
+        """Return (M, B) weights of the followed nodes: Gaussians of the distance, normalised;
+        constant in ``means``."""
+        apart = (means.detach()[:, None] - self.positions[self.followed]).square().sum(-1)
+        return torch.softmax(-0.5 * apart / self.radii[self.followed].square(), dim=1)
+
+
+def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
+    """Return the nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M,
+    3)."""
+    tree = _tree(positions)
+    places = positions.double().cpu().numpy()
+    points = means.detach().double().cpu().numpy()
+    count = min(FOLLOWED, len(positions))
+    gaps = (
+        torch.from_numpy(tree.query(places, k=count)[0])
+        .to(positions.device)
+        .reshape(len(positions), -1)
+    )
+    radii = (
+        gaps[:, 1:].mean(1)
+        if count > 1
+        else torch.ones(len(positions), dtype=torch.float64, device=gaps.device)
+    )
+    followed = (
+        torch.from_numpy(tree.query(points, k=count)[1])
+        .to(positions.device)
+        .reshape(len(points), -1)
+    )
+    floor = max(1e-6 * float(radii.max()), 1e-12)
+    return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
+
+
+def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
+    """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it
+    and from ``taken``.
+
+    None coincides with another or with one of ``taken`` (S, 3). Without those, the first is nearest
+    to the mean.
+    """
+    points = points.detach().double()
+    chosen: list[int] = []
+    if len(taken):
+        nearest, _ = _tree(taken).query(points.cpu().numpy())
+        apart = torch.from_numpy(nearest).to(points.device).square()
+    elif count and len(points):
+        chosen = [int((points - points.mean(0)).square().sum(1).argmin())]
+        apart = (points - points[chosen[0]]).square().sum(1)
+    else:
+        return torch.zeros(0, dtype=torch.long, device=points.device)
+    while len(chosen) < min(count, len(points)):
+        farthest = int(apart.argmax())
+        if float(apart[farthest]) <= 0:
+            break
+        chosen.append(farthest)
+        apart = torch.minimum(apart, (points - points[farthest]).square().sum(1))
+    return torch.tensor(chosen, dtype=torch.long, device=points.device)
+
+
+def follow(
+    nodes: Nodes, means: Tensor, motion: Tensor, values: Tensor, heads: Mapping[str, int]
+) -> Offsets:
+    """Return offsets of the points ``means`` (M, 3) from the nodes' ``motion`` (S, 7) and
+    ``values`` (S, D).
+
+    A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b);
+    differentiable in x, the weights taken as constant. The values of all other ``heads``, names and
+    sizes in order, are blended alike.
+    """
+    moved, blended = blend_skinning(
+        means, nodes.positions, nodes.radii, nodes.followed, motion, values
+    )
+    return offsets_of(moved, blended, heads)
+
+
+def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
+    """Return (..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any
+    length."""
+    return rotate(offsets + identity_quat(offsets), vectors)
+
+
+def _tree(points: Tensor) -> KDTree:
+    from scipy.spatial import KDTree
+
+    return KDTree(points.double().cpu().numpy())
+
+
+# Places per piece at which two splines are compared; a cubic is determined by four
+_SAMPLES_PER_PIECE = 8
+
+
+def spline_basis(places: Tensor, pieces: int) -> Tensor:
+    """Return (K, pieces + 3) float64 weights of the control points of a uniform cubic B-spline at
+    ``places`` (K,).
+
+    Places lie in [0, 1], which the pieces share evenly.
+    """
+    scaled = places.double().clamp(0, 1) * pieces
+    piece = scaled.long().clamp_max(pieces - 1)
+    weights = torch.stack(cubic_fractions(scaled - piece), dim=1)
+    basis = torch.zeros(len(places), pieces + SPAN - 1, dtype=torch.float64, device=places.device)
+    return basis.scatter_(1, piece[:, None] + torch.arange(SPAN, device=places.device), weights)
+
+
+def refitted(points: Tensor, pieces: int) -> Tensor:
+    """Return (S, pieces + 3, D) control points of the splines nearest to those of ``points`` (S, P,
+    D).
+
+    Nearest in the mean square over time, sampled evenly: A' x' = A x by least squares in float64
+    with the bases A' and A. Exact where the splines have such pieces; always if every piece is
+    divided into equal ones.
+    """
+    old = points.shape[1] - SPAN + 1
+    if pieces == old:
+        return points.clone()
+    count = _SAMPLES_PER_PIECE * max(pieces, old)
+    count = math.ceil(count / pieces) * pieces
+    places = (torch.arange(count, dtype=torch.float64, device=points.device) + 0.5) / count
+    fit = torch.linalg.lstsq(spline_basis(places, pieces), spline_basis(places, old)).solution
+    return torch.einsum("qp,spd->sqd", fit, points.double()).to(points)
+
 
 NOTHING = torch.zeros(0, 3, device="cpu")
 COMPARED_TIMES = 16  # Times at which the paths of nodes are compared where some of them are to go

@@ -1,23 +1,81 @@
-"""Deformation fields from the configuration, new or from a checkpoint."""
+"""Deformation fields from the configuration, new or from a checkpoint, and the windows in time around them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
 from dyngs.config import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
-from dyngs.core.state import Role, State, part_of, with_role
+from dyngs.core.state import Role, State, part_of, prefixed, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, FieldSetup
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, OuterField, chosen
 from dyngs.deform.free import FreePrimitives
-from dyngs.deform.hexplane import Hexplane
-from dyngs.deform.mlp import Mlp
-from dyngs.deform.windows import WindowedField
+from dyngs.deform.networks import Hexplane, Mlp
+from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.parameters import Parameters
+from dyngs.ops.adam import Count
+
+EDGE = 0.05  # Time over which the logit falls by 1 outside of a window, in units of the clip
+# Edges by which an open window is longer than the clip, at either end: slopes can still be felt
+MARGIN = 3.0
+OPEN = -MARGIN * EDGE, 1 + MARGIN * EDGE
+LR, LR_DECAY = 1e-2, 0.1
+
+
+class WindowedField(OuterField):
+    """The offsets of ``others``, and the window of each of M Gaussians added to the logit of its
+    opacity.
+
+    w(t) = log s((t - a) / e) + log s((b - t) / e), less what it is where a window is open: s is the
+    logistic function, a and b, the ``edges`` (M, 2), are where the window begins and ends.
+    """
+
+    fades = True
+
+    def __init__(self, others: DeformationField, num_moving: int) -> None:
+        super().__init__(others)
+        edges = torch.tensor(OPEN, device="cpu").expand(num_moving, 2)
+        self.parameters = Parameters({"edges": edges}, {"edges": LR}, LR_DECAY, Role.PER_MOVING)
+
+    @property
+    def edges(self) -> Tensor:
+        return self.parameters["edges"]
+
+    def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
+        edges = chosen(self.edges, rows)
+        window = _window(edges, time) - _window(edges.new_tensor([OPEN]), time)
+        logits = window if found.logit_opacities is None else found.logit_opacities + window
+        return replace(found, logit_opacities=logits)
+
+    def step(self, step: int, progress: float) -> Count:
+        count = super().step(step, progress)
+        self.edges.data[:, 0].clamp_min_(OPEN[0])
+        self.edges.data[:, 1].clamp_max_(OPEN[1])
+        return count
+
+    def edited(self, edit: TopologyEdit) -> WindowedField:
+        return super().edited(edit).with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+
+    def state(self) -> State:
+        return self.others.state() | prefixed("windows", self.parameters.state())
+
+    @staticmethod
+    def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> WindowedField:
+        """Return the field of a state within the restored ``others``; raises as ``restored``."""
+        field = WindowedField(others, others.setup.num_moving)
+        field.parameters = field.parameters.restored(tensors)
+        return field
+
+
+def _window(edges: Tensor, time: float) -> Tensor:
+    inside = torch.stack([time - edges[:, 0], edges[:, 1] - time], dim=1) / EDGE
+    return torch.nn.functional.logsigmoid(inside).sum(1)
 
 
 def new_field(

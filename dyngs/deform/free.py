@@ -19,7 +19,7 @@ from torch import Tensor
 from dyngs.config import FreeField
 from dyngs.core.state import Role
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
-from dyngs.deform.fixed_cameras.seeds import Moment
+from dyngs.deform.fixed_cameras.start import Moment
 from dyngs.deform.keys import COPIES_OF_MOVING
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dyngs.config import DynamicModel
 from dyngs.data.capture import Capture
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
-from dyngs.deform.fixed_cameras.changes import Footage, footage_of
+from dyngs.deform.bodies.paths import Shots, one_camera, shots_of
+from dyngs.deform.fixed_cameras.hulls import Footage, footage_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.still_error import (

@@ -15,7 +15,7 @@ from dyngs.core.conventions import SH_C0
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.deform.fixed_cameras.changes import median_image
+from dyngs.deform.fixed_cameras.hulls import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 

@@ -18,12 +18,12 @@ from dyngs.config import DynamicModel, FreeField
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, with_role
 from dyngs.data.loader import Image
-from dyngs.deform.bodies.shots import Shots
+from dyngs.deform.bodies.paths import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import FieldSetup, Offsets, deformed, innermost
-from dyngs.deform.fields import new_field
-from dyngs.deform.fixed_cameras.changes import Footage
+from dyngs.deform.fields import WindowedField, new_field
+from dyngs.deform.fixed_cameras.hulls import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.free import FreePrimitives, FreeStart, free_start
 from dyngs.deform.motion import bake_, measure_motion
@@ -31,7 +31,6 @@ from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussia
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
-from dyngs.deform.windows import WindowedField
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining

@@ -13,11 +13,11 @@ from dyngs.core.errors import DyngsError, counted
 from dyngs.core.metrics import psnr
 from dyngs.export.camera_paths import pick_cameras
 from dyngs.export.orbits import frame_orbit_for_points
-from dyngs.gaussians.rendering import render
+from dyngs.gaussians.rendering import drawing_options, render, splat_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import Written, read_splats
 from dyngs.io.formats.similarity import AXES
-from dyngs.io.formats.splat_file import SplatFile, drawing_options, splat_options
+from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.opened import Opened
 
 VIEWS = 4

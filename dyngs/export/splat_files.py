@@ -16,7 +16,8 @@ import torch
 
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError, counted
-from dyngs.gaussians.colour.bake import with_harmonics
+from dyngs.export.sog_levels import write_sog_levels
+from dyngs.gaussians.colour.network import with_harmonics
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     Format,
@@ -35,7 +36,6 @@ from dyngs.io.formats.similarity import (
     nearest_axis,
     turn_between,
 )
-from dyngs.io.formats.sog_levels import write_sog_levels
 from dyngs.io.formats.splat_file import (
     SplatFile,
     drawable,

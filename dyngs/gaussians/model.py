@@ -12,15 +12,19 @@ from torch import Tensor
 
 from dyngs.config import AutoColour, DefaultStrategy, SceneInit, SceneModel
 from dyngs.core.conventions import SH_C0, RasterizeMode
+from dyngs.core.gaussians import morton_order
 from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
-from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, TrainingLooks
-from dyngs.gaussians.colour.view_dependence import MeasuredView
+from dyngs.gaussians.colour.training import (
+    AutoTraining,
+    ColourTraining,
+    MeasuredView,
+    TrainingLooks,
+)
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import GaussianOptimizer, Still
-from dyngs.gaussians.order import morton_order
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rates_of

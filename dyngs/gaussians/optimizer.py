@@ -11,7 +11,7 @@ from torch import Tensor
 from dyngs.config import OptimConfig
 from dyngs.core.state import State
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.adam import AdamState
+from dyngs.gaussians.parameters import AdamState
 from dyngs.ops.adam import Count, seen_rows
 
 ADAM_EPS = 1e-15

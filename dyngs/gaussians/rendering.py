@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +14,14 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.models.renderable import DrawOptions, Rendering, check_background, check_views
+from dyngs.io.formats.splat_file import SplatFile
+from dyngs.models.renderable import (
+    DrawOptions,
+    Rendering,
+    check_background,
+    check_views,
+    near_plane,
+)
 from dyngs.ops.checks import check_choice, check_count, check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
@@ -324,3 +332,22 @@ def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
     hidden = torch.full_like(gaussians.logit_opacities, -1e4)
     cleaned["logit_opacities"] = torch.where(keep, cleaned["logit_opacities"], hidden)
     return Gaussians(**cleaned)
+
+
+def splat_options(splat: SplatFile) -> RenderOptions:
+    """Return the render options stated in a splat file: its mode, and its low-pass filter if
+    any."""
+    options = RenderOptions(mode=splat.mode)
+    return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
+
+
+def drawing_options(splat: SplatFile) -> RenderOptions:
+    """Return ``splat_options`` with a near plane that suits the size of the scene."""
+    means = splat.gaussians.means.double().numpy()
+    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    # About the extent of cameras around it. The median ignores a far background, which must not
+    # push the plane away.
+    extent = 2 * float(np.median(distances))
+    return (
+        replace(splat_options(splat), near=near_plane(extent)) if extent else splat_options(splat)
+    )

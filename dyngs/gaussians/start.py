@@ -1,28 +1,43 @@
-"""What all models of Gaussians begin with: colours, a strategy, a 3D filter."""
+"""The Gaussians, colours, strategy and 3D filter that training starts from."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
+from dyngs.capture.first_points import AROUND_ORIGIN
 from dyngs.config import (
     AutoColour,
     DefaultStrategy,
     FixedStrategy,
     McmcStrategy,
     NetworkColour,
+    PointsInit,
+    RandomInit,
+    SceneInit,
     ShColour,
+    Strategy,
+)
+from dyngs.core.conventions import SH_C0, num_sh_terms
+from dyngs.data.capture import Capture, View
+from dyngs.data.scene_space import (
+    MIN_VIEWS,
+    cube_half_side,
+    extent_of,
+    outside_of_cube,
+    points_in_frusta,
 )
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import box_around
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, NetworkTraining
-from dyngs.gaussians.densify import DefaultDensifier, Densifier
+from dyngs.gaussians.densify import DefaultDensifier, Densifier, McmcDensifier
 from dyngs.gaussians.filters import FilterUpdate
-from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
-from dyngs.gaussians.mcmc import McmcDensifier
 from dyngs.gaussians.schedule import (
     densify_schedule,
     filter_steps,
@@ -31,6 +46,175 @@ from dyngs.gaussians.schedule import (
 )
 from dyngs.models.kind import RunStart
 from dyngs.models.views import training_cameras
+
+START_OPACITY = 0.1
+# Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with
+MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1
+MIN_SQUARED_DISTANCE = 1e-7
+# Random points that are drawn per one that is taken, where what the cameras see decides
+CANDIDATES = 4
+
+
+@dataclass(frozen=True)
+class StartValues:
+    """Scales and opacities of the first Gaussians, by strategy."""
+
+    opacity: float = START_OPACITY  # in (0, 1)
+    scale_factor: float = 1.0  # multiplies the distance to the nearest neighbours
+    max_gaussians: int = 3_000_000  # more points than this are thinned at random
+
+    @staticmethod
+    def for_strategy(strategy: Strategy) -> StartValues:
+        """Return the published start of ``strategy`` (3DGS-MCMC: more opaque and smaller)."""
+        match strategy:
+            case McmcStrategy():
+                return StartValues(MCMC_OPACITY, MCMC_SCALE, strategy.max_gaussians)
+            case DefaultStrategy():
+                return StartValues(max_gaussians=strategy.max_gaussians)
+            case FixedStrategy():
+                return StartValues()
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Cameras and extent of a scene before training, in scene units."""
+
+    views: Sequence[View]
+    points: np.ndarray | None = None  # (P, 3) sparse points, or None
+    points_rgb: np.ndarray | None = None
+    # by convention the scene lies around the origin (Blender scenes), where the cameras look there
+    around_origin: bool = False
+    world_scale: float = 1.0  # as ``Capture.world_scale``
+
+    @property
+    def camera_centers(self) -> np.ndarray:
+        poses = np.stack([view.cam_from_world for view in self.views])
+        return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+
+    @property
+    def extent(self) -> float:
+        """1.1 x the largest distance of a camera's centre to the mean centre.
+
+        Learning rates and size thresholds are relative to it. Where all cameras share one centre it
+        is 1.
+        """
+        return extent_of(self.camera_centers) or 1.0
+
+
+def surroundings(capture: Capture) -> Surroundings:
+    """Return the properties of a capture that initialisation needs."""
+    points = capture.points
+    return Surroundings(
+        views=capture.splits["train"],
+        points=None if points is None else points.xyz,
+        points_rgb=None if points is None else points.rgb,
+        around_origin=capture.format in AROUND_ORIGIN,
+        world_scale=capture.world_scale,
+    )
+
+
+def initial_gaussians(
+    scene: Surroundings,
+    options: PointsInit | RandomInit | SceneInit,
+    start: StartValues,
+    sh_degree: int,
+    generator: torch.Generator,
+) -> Gaussians:
+    """Return the first Gaussians of a run: isotropic, as large as the distance to the three nearest
+    neighbours.
+
+    ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the
+    scene's points; where there are none it draws that cube if the scene may lie in it by
+    convention, else what the cameras see together.
+    """
+    if options.kind != "random" and scene.points is not None and scene.points_rgb is not None:
+        finite = np.isfinite(scene.points).all(axis=1)
+        xyz = torch.from_numpy(scene.points[finite].astype(np.float64))
+        base = (torch.from_numpy(scene.points_rgb[finite].astype(np.float64)) / 255 - 0.5) / SH_C0
+        if len(xyz) > start.max_gaussians:
+            chosen = (
+                torch.randperm(len(xyz), generator=generator, device="cpu")[: start.max_gaussians]
+                .sort()
+                .values
+            )
+            xyz = xyz[chosen]
+            base = base[chosen]
+        if len(xyz) > 0:
+            return _isotropic(xyz, base, start, sh_degree)
+    xyz, base = _random_points(scene, options, start.max_gaussians, generator)
+    return _isotropic(xyz, base, start, sh_degree)
+
+
+def _random_points(
+    scene: Surroundings,
+    options: PointsInit | RandomInit | SceneInit,
+    max_points: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Positions (N, 3) float64, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
+    count = min(options.num_random, max_points)
+    half_extent = cube_half_side(options.half_extent, scene.views, scene.world_scale)
+    if options.kind == "random" or (
+        scene.around_origin and outside_of_cube(scene.views, half_extent) is None
+    ):
+        xyz = (
+            torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1
+        ) * half_extent
+    else:
+        xyz = _seen_together(scene.views, count, generator)
+    return xyz, torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") / 255
+
+
+def _seen_together(views: Sequence[View], count: int, generator: torch.Generator) -> Tensor:
+    """Return ``count`` random points (N, 3) float64 in what the cameras see together, see
+    ``points_in_frusta``.
+
+    A candidate is taken with a chance proportional to the square of the number of views that see
+    it; those that fewer than ``MIN_VIEWS`` see come last. So most points lie where most cameras
+    look, some wherever depth can be told.
+    """
+    unit = torch.rand(
+        (CANDIDATES * count, 5), generator=generator, dtype=torch.float64, device="cpu"
+    ).numpy()
+    xyz, seen = points_in_frusta(views, unit[:, :4])
+    # The largest of u^(1 / weight) are a weighted sample without replacement (Efraimidis and
+    # Spirakis 2006).
+    order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1) ** 2
+    order[seen < min(MIN_VIEWS, len(views))] -= 1e6
+    return torch.from_numpy(xyz[np.sort(np.argsort(-order, kind="stable")[:count])])
+
+
+def _isotropic(xyz: Tensor, base: Tensor, start: StartValues, sh_degree: int) -> Gaussians:
+    n = len(xyz)
+    log_scale = 0.5 * mean_squared_neighbour_distance(xyz).log() + math.log(start.scale_factor)
+    sh = torch.zeros((n, num_sh_terms(sh_degree), 3), device="cpu")
+    sh[:, 0] = base.float()
+    return Gaussians(
+        means=xyz.float(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0], device="cpu").repeat(n, 1),
+        log_scales=log_scale.float()[:, None].repeat(1, 3),
+        logit_opacities=torch.full(
+            (n,), math.log(start.opacity / (1 - start.opacity)), device="cpu"
+        ),
+        sh=sh,
+    )
+
+
+def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
+    """Return (N,) mean squared distance to the three nearest other points, at least 1e-7; ``xyz``
+    is (N, 3).
+
+    With fewer than four points the mean is over those there are; a single point gets 1e-2.
+    """
+    from scipy.spatial import KDTree
+
+    neighbours = min(3, len(xyz) - 1)
+    if neighbours < 1:
+        return torch.full((len(xyz),), 1e-2, dtype=torch.float64, device="cpu")
+    points = xyz.double().numpy()
+    distances, _ = KDTree(points).query(points, k=neighbours + 1)
+    squared = torch.from_numpy(np.square(distances[:, 1:]).mean(axis=1))
+    return squared.clamp_min(MIN_SQUARED_DISTANCE)
 
 
 @dataclass(frozen=True)

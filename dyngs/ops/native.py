@@ -241,3 +241,11 @@ def writable(x: Tensor) -> object:
         )
     torch.autograd.graph.increment_version(x)
     return to_dlpack(x)
+
+
+def num_cores() -> int:
+    """Return the number of cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1

@@ -29,13 +29,13 @@ from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.renderable import Renderable
-from dyngs.runs.scene_file import read_scene
+from dyngs.runs.stored_file import read_scene
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
 _MOST_TIMING_BYTES = 1 << 20
 SCENE_FILE = "scene.dyngs"
-"""Name of the .dyngs file that holds a finished run, see ``dyngs.compress.storage``."""
+"""Name of the .dyngs file that holds a finished run, see ``dyngs.runs.stored_file``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
 MAX_STEP = 2**53
 BACKGROUNDS = ("white", "black", "random")

@@ -18,6 +18,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
+from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
@@ -25,7 +26,7 @@ from dyngs.human.body.body_reader import load_template
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
-from dyngs.io.formats.splat_file import Nonfinite, drawing_options
+from dyngs.io.formats.splat_file import Nonfinite
 from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.renderable import Renderable

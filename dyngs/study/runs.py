@@ -1,24 +1,33 @@
-"""The runs of a study: one after another here, or by Ray on as many machines as a cluster has; none
-is made twice."""
+"""The runs of a study, one after another or by Ray, and the files in which a study keeps what it
+has, so that nothing is trained or measured twice."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
+
+from pydantic import ConfigDict, TypeAdapter
 
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, printable, reading
 from dyngs.io.child import home_of_dyngs
 from dyngs.io.containment import following_links_of_runs, follows_links_of_runs
+from dyngs.io.limits import read_limited
+from dyngs.io.write import write_text
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Listener
 
 T = TypeVar("T")
 R = TypeVar("R")
+AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
+"""How the dataclasses of results are read: nothing else, and only numbers."""
+STUDY_FILE = "study.json"
+"""What a study is about, in its folder."""
 
 
 def finished(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> Path:
@@ -43,24 +52,37 @@ def done_in_turn(
     machine or on the cluster that ``RAY_ADDRESS`` names, whose machines share the file system;
     None: here, one after another.
     """
+
+    def attempted(task: T) -> R | DyngsError:
+        try:
+            return do(task)
+        except DyngsError as error:
+            return error
+
     if ray_cores is None:
         for task in tasks:
-            yield task, _attempted(do, task)
+            yield task, attempted(task)
         return
+    here = os.getcwd()
+    links = follows_links_of_runs()
+
+    def attempted_elsewhere(task: T) -> R | DyngsError:
+        os.chdir(here)
+        with following_links_of_runs(links):
+            return attempted(task)
+
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise DyngsError("--ray needs the package ray; run pip install 'dyngs[ray]'") from None
-    here = os.getcwd()
     os.chdir(home_of_dyngs())  # Ray's processes import modules from the current folder of ray.init
     try:
         ray.init()
     finally:
         os.chdir(here)
     try:
-        remote: Any = ray.remote(num_cpus=ray_cores)(_attempted_in)
-        links = follows_links_of_runs()
-        waiting = {remote.remote(here, links, do, task): task for task in tasks}
+        remote: Any = ray.remote(num_cpus=ray_cores)(attempted_elsewhere)
+        waiting = {remote.remote(task): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting))
             yield waiting.pop(ready), ray.get(ready)
@@ -68,15 +90,44 @@ def done_in_turn(
         ray.shutdown()
 
 
-def _attempted_in(folder: str, links: bool, do: Callable[[T], R], task: T) -> R | DyngsError:
-    """Attempt a task in a process of Ray, with the current folder and permissions of ours."""
-    os.chdir(folder)
-    with following_links_of_runs(links):
-        return _attempted(do, task)
+def read_stored(path: Path, kind: TypeAdapter[T]) -> T:
+    """Return a result. Raises DyngsError: the file is damaged."""
+    with reading(path, "it is no result of a study: remove it to have it measured again"):
+        return kind.validate_json(read_limited(path))
 
 
-def _attempted(do: Callable[[T], R], task: T) -> R | DyngsError:
+def write_stored(path: Path, values: Mapping[str, Any] | Sequence[Any]) -> None:
+    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+
+
+def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequence[str]) -> None:
+    """Note what a study is about in its folder ``out``, or compare it with what is noted there.
+
+    Raises:
+        DyngsError: one of the ``compared`` facts differs; names those that do.
+    """
+    path = out / STUDY_FILE
+    if not path.is_file():
+        write_stored(path, facts)
+        return
     try:
-        return do(task)
-    except DyngsError as error:
-        return error
+        known = cast(object, json.loads(read_limited(path)))
+    except (ValueError, RecursionError):
+        known = None
+    if not isinstance(known, dict):
+        raise DyngsError(
+            f"{path}: cannot be read, so what its folder holds is not known; give another --out"
+        )
+    here = json.loads(json.dumps(facts))
+    differing = [
+        f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
+        for key in compared
+        if known.get(key) != here[key]
+    ]
+    if differing:
+        raise DyngsError(f"{out}: holds another study ({'; '.join(differing)}); give another --out")
+
+
+def _shown(value: object) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return printable(text, 80) or "none"

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, counted
 from dyngs.export.edit.crop import Box, held_by
-from dyngs.export.edit.scene_file import write_part
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.runs.opened import Opened

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from dyngs.api.from_scene import first_of, settled
 from moving_scene import write_moving_run
 
-from dyngs.api.first_scene import first_of, settled
+from dyngs.api.edit import Edits, edit_scene
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, FixedStrategy
@@ -18,10 +20,12 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.edit.frame import Frame
-from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import write_run_splats
-from dyngs.gaussians import Gaussians
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.densify import Densifier
+from dyngs.gaussians.optimizer import Still
 from dyngs.runs.opened import open_run
+from dyngs.training.new_trainer import assemble
 
 BOX = (-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)
 
@@ -99,6 +103,47 @@ def test_it_begins_where_the_scene_was(kind: str, capture: Path, run: Path, tmp_
     assert psnr_of(new) == pytest.approx(psnr_of(run), abs=0.01)
 
 
+class Wild(Densifier):
+    """Doubles every Gaussian beside itself, makes all fainter, and shakes them, in every step."""
+
+    touches_all = True
+
+    def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
+        source = torch.arange(len(parameters)).repeat(2)
+        edit = TopologyEdit(source, torch.arange(len(source)) >= len(parameters))
+        faint = parameters.logit_opacities.detach()[source] - 0.1
+        return EditResult(
+            edit, {"means": parameters.means.detach()[source] + 0.01, "logit_opacities": faint}
+        )
+
+    def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
+        parameters.means.detach().add_(0.001)
+
+
+def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_path: Path) -> None:
+    """While the set grows, is shaken and ordered anew around it; also from a checkpoint."""
+    config = settled(
+        going_on(capture, run, tmp_path / "new", f"init.box={list(BOX)}", "strategy.kind=fixed")
+    )
+    first = first_of(config, read_capture(config.data))
+    assert first is not None
+    assert first.frozen is not None
+    frozen, free = (first.gaussians.select(x) for x in (first.frozen, ~first.frozen))
+    assert 0 < len(frozen) < len(first.frozen)
+    trainer = assemble(config, first=first)
+    again = assemble(config, restored=True)
+    for one in (trainer, again):
+        if one is again:
+            again.restore(trainer.checkpoint())
+        one.model.densifier = Wild()
+        for _ in range(2):
+            one.step()
+        rows = rows_of(one.model.scene.gaussians)
+        assert rows_of(frozen) <= rows
+        assert not rows_of(free) & rows
+    assert again.num_gaussians == len(frozen) + 16 * len(free)
+
+
 def test_colour_only(capture: Path, run: Path, tmp_path: Path) -> None:
     new = train(going_on(capture, run, tmp_path / "new", "init.trains=colour"))
     before = open_run(run).scene.gaussians.tensors()
@@ -125,6 +170,27 @@ def test_an_edited_run_goes_on_with_its_own_cameras(
     moved = open_run(edited).frame.gaussians(open_run(run).scene.gaussians)
     means = again.world_scale * first.gaussians.means
     torch.testing.assert_close(means, moved.means)
+
+
+def test_what_stays_is_not_part_of_a_change() -> None:
+    """A frozen Gaussian that would be split, relocated or made fainter is there as it was, and has
+    no copies."""
+    n = 4
+    means = torch.arange(12.0).reshape(n, 3)
+    sh = torch.ones(n, 1, 3)
+    old = Gaussians(means, torch.ones(n, 4), torch.zeros(n, 3), torch.arange(4.0), sh)
+    still = Still(torch.tensor([False, True, False, True]))
+    source = torch.tensor([0, 1, 1, 2, 2])
+    edit = TopologyEdit(source, torch.tensor([False, False, True, False, True]))
+    result = EditResult(edit, {"means": -means[source]})
+    found = still.grown(result, old)
+    assert found.edit is not None
+    assert found.edit.source.tolist() == [0, 2, 2, 1, 3]
+    assert found.edit.is_new.tolist() == [False, False, True, False, False]
+    assert found.changes["means"][:, 0].tolist() == [0, -6, -6, 3, 9]
+    reset = still.grown(EditResult(None, {"logit_opacities": torch.full((n,), -9.0)}), old)
+    assert reset.changes["logit_opacities"].tolist() == [-9, 1, -9, 3]
+    assert replace(still, rows=None).grown(result, old) is result
 
 
 def test_what_cannot_be_gone_on_from(capture: Path, run: Path, tmp_path: Path) -> None:

@@ -3,16 +3,18 @@ that is kept."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from moving_scene import write_moving_run
+from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.prune import file_of, prune_run, prune_within
 from dyngs.api.train import train
-from dyngs.compress.prune.search import evenly_held_out
-from dyngs.compress.prune.stage import quality_of
+from dyngs.compress.search import evenly_held_out
+from dyngs.compress.stage import quality_of
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -47,7 +49,7 @@ def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
         "HARMONIC_LOSSES": (0.03,),
     }
     for name, candidates in few.items():
-        monkeypatch.setattr(f"dyngs.compress.prune.search.{name}", candidates)
+        monkeypatch.setattr(f"dyngs.compress.search.{name}", candidates)
 
 
 def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -> None:
@@ -71,6 +73,24 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
     assert load_run(twice).step == 32
     assert load_run(thrice).step == 36
+
+
+@pytest.mark.usefixtures("few_candidates")
+def test_on_a_gpu_it_is_the_same(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search, of few candidates, its file, and the comparison with the run before."""
+    briefly = ("prune.steps=1", "run.threads=1")
+    expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
+    here = compared([run_dir, file_of(tmp_path / "here")], 1)
+    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
+    with pretend_gpu():
+        found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
+        there = compared([run_dir, file_of(tmp_path / "there")], 1, GPU)
+    assert found == expected
+    files = [file_of(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert [replace(x, fps=1) for x in there] == [replace(x, fps=1) for x in here]
 
 
 def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
@@ -99,8 +119,26 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     assert str(first).count("limit:") == len(first.limits) >= 4
 
 
+@pytest.mark.usefixtures("few_candidates")
+def test_where_nothing_can_go_the_run_stays_as_it_is(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every candidate is worse by 5 dB than what was there."""
+    monkeypatch.setattr("dyngs.compress.search.apply_cut", _spoil)
+    promise = prune_within(run_dir, tmp_path / "same", 0.2, BRIEFLY, silent)
+    assert (
+        checkpoint_paths(tmp_path / "same")[-1].read_bytes()
+        == checkpoint_paths(run_dir)[-1].read_bytes()
+    )
+    assert str(promise).startswith("nothing can be taken away for 0.2 dB: the run is as it was")
+    assert all(
+        limit.refused is not None and limit.refused[1] > 0.2 for limit in promise.limits[:-1]
+    )
+    assert promise.before - promise.after <= 0.2
+
+
 def _spoil(trainer: object, cut: object, scores: object) -> None:
-    from dyngs.compress.prune.cut import Cut, apply_cut
+    from dyngs.compress.cut import Cut, apply_cut
 
     apply_cut(trainer, cut, scores)  # pyright: ignore[reportArgumentType]
     if cut != Cut():
@@ -117,7 +155,7 @@ def test_an_interruption_leaves_nothing(
         patch.setattr("dyngs.api.prune.write_config", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_run(run_dir, tmp_path / "small", ASKED)
-        patch.setattr("dyngs.compress.prune.search.apply_cut", interrupted)
+        patch.setattr("dyngs.compress.search.apply_cut", interrupted)
         with pytest.raises(KeyboardInterrupt):
             prune_within(run_dir, tmp_path / "small", 50.0, BRIEFLY, silent)
     assert not list(tmp_path.iterdir())

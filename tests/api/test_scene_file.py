@@ -11,7 +11,7 @@ import torch
 from moving_scene import write_moving_run
 
 from dyngs.api.scene_file import write_scene_file
-from dyngs.compress.storage.precision import Precision
+from dyngs.compress.precision import Precision
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import prefixed, tensors_of
 from dyngs.gaussians.visibility import VisibilityMasks
@@ -81,7 +81,7 @@ def test_a_file_that_changes_images_more_than_allowed_is_not_written(
     before = sorted(run_dir.rglob("*"))
     coarse = {f"gaussians.{name}": 0.5 for name in ("means", "log_scales", "sh_base")}
     monkeypatch.setattr(
-        "dyngs.compress.storage.measure.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5)
+        "dyngs.compress.measure.measured_precision", lambda *_: Precision(coarse, 0.1, 0.5)
     )
     with pytest.raises(
         DyngsError,

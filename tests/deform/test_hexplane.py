@@ -12,7 +12,7 @@ from tiny_fields import cloud, stirred_field, tiny_field, tiny_options, tiny_set
 from torch import Tensor
 
 from dyngs.config import HexplaneField
-from dyngs.deform.hexplane import Hexplane
+from dyngs.deform.networks import Hexplane
 
 
 def field_with_rows(rows: int) -> Hexplane:

@@ -10,7 +10,7 @@ from tiny_fields import cloud, tiny_setup
 
 from dyngs.config import MlpField
 from dyngs.deform.field import Offsets
-from dyngs.deform.mlp import SKIP_LAYER, Mlp, encoded
+from dyngs.deform.networks import SKIP_LAYER, Mlp, encoded
 
 
 def outputs(offsets: Offsets) -> list[torch.Tensor]:

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import followed
 from torch import Tensor
 
+from dyngs.deform.control_nodes import FOLLOWED, Nodes, nodes_at, spread_out
 from dyngs.deform.field import Offsets
-from dyngs.deform.nodes import FOLLOWED, Nodes, nodes_at, spread_out
 
 
 def points(count: int, seed: int = 0) -> Tensor:

@@ -29,7 +29,7 @@ from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
-from dyngs.deform.hexplane import Hexplane
+from dyngs.deform.networks import Hexplane
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit

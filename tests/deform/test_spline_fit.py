@@ -6,8 +6,7 @@ import pytest
 import torch
 from tiny_fields import cloud, stirred_field
 
-from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.spline_fit import refitted, spline_basis
+from dyngs.deform.control_nodes import ControlNodes, refitted, spline_basis
 
 PLACES = torch.linspace(0, 1, 41, dtype=torch.float64)
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from dyngs.core.state import tensors_of
 from dyngs.deform.field import deformed
-from dyngs.deform.fields import field_state, restored_field
-from dyngs.deform.windows import EDGE, OPEN, WindowedField
+from dyngs.deform.fields import EDGE, OPEN, WindowedField, field_state, restored_field
 
 COUNT = 9
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dyngs.io.formats.rotation import AXES, turn_between
 from moving_scene import (
     MOVING_ROWS,
     TRAIN_TIMES,
@@ -32,8 +31,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, PointCloud
 from dyngs.data.read import read_capture
 from dyngs.deform.bodies.field import BodyField, BodyRest, bodies_of
+from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.windows import WindowedField
 from dyngs.export import splat_files
 from dyngs.export.body_nodes import write_bodies
 from dyngs.export.cameras import NAME, write_cameras
@@ -55,7 +54,7 @@ from dyngs.export.splat_files import (
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import read_splats, upright, write_splats
-from dyngs.io.formats.similarity import Similarity
+from dyngs.io.formats.similarity import AXES, Similarity, turn_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene

@@ -9,7 +9,7 @@ import pytest
 import torch
 from seen_ball import HIGH, LOW, RADIUS, views
 
-from dyngs.gaussians.fusion import Mesh, colours_of, fused, simplified
+from dyngs.gaussians.surface import Mesh, colours_of, fused, simplified
 
 
 @cache

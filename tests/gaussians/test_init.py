@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
 from dyngs.data.capture import View
 from dyngs.data.geometry import pinhole_matrix, times_seen
-from dyngs.gaussians.init import (
+from dyngs.gaussians.start import (
     StartValues,
     Surroundings,
     initial_gaussians,

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.densify import DensifySchedule, rotate
-from dyngs.gaussians.mcmc import McmcDensifier, relocated
+from dyngs.gaussians.densify import DensifySchedule, McmcDensifier, relocated, rotate
 
 SCHEDULE = DensifySchedule(start=100, stop=1000, every=100)
 

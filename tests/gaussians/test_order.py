@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dyngs.gaussians.order import morton_order, storage_order
+from dyngs.core.gaussians import morton_order, storage_order
 
 
 def test_corners_of_a_cube_follow_the_z_curve() -> None:

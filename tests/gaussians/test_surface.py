@@ -16,9 +16,8 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.fusion import Mesh, fused
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import largest_pieces, num_holes, opaque_box, surface_of
+from dyngs.gaussians.surface import Mesh, fused, largest_pieces, num_holes, opaque_box, surface_of
 from dyngs.io.formats.similarity import Similarity
 from dyngs.models.surface import Surface
 

@@ -14,7 +14,6 @@ from dyngs.api.load import read_capture
 from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import is_capture
-from dyngs.io import archive
 from dyngs.io.archive import unpacked
 from dyngs.io.temporary import cache_folder
 
@@ -121,14 +120,6 @@ def test_bombs_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
     ):
         unpacked(file)
     assert left() == []
-
-
-def test_too_many_files_are_refused(
-    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(archive, "MOST_FILES", 2)
-    with pytest.raises(DyngsError, match="asks for 6 files, of which 2"):  # 5, and a folder
-        unpacked(packed(tmp_path / "scene.zip", root))
 
 
 def test_no_more_is_written_than_an_archive_states(tmp_path: Path) -> None:

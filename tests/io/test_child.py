@@ -27,7 +27,7 @@ HOSTILE += ("dyngs/__init__.py", "dyngs/io/formats/__init__.py", "dyngs/io/forma
 
 def hostile(folder: Path) -> Path:
     """A folder of downloads in which everything that a Python process may import leaves a mark."""
-    (folder / "dyngs" / "splats").mkdir(parents=True)
+    (folder / "dyngs" / "io" / "formats").mkdir(parents=True)
     for name in HOSTILE:
         (folder / name).write_text("import pathlib\npathlib.Path('ran').touch()\n")
     return folder

@@ -73,30 +73,6 @@ def test_folders_around_and_within_a_capture(tmp_path: Path) -> None:
         inputs.require_output(out)
 
 
-def test_own_outputs_are_replaced(tmp_path: Path) -> None:
-    """An earlier export outside the capture, and all in a run folder that lies within it."""
-    root = filled(tmp_path / "capture")
-    for name in (
-        "capture/runs/a/config.yaml",
-        "capture/runs/a/images/sheet.png",
-        "out/sheet.png",
-        "config.yaml",
-    ):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("mine")
-    inputs = Inputs([root])
-    for out in (
-        "capture/runs/a",
-        "capture/runs/a/images",
-        "capture/runs/a/images/sheet.png",
-        "out",
-        "out/sheet.png",
-    ):
-        inputs.require_output(tmp_path / out)
-    with pytest.raises(DyngsError, match="exists and lies in"):
-        inputs.require_output(root / "runs")  # a folder above a run is none
-
-
 def test_a_folder_with_a_link_to_an_input(tmp_path: Path) -> None:
     root = filled(tmp_path / "capture")
     out = tmp_path / "out"

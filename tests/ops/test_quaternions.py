@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.deform.nodes import turned
+from dyngs.deform.control_nodes import turned
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.quaternions import quat_product, quats_of, rotate, rotation_matrices, unit_quats

@@ -5,17 +5,23 @@ from __future__ import annotations
 import json
 import math
 import random
+import sys
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 import torch
 from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
+from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
 from dyngs.config import Config, DataConfig, RunConfig, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.filters import fuse_filter
 from dyngs.gaussians.restored import restored_scene
+from dyngs.io import tensor_file
 from dyngs.io.tensor_file import write_tensors
 from dyngs.runs import checkpoint
 from dyngs.runs.checkpoint import (
@@ -28,7 +34,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.scene_tensors import drawable
+from dyngs.runs.stored_tensors import drawable
 
 
 def _checkpoint(step: int) -> Checkpoint:
@@ -59,6 +65,35 @@ def test_the_newest_is_that_of_the_most_steps(tmp_path: Path) -> None:
         save_checkpoint(tmp_path, _checkpoint(step), 1.0)
     assert [path.stem for path in checkpoint_paths(tmp_path)] == ["step_9999999", "step_10000000"]
     assert latest_checkpoint(tmp_path).info.step == 10_000_000
+
+
+def test_nobody_is_told_to_delete_a_file_that_may_be_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Too little memory, too many open files, no permission."""
+    for step in (1, 2):
+        save_checkpoint(tmp_path, _checkpoint(step), 1.0)
+    for error in (
+        RuntimeError("unable to mmap: Cannot allocate memory (12)"),
+        MemoryError(),
+        PermissionError(13, "no"),
+    ):
+
+        def failing(*given: object, error: Exception = error, **named: object) -> None:
+            raise error
+
+        monkeypatch.setattr(tensor_file, "safe_open", failing)
+        with pytest.raises(DyngsError, match=r"keep it, try again$"):
+            latest_checkpoint(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_a_link_to_nothing_is_an_error(tmp_path: Path) -> None:
+    """It was taken for a checkpoint that is removed meanwhile, and looked for without end."""
+    save_checkpoint(tmp_path, _checkpoint(1), 1.0)
+    (tmp_path / "checkpoints" / "step_0000002.safetensors").symlink_to(tmp_path / "nothing")
+    with pytest.raises(DyngsError, match=r"step_0000002.*"):
+        latest_checkpoint(tmp_path)
 
 
 def test_a_run_can_be_loaded_while_it_trains(
@@ -177,6 +212,46 @@ def test_load_run_gives_the_newest_model(tmp_path: Path) -> None:
     )
 
 
+def test_load_run_fuses_the_filter_of_a_filtered_model(tmp_path: Path) -> None:
+    save_config(_config(tmp_path, filter_3d=True), tmp_path / RESOLVED_NAME)
+    checkpoint = _checkpoint(5)
+    save_checkpoint(tmp_path, checkpoint, 1.0)
+    expected = fuse_filter(
+        Gaussians(**checkpoint.part("gaussians")), checkpoint.tensors["model.filter_std"]
+    )
+    drawn = load_run(tmp_path).scene.at(None)
+    assert torch.equal(drawn.log_scales, expected.log_scales)
+    assert torch.equal(drawn.logit_opacities, expected.logit_opacities)
+
+
+def test_a_moving_scene_is_loaded_with_its_field(tmp_path: Path) -> None:
+    scene = load_run(write_moving_run(tmp_path)).scene
+    assert not scene.is_static
+    assert scene.rows.tolist() == list(MOVING_ROWS)
+    assert scene.times == TRAIN_TIMES
+    for time in (0.0, 0.3, 1.0):
+        torch.testing.assert_close(scene.at(time).means[:, 0], moved_x(tuple(range(5)), time))
+
+
+def test_a_field_that_lacks_something_is_named(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    checkpoint = latest_checkpoint(run_dir)
+    tensors = {name: x for name, x in checkpoint.tensors.items() if name != "model.field.box"}
+    save_checkpoint(run_dir, replace(checkpoint, tensors=tensors), 1.0)
+    with pytest.raises(DyngsError, match=r"step_0000007\.safetensors lacks 'box'"):
+        load_run(run_dir)
+
+
+def test_a_field_that_is_not_finite_is_not_saved(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    good = latest_checkpoint(run_dir)
+    bad = replace(good, info=replace(good.info, step=8), tensors=dict(good.tensors))
+    bad.tensors["model.field.learned.means"] = torch.full((2, 1, 3), math.nan)
+    with pytest.raises(DyngsError, match=r"field.*not finite after step 8.*step_0000007"):
+        save_checkpoint(run_dir, bad, 2.0)
+    assert latest_checkpoint(run_dir).info.step == 7
+
+
 def test_missing_things_are_named(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="not a run folder"):
         load_run(tmp_path)
@@ -260,6 +335,46 @@ def test_headers_of_other_types_are_refused(tmp_path: Path, key: str, value: obj
     with pytest.raises(DyngsError, match=r"step_0000007\.safetensors: cannot be read") as caught:
         load_checkpoint(path)
     one_line(caught.value, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("model.rows", lambda x: x.flip(0), "'rows' does not ascend"),
+        ("model.rows", lambda x: x + 6, "'rows' names something beyond the 9"),
+        ("model.rows", lambda x: x.int(), "'rows' is int32"),
+        ("model.times", lambda x: x + 0.5, "outside"),
+        ("model.filter_std", lambda x: -x, "negative"),
+        (
+            "model.field.buffers.followed",
+            lambda x: x + 5,
+            "'followed' names something beyond the 4",
+        ),
+        ("model.field.buffers.followed", lambda x: x[1:], r"'followed' is int64 \(3, 4\)"),
+        ("model.field.buffers.radii", torch.zeros_like, "'radii' must be above 0"),
+        ("model.field.buffers.positions", lambda x: x[1:], r"float32 \(4,"),
+        ("model.field.learned.means", lambda x: x[:, 1:], "'means' is float32"),
+        ("model.field.learned.exp_avg.means", lambda x: x.double(), "'exp_avg.means' is float64"),
+        ("model.field.box", torch.zeros_like, "'box' must be above 0"),
+        ("model.field.numbers", lambda x: -x, "'numbers' must be above 0"),
+        ("gaussians.sh", lambda x: x[:, :3], "'sh' has 3 terms"),
+        ("gaussians.means", lambda x: x * torch.nan, "'means' holds NaN"),
+    ],
+)
+def test_what_does_not_fit_is_named(
+    tmp_path: Path, name: str, change: Callable[[torch.Tensor], torch.Tensor], said: str
+) -> None:
+    tensors, model = contents("control_nodes")
+    save_config(Config(data=DataConfig(root=tmp_path), model=model), tmp_path / RESOLVED_NAME)
+    path = tmp_path / "checkpoints" / "step_0000007.safetensors"
+    path.parent.mkdir()
+    write_tensors(
+        path, checkpoint._KIND, tensors | {name: change(tensors[name]).contiguous()}, _header()
+    )
+    with pytest.raises(
+        DyngsError, match=rf"step_0000007\.safetensors: cannot be read \(ValueError: .*{said}"
+    ):
+        load_run(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,16 @@
-"""Tasks in turn: what cannot be done is said, and the others are done."""
+"""Tasks in turn, and what a study is about: noted once and compared afterwards."""
 
 from __future__ import annotations
 
 import os
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.study.runs import done_in_turn
+from dyngs.study.runs import STUDY_FILE, done_in_turn, require_same_study
 
 
 def reciprocal(number: float) -> float:
@@ -20,29 +19,14 @@ def reciprocal(number: float) -> float:
     return 1 / number
 
 
-def test_one_after_another_and_as_they_are_asked_for() -> None:
+def test_tasks_are_done_as_they_are_asked_for_and_a_failure_stops_no_other() -> None:
     begun: list[int] = []
     results = done_in_turn(begun.append, [1, 2, 3])
     assert next(results) == (1, None)
     assert begun == [1]
-    assert [task for task, _ in results] == [2, 3]
-
-
-def test_a_task_that_fails_stops_no_other() -> None:
     found = dict(done_in_turn(reciprocal, [2.0, 0.0, 4.0]))
     assert (found[2.0], found[4.0]) == (0.5, 0.25)
     assert str(found[0.0]) == "nothing to divide by"
-
-
-def test_a_fault_of_ours_keeps_its_traceback() -> None:
-    with pytest.raises(TypeError):
-        list(done_in_turn(reciprocal, ["x"]))  # type: ignore[list-item]
-
-
-@pytest.mark.skipif(find_spec("ray") is not None, reason="ray is installed")
-def test_without_ray_a_line_says_how_to_get_it() -> None:
-    with pytest.raises(DyngsError, match=r"pip install 'dyngs\[ray\]'"):
-        list(done_in_turn(reciprocal, [1.0], 1))
 
 
 def test_ray_imports_no_module_of_the_current_folder(
@@ -65,3 +49,23 @@ def test_ray_imports_no_module_of_the_current_folder(
     assert tmp_path not in map(Path, importing)
     assert len(importing) == 1
     assert os.getcwd() == str(tmp_path)
+
+
+def test_another_study_is_refused_with_what_differs(tmp_path: Path) -> None:
+    facts = {"where": "a", "models": ("static", "mip"), "minutes": 2.0}
+    require_same_study(tmp_path, facts, ("models", "minutes"))
+    before = (tmp_path / STUDY_FILE).read_bytes()
+    require_same_study(tmp_path, facts | {"where": "b"}, ("models", "minutes"))
+    with pytest.raises(
+        DyngsError, match=r"\(models is static, mip there and static here; minutes is 2.0 there"
+    ):
+        require_same_study(tmp_path, {"models": ["static"], "minutes": ""}, ("models", "minutes"))
+    assert (tmp_path / STUDY_FILE).read_bytes() == before
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "nonsense", "[" * 100_000])
+def test_a_damaged_note_is_no_permission(tmp_path: Path, text: str) -> None:
+    (tmp_path / STUDY_FILE).write_text(text)
+    with pytest.raises(DyngsError, match=r"study\.json: cannot be read"):
+        require_same_study(tmp_path, {"a": 1}, ("a",))
+    assert (tmp_path / STUDY_FILE).read_text() == text

@@ -10,9 +10,9 @@ import pytest
 import torch
 from moving_scene import moved_x, row_of_balls, write_moving_run
 
+from dyngs.api.edit import Edits, edit_scene
 from dyngs.core.errors import DyngsError
 from dyngs.export.edit.frame import Frame
-from dyngs.export.edit.scene_file import Edits, edit_scene
 from dyngs.export.splat_files import Writing, write_run_splats
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene

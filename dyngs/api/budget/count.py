@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dyngs.compress.prune.stage import highest, quality_of, scores_of
+from dyngs.compress.stage import highest, quality_of, scores_of
 from dyngs.config import Config
 from dyngs.core.errors import counted
 from dyngs.training.loop import Loop

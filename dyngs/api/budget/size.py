@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from dyngs.baselines.triangles.scene import TriangleScene
-from dyngs.compress.prune.stage import highest, probe_images, quality_of, scores_of
-from dyngs.compress.storage.measure import storage_plan
+from dyngs.compress.measure import storage_plan
+from dyngs.compress.stage import highest, probe_images, quality_of, scores_of
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.errors import DyngsError, counted
 from dyngs.gaussians.restored import restored_model
@@ -23,8 +23,8 @@ from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
-from dyngs.runs.scene_file import decoded, encoded, write_scene
-from dyngs.runs.scene_tensors import drawable, step_below
+from dyngs.runs.stored_file import decoded, encoded, write_scene
+from dyngs.runs.stored_tensors import drawable, step_below
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7

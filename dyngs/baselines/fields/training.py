@@ -16,7 +16,7 @@ from dyngs.baselines.fields.space import part_of, rays_of
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import State, moved_to, prefixed
 from dyngs.data.loader import Image
-from dyngs.gaussians.adam import AdamState
+from dyngs.gaussians.parameters import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Look, Loss, Model, Updated

@@ -16,11 +16,10 @@ from dyngs.config import DefaultStrategy, ShColour, StaticModel
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
-from dyngs.gaussians.fusion import Mesh, Seen, colours_of, fused, simplified
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.start import densifier_of, first_gaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import opaque_box, seen_by
+from dyngs.gaussians.surface import Mesh, Seen, colours_of, fused, opaque_box, seen_by, simplified
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss

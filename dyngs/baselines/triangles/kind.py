@@ -11,7 +11,7 @@ from dyngs.baselines.triangles.scene import TriangleScene, scene_options, stored
 from dyngs.baselines.triangles.training import TriangleTraining
 from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
+from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.views import evaluation_background

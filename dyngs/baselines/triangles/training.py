@@ -22,7 +22,7 @@ from dyngs.baselines.triangles.tallies import Tallies, most_pixels, slopes_of
 from dyngs.core.errors import DyngsError, counted
 from dyngs.core.state import State, prefixed
 from dyngs.data.loader import Image
-from dyngs.gaussians.adam import AdamState
+from dyngs.gaussians.parameters import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated

@@ -7,6 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from dyngs.core.conventions import srgb_decoded
+
 UNSPECIFIED = 2
 BT2020, _DISPLAY_P3 = 9, 12
 _PQ, _HLG = 16, 18
@@ -90,11 +92,6 @@ def srgb_encoded(linear: np.ndarray) -> np.ndarray:
         12.92 * linear,
         1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
     )
-
-
-def srgb_decoded(signal: np.ndarray) -> np.ndarray:
-    """Return the linear light of an sRGB signal in [0, 1]."""
-    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
 
 
 @lru_cache

@@ -15,13 +15,46 @@ from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
-from dyngs.deform.bodies.shadows import START, light_left
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.harmonics import dimmed, light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
+
+START = 0.15, 0.1, 0.0, 0.0
+"""Parts of direct light and of that from all around that a ball takes; logarithms of the shadow's
+size and softness."""
+# Radii in which the edge of a shadow, and its beginning at the ball, fall by e
+PENUMBRA, GRAZING = 0.2, 0.3
+
+
+def light_left(
+    points: Tensor, labels: Tensor, places: Tensor, radii: Tensor, sun: Tensor, shade: Tensor
+) -> Tensor:
+    """Return the (N,) parts of the light that reach ``points`` (N, 3) around balls; differentiable
+    in the last two.
+
+    A ball hides direct light from what lies behind it, near its axis, and of that from all around
+    as much as it fills of the view: the square of its radius (B,) over the distance from its place
+    (B, 3). The ball of ``labels`` (N,) that a point is a part of, -1 for none, throws no shadow on
+    it. Direct light comes from ``sun`` (3,), of any length; ``shade`` (4,) is as ``START``.
+    """
+    direct, around = shade[:2].clamp(0.0, 0.95)
+    size, softness = shade[2:].exp()
+    way = torch.nn.functional.normalize(sun, dim=0)
+    left = points.new_ones(len(points))
+    for ball in range(len(places)):
+        to = (places[ball] - points) / radii[ball]
+        along = to @ way
+        away = (to - along[:, None] * way).norm(dim=1)
+        hidden = torch.sigmoid((size - away) / (PENUMBRA * softness)) * torch.sigmoid(
+            along / GRAZING
+        )
+        view = to.square().sum(1).clamp_min(1.0).reciprocal()
+        left = left * torch.where(labels == ball, 1.0, (1 - direct * hidden) * (1 - around * view))
+    return left
+
 
 RATES = {"places": 3e-4, "quats": 3e-3, "light": 1e-2, "albedo": 5e-3, "sun": 1e-2, "shade": 1e-2}
 """Learning rates; that of places times the scene extent."""

@@ -8,12 +8,127 @@ Local letters: C cubes, T images of one camera.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from dyngs.deform.fixed_cameras.changes import Footage
+from dyngs.core.camera import Cameras
+from dyngs.data.loader import Image
+
+LONGEST_SIDE, IMAGES = 200, 2000
+"""Pixels; larger images are shrunk: silhouettes need no more, and noise averages out. Of more
+images than that, each is smaller, so that all of them together take as much memory."""
+SMALLEST_CHANGE = 0.05  # Least difference in a channel, of 1, that counts as a change
+NOISE_MULTIPLE = 5.0
+"""Differences below so many standard deviations of the noise, as estimated from the median, are no
+change."""
+# A change must reach this multiple of its threshold somewhere, as in hysteresis thresholding (Canny
+# 1986)
+SURE = 2.0
+FEWEST_PIXELS = 6
+DARKEST_SHADOW = 0.35
+SHADOW_TINT = 0.14
+"""A shadow leaves at least that fraction of the light and changes no channel by more than this
+share beyond the others."""
+_MAD_TO_STD = 1.4826
+_DARK = 0.03  # Added to colours before they are divided
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Images of one camera that stands still, and what changes in them."""
+
+    camera: Cameras  # (V = 1) of the images' size
+    times: tuple[float, ...]  # T, ascending
+    images: np.ndarray  # (T, H, W, 3) uint8
+    # (T, H, W) bool: shows something that is elsewhere, or not there, at most other times
+    changed: np.ndarray
+    counted: np.ndarray  # (T, H, W) bool; False where the image is masked out
+    median: np.ndarray  # (H, W, 3) uint8, what is still
+
+
+def footage_of(images: Iterable[Image], background: Tensor, total: int = 1) -> Footage:
+    """Return the frames of one camera that stands still, on the CPU."""
+    longest = LONGEST_SIDE * min(1.0, (IMAGES / max(total, 1)) ** 0.5)
+    shown = []
+    counted = []
+    times = []
+    camera: Cameras | None = None
+    for image in images:
+        small = image.shrunk(math.ceil(max(image.cameras.width, image.cameras.height) / longest))
+        rgb = small.composite(background).clamp(0, 1)
+        shown.append((255 * rgb).round().to(torch.uint8).cpu().numpy())
+        counted.append(
+            np.ones(rgb.shape[:2], bool) if small.mask is None else small.mask.cpu().numpy() > 0.5
+        )
+        times.append(small.time or 0.0)
+        camera = small.cameras.to(device="cpu")
+    if camera is None:
+        raise ValueError("no images")
+    stack = np.stack(shown)
+    valid = np.stack(counted)
+    median = np.median(stack, axis=0).astype(np.uint8)
+    return Footage(camera, tuple(times), stack, changes(stack) & valid, valid, median)
+
+
+def median_image(images: Sequence[Tensor]) -> Tensor:
+    """Return the median (H, W, 3) over ``images`` of a camera in place: what is still, as it is."""
+    return torch.stack(list(images)).median(0).values
+
+
+def changes(images: np.ndarray) -> np.ndarray:
+    """Return (T, H, W) bool: where ``images`` (T, H, W, 3), uint8, differ from their median,
+    shadows left out.
+
+    The threshold of a pixel is the largest of ``SMALLEST_CHANGE`` and a multiple of the noise, that
+    of all pixels and its own; both are estimated by the median absolute deviation, which what moves
+    does not affect. Of what lies above, connected parts without a pixel far above, and specks, are
+    dropped; holes, as shadows leave them, are filled.
+    """
+    from scipy import ndimage
+
+    values = images.astype(np.float32) / 255
+    median = np.median(values, axis=0).astype(np.float32)
+    apart = np.abs(values - median).max(-1)
+    own = _MAD_TO_STD * np.median(apart, axis=0)
+    threshold = np.maximum(
+        SMALLEST_CHANGE, NOISE_MULTIPLE * np.maximum(own, _MAD_TO_STD * float(np.median(apart)))
+    )
+    found = np.zeros(apart.shape, bool)
+    for i, (difference, image) in enumerate(zip(apart, values, strict=True)):
+        differs = (difference > threshold) & ~shadows(image, median)
+        differs = ndimage.binary_closing(np.pad(differs, 2), iterations=1)[2:-2, 2:-2]
+        found[i] = _without_specks(
+            np.asarray(ndimage.binary_fill_holes(differs)), difference / threshold
+        )
+    return found
+
+
+def _without_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
+    """Return ``differs`` (H, W) without small parts, and those in which ``certainty`` is below
+    ``SURE`` all over."""
+    from skimage.measure import label
+
+    labels: np.ndarray = np.asarray(label(differs, connectivity=1))
+    sizes = np.bincount(labels.ravel())
+    peaks = np.zeros(len(sizes))
+    np.maximum.at(peaks, labels.ravel(), certainty.ravel())
+    kept = (sizes >= FEWEST_PIXELS) & (peaks > SURE)
+    kept[0] = False
+    return kept[labels]
+
+
+def shadows(image: np.ndarray, still: np.ndarray) -> np.ndarray:
+    """Return (..., H, W) bool: as ``still`` but darker, all channels alike (after Horprasert et al.
+    1999)."""
+    left = (image + _DARK) / (still + _DARK)
+    tint = left.max(-1) - left.min(-1)
+    return (left.max(-1) < 1) & (left.min(-1) > DARKEST_SHADOW) & (tint < SHADOW_TINT)
+
 
 FIRST_CUBES = 16  # Cubes along the longest side of the box that carving begins with
 MAX_CUBES = 300_000  # Carving stops to divide cubes at this number
@@ -249,3 +364,104 @@ def _blob(views: Sequence[ChangedRegion], points: np.ndarray, side: float) -> Bl
     color = np.mean(colors, axis=0) if colors else np.full(3, 0.5)
     radius = float((len(points) * side**3 * 3 / (4 * np.pi)) ** (1 / 3))
     return Blob(points.mean(0), radius, points, side, color)
+
+
+MAX_GAP = 3  # Times in a row at which a thing may be lost
+FEWEST_TIMES = 4  # Times at which a thing must be found
+# Radii within which a thing whose velocity is not known is looked for at the next time
+FIRST_REACH = 6.0
+REACH, SPEED_REACH = 3.0, 1.5
+"""Radii, and fractions of the last displacement, by which a thing may be away from where its
+velocity takes it."""
+COLOR_REACH, SIZE_REACH = 0.35, 1.2
+"""Differences of colour, and of the logarithm of the radius, at which a blob is another thing."""
+FEWEST_STEPS = 2
+SAME_WAY = -0.2
+"""Steps of at least a radius that a thing which travels makes, and the least correlation of each
+with the next: what hops turns back, too, but less often than noise does."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """A thing followed over time."""
+
+    times: tuple[float, ...]
+    blobs: tuple[Blob, ...]
+
+    @property
+    def centers(self) -> np.ndarray:
+        return np.stack([blob.center for blob in self.blobs])
+
+    @property
+    def radius(self) -> float:
+        return float(np.median([blob.radius for blob in self.blobs]))
+
+    @property
+    def travels(self) -> bool:
+        """Whether it goes on and on: what turns or bends in place is no track to start from.
+
+        Of places a radius apart or more, in the order of time, successive steps must not mostly
+        turn back.
+        """
+        centers = self.centers
+        places = [centers[0]]
+        for center in centers[1:]:
+            if np.linalg.norm(center - places[-1]) >= self.radius:
+                places.append(center)
+        steps: np.ndarray = np.diff(np.stack(places), axis=0)
+        if len(steps) < FEWEST_STEPS:
+            return False
+        return float((steps[1:] * steps[:-1]).sum()) > SAME_WAY * float((steps**2).sum())
+
+    def predicted(self, time: float) -> np.ndarray:
+        last = self.blobs[-1].center
+        if len(self.blobs) < 2:
+            return last
+        pace = (last - self.blobs[-2].center) / (self.times[-1] - self.times[-2])
+        return last + (time - self.times[-1]) * pace
+
+    def extended(self, time: float, blob: Blob) -> Track:
+        return Track((*self.times, time), (*self.blobs, blob))
+
+
+def linked(times: Sequence[float], blobs: Sequence[Sequence[Blob]]) -> list[Track]:
+    """Return the tracks among the ``blobs`` of each of ``times`` (ascending), longest first.
+
+    Blobs are assigned to the tracks so far by the least total cost (Kuhn 1955), each within a gate
+    around where constant velocity takes a track. A track may miss some times in a row; those found
+    too rarely are left out.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    done: list[Track] = []
+    open_: list[Track] = []
+    for i, (time, found) in enumerate(zip(times, blobs, strict=True)):
+        oldest = times[max(i - MAX_GAP - 1, 0)]
+        done += [track for track in open_ if track.times[-1] < oldest]
+        open_ = [track for track in open_ if track.times[-1] >= oldest]
+        cost = np.full((len(open_), len(found)), np.inf)
+        for row, track in enumerate(open_):
+            cost[row] = [_cost(track, time, blob) for blob in found]
+        rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
+        taken = {int(c): int(r) for r, c in zip(rows, columns, strict=True) if cost[r, c] < np.inf}
+        fresh = [Track((time,), (blob,)) for j, blob in enumerate(found) if j not in taken]
+        for column, row in taken.items():
+            open_[row] = open_[row].extended(time, found[column])
+        open_ += fresh
+    kept = [track for track in done + open_ if len(track.times) >= FEWEST_TIMES]
+    return sorted(kept, key=lambda track: -len(track.times))
+
+
+def _cost(track: Track, time: float, blob: Blob) -> float:
+    """Return the cost of taking ``blob`` for the next of ``track``; infinite where it cannot be."""
+    last = track.blobs[-1]
+    reach = FIRST_REACH * last.radius
+    if len(track.blobs) > 1:
+        step = np.linalg.norm(track.predicted(time) - last.center)
+        reach = REACH * max(last.radius, track.radius) + SPEED_REACH * float(step)
+    terms = (
+        float(np.linalg.norm(blob.center - track.predicted(time))) / reach,
+        float(np.abs(blob.color - last.color).max()) / COLOR_REACH,
+        abs(float(np.log(blob.radius / track.radius))) / SIZE_REACH,
+    )
+    return sum(terms) if max(terms) < 1 else np.inf

@@ -10,9 +10,10 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError, counted
 from dyngs.export.splat_files import splats_at, up_of
+from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.formats import format_to_read, read_splats
 from dyngs.io.formats.similarity import Similarity, axis_of, joined, turn_between
-from dyngs.io.formats.splat_file import SplatFile, splat_options, with_degree
+from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.runs.opened import open_scene
 
 

@@ -14,12 +14,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
 from dyngs.deform.field import DeformationField, Offsets
+from dyngs.deform.fields import WindowedField
 from dyngs.deform.free import FreePrimitives
-from dyngs.deform.nodes import FOLLOWED
-from dyngs.deform.spline_fit import spline_basis
-from dyngs.deform.windows import WindowedField
 from dyngs.ops.nodes import SPAN
 
 SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at

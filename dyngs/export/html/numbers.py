@@ -19,14 +19,14 @@ from torch import Tensor
 
 from dyngs.baselines.triangles.patches import CORNERS
 from dyngs.baselines.triangles.scene import TriangleScene
+from dyngs.core.gaussians import storage_order
 from dyngs.deform.field import Offsets
+from dyngs.deform.fields import EDGE, OPEN
 from dyngs.deform.scene import DynamicScene, field_scene_of
-from dyngs.deform.windows import EDGE, OPEN
 from dyngs.export.html.curves import Curves, curves_of, fitted_curves
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.levels import BLOCK, MERGED, PIXELS, Block, Levels
-from dyngs.gaussians.order import storage_order
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of

@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.gaussians.colour.bake import with_harmonics
+from dyngs.gaussians.colour.network import with_harmonics
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import Texels

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
 from dyngs.io.limits import require_at_most
 

@@ -12,7 +12,7 @@ import torch
 
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading, require_regular
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats.edit_note import note_path, read_note, write_note
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, axis_of, turn_between
 from dyngs.io.formats.splat_file import (

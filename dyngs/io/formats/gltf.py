@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms
-from dyngs.data.images.colour_space import srgb_decoded
-from dyngs.gaussians import Gaussians
+from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms, srgb_decoded
+from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
 from dyngs.io.formats.splat_file import (
     MOST_GAUSSIANS,

@@ -25,8 +25,7 @@ import numpy as np
 import torch
 
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.order import morton_order
+from dyngs.core.gaussians import Gaussians, morton_order
 from dyngs.io.formats.packing import (
     logit,
     pack_fractions,

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import quat_product, rotation_matrices
 
@@ -147,6 +146,8 @@ def similarity_of_matrix(world: np.ndarray) -> Similarity | None:
 
 def turn_of(rotation: np.ndarray) -> Quaternion:
     """Return the quaternion wxyz of a rotation (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True).tolist()
     return w, x, y, z
 

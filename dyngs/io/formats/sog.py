@@ -22,8 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, Val
 
 from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError, require_regular
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.order import morton_order
+from dyngs.core.gaussians import Gaussians, morton_order
 from dyngs.io.formats.formats import SOG_META
 from dyngs.io.formats.packing import (
     codebook,

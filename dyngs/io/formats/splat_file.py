@@ -15,12 +15,10 @@ from torch import Tensor
 
 from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import RenderOptions
+from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats.packing import logit
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, far_offset, similarity_of
 from dyngs.io.limits import require_at_most
-from dyngs.models.renderable import near_plane
 from dyngs.ops.checks import finite_rows
 
 Nonfinite = Literal["error", "skip"]
@@ -119,25 +117,6 @@ def offset_notes(splat: SplatFile, remark: str) -> tuple[str, ...]:
     offset = " ".join(f"{x:.12g}" for x in splat.frame.points(np.array(splat.world_offset)))
     return (
         f"the scene is far from the origin: {offset} is subtracted from its positions ({remark})",
-    )
-
-
-def splat_options(splat: SplatFile) -> RenderOptions:
-    """Return the render options stated in a splat file: its mode, and its low-pass filter if
-    any."""
-    options = RenderOptions(mode=splat.mode)
-    return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
-
-
-def drawing_options(splat: SplatFile) -> RenderOptions:
-    """Return ``splat_options`` with a near plane that suits the size of the scene."""
-    means = splat.gaussians.means.double().numpy()
-    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    # About the extent of cameras around it. The median ignores a far background, which must not
-    # push the plane away.
-    extent = 2 * float(np.median(distances))
-    return (
-        replace(splat_options(splat), near=near_plane(extent)) if extent else splat_options(splat)
     )
 
 

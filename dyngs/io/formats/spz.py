@@ -20,7 +20,7 @@ import torch
 
 from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats.formats import SYSTEM_OF_UP
 from dyngs.io.formats.packing import largest_and_others, logit, with_largest
 from dyngs.io.formats.similarity import Similarity, mirrored, turn_of

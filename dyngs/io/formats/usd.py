@@ -19,7 +19,7 @@ import numpy as np
 
 from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
+from dyngs.core.gaussians import Gaussians
 from dyngs.io.child import python_command
 from dyngs.io.formats import usd_child
 from dyngs.io.formats.similarity import joined, similarity_of_matrix

@@ -21,7 +21,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.gaussians.adam import AdamState
+from dyngs.gaussians.parameters import AdamState
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.correction import Correction

@@ -27,8 +27,8 @@ from dyngs.core.state import tensors_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import videos
-from dyngs.gaussians.adam import AdamState
 from dyngs.gaussians.colour.affine import SATURATED, recoloured
+from dyngs.gaussians.parameters import AdamState
 from dyngs.models.correction import Correction, RenderedView
 from dyngs.models.model import Look, Loss
 from dyngs.models.renderable import Rendering

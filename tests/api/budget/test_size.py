@@ -10,7 +10,7 @@ import torch
 
 from dyngs.api.budget.size import write_within
 from dyngs.api.train import train
-from dyngs.compress.prune.stage import quality_of
+from dyngs.compress.stage import quality_of
 from dyngs.config import (
     BudgetConfig,
     Config,

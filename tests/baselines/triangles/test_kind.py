@@ -25,8 +25,8 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.models.views import training_cameras
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
-from dyngs.study.tradeoff.variant_runs import VariantRuns
-from dyngs.study.tradeoff.variants import Variant
+from dyngs.study.variant_runs import VariantRuns
+from dyngs.study.variants import Variant
 from dyngs.training.new_trainer import build
 
 STEPS = ["train.steps=120", "train.save_every=60"]
@@ -106,13 +106,13 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
 def test_its_settings_are_traded(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dyngs.study.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
+    monkeypatch.setattr("dyngs.study.measure.peak_megabytes", lambda *_: None)
     out = tmp_path / "tradeoff"
     settings = ("sh_degree=0", "storage=2", "supersampling=1", "scale=0.5", "prune")
     vary = [word for setting in settings for word in ("--vary", setting)]
     words = ["tradeoff", str(run), "--out", str(out), *vary, "--rounds", "1", "--combine", "1"]
     assert main([*words, "--require", "mb<=1", "--minimize", "mb"]) == 0
-    points = {row["name"]: row for row in json.loads((out / "tradeoff.json").read_text())["points"]}
+    points = {row["name"]: row for row in json.loads((out / "tradeoff.json").read_text())["rows"]}
     base = points["as it is"]
     assert base["psnr"] == pytest.approx(evaluate_run(run).psnr)
     assert base["gaussians"] == len(open_run(run).renderable.state()["triangles.points"].tensor)

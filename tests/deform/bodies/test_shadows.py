@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from dyngs.deform.bodies.shadows import light_left
+from dyngs.deform.bodies.field import light_left
 
 SUN = torch.tensor([0.0, 0.0, 2.0])
 BALL = torch.tensor([[0.0, 0.0, 1.0]])

@@ -15,7 +15,7 @@ from tiny_fields import cloud
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
+from dyngs.deform.bodies.paths import Shots, one_camera, shots_of
 from dyngs.gaussians.rendering import RenderOptions
 
 

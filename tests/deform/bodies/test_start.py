@@ -8,8 +8,7 @@ import torch
 from rolling_ball import rolling
 from tiny_fields import tiny_options
 
-from dyngs.deform.bodies.start import found_bodies
-from dyngs.deform.bodies.turning import angles_deg
+from dyngs.deform.bodies.start import angles_deg, found_bodies
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 

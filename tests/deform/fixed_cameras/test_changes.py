@@ -9,7 +9,7 @@ import torch
 from static_balls import BLACK, Ball, cameras, drawn, filmed
 
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.changes import LONGEST_SIDE, changes, footage_of
+from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, changes, footage_of
 
 TIMES = tuple(i / 8 for i in range(9))
 

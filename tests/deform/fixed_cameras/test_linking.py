@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from dyngs.deform.fixed_cameras.hulls import Blob
-from dyngs.deform.fixed_cameras.linking import MAX_GAP, linked
+from dyngs.deform.fixed_cameras.hulls import MAX_GAP, Blob, linked
 
 TIMES = tuple(i / 19 for i in range(20))
 RED = (0.9, 0.1, 0.1)

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from static_balls import Ball, filmed
 
-from dyngs.deform.fixed_cameras.seeds import moments_of, pays
-from dyngs.deform.fixed_cameras.start import found_tracks
+from dyngs.deform.fixed_cameras.start import found_tracks, moments_of, pays
 
 TIMES = tuple(i / 7 for i in range(8))
 BALL = Ball((0.0, 0.0, 0.0), 0.3)

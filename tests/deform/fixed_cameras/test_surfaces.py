@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from static_balls import Ball, filmed
 
-from dyngs.deform.fixed_cameras.surfaces import surface_changes
+from dyngs.deform.fixed_cameras.start import surface_changes
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 

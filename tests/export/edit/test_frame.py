@@ -37,14 +37,6 @@ def test_a_frame_is_one_similarity() -> None:
     assert Frame().similarity(None, (0.0, 1.0, 0.0)) == Similarity()
 
 
-def test_words() -> None:
-    assert direction("-y") == (0.0, -1.0, 0.0)
-    assert direction("0,1,-2") == (0.0, 1.0, -2.0)
-    assert direction("auto") == "auto"
-    assert scale_of("2.5") == 2.5
-    assert scale_of("0,0,0 -1,0,0 1.25m") == Distance((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 1.25)
-
-
 @pytest.mark.parametrize(
     ("call", "said"),
     [

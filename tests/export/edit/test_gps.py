@@ -9,10 +9,8 @@ import pytest
 from moving_scene import write_moving_run
 from PIL import Image
 
-from dyngs.cli import main
-from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
-from dyngs.export.edit.gps import east_north_up, gps_frame, position_of
+from dyngs.export.edit.gps import east_north_up, gps_frame
 from dyngs.io.formats.similarity import Similarity
 from dyngs.runs.opened import open_run
 
@@ -84,39 +82,6 @@ def test_the_error_is_stated(run: Path) -> None:
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) < 3 * tilt < 30
 
 
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [
-        (
-            {"count": 3},
-            "3 of 8 photos have a position with altitude in EXIF, and --geo exif needs 4 or more",
-        ),
-        ({"flat": True}, "stand (on|too near to) one line"),
-        ({"noise": 30.0}, "too near to one line for positions that are off by"),
-    ],
-)
-def test_positions_that_say_too_little(how: dict, said: str, run: Path) -> None:
-    stamped(run, **how)
-    with pytest.raises(DyngsError, match=said) as caught:
-        gps_frame(open_run(run))
-    assert "\n" not in str(caught.value)
-
-
-def test_what_states_no_position(tmp_path: Path) -> None:
-    path = tmp_path / "a.jpg"
-    Image.new("RGB", (8, 8)).save(path)
-    assert position_of(path) is None
-    stamp(path, -33.5, -70.25, None)
-    assert position_of(path) is None
-    stamp(path, -33.5, -70.25, -12.5)
-    assert position_of(path) == pytest.approx((-33.5, -70.25, -12.5))
-    stamp(path, 91.0, 0.0, 0.0)
-    assert position_of(path) is None
-    path.write_bytes(path.read_bytes()[:40])
-    assert position_of(path) is None
-    assert position_of(tmp_path / "none.jpg") is None
-
-
 def test_the_tangent_plane() -> None:
     """Known lengths of WGS84: a degree of latitude is 110.574 km at the equator, one of longitude
     111.320 km."""
@@ -125,17 +90,3 @@ def test_the_tangent_plane() -> None:
     np.testing.assert_allclose(near, [[0, 110.574, 0], [111.320, 0, 0], [0, 0, 5]], atol=2e-3)
     at_pole = east_north_up(np.array([[89.999, 90.0, 0.0]]), np.array([90.0, 0.0, 0.0]))
     np.testing.assert_allclose(np.linalg.norm(at_pole), 111.694, atol=2e-3)
-
-
-def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamped(run)
-    assert main(["edit", str(run), "--geo", "exif", "--out", str(tmp_path / "site")]) == 0
-    assert "the origin is at 48.13" in capsys.readouterr().out
-    opened = open_run(tmp_path / "site")
-    assert opened.edited is not None
-    assert opened.edited.fixed
-    assert opened.scaled
-    assert (
-        main(["edit", str(run), "--geo", "exif", "--up", "z", "--out", str(tmp_path / "other")])
-        == 2
-    )

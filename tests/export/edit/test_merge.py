@@ -5,16 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
-from moving_scene import row_of_balls, write_moving_run
+from moving_scene import write_moving_run
 from scaled_files import FAR
 from splat_scenes import cameras_turned, cloud, seen
 
-from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError
 from dyngs.export.edit.merge import merged
-from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import upright, write_splats
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.formats.splat_file import SplatFile
@@ -56,27 +52,3 @@ def test_scenes_far_from_the_origin_lie_as_in_the_world(tmp_path: Path) -> None:
     world = splat.frame.inverse().points(both.gaussians.means.numpy())
     np.testing.assert_allclose(world[:20], first.means.numpy(), atol=1e-6)
     np.testing.assert_allclose(world[20:], other.means.numpy() + np.array([3, -2, 1]), atol=1e-6)
-
-
-def test_other_low_pass_filters_are_told(tmp_path: Path) -> None:
-    path = write_splats(
-        tmp_path / "a.ply", SplatFile(row_of_balls(), RasterizeMode.ANTIALIASED)
-    ).path
-    told: list[str] = []
-    found = merged(SplatFile(row_of_balls()), None, (path,), told.append)
-    assert found.mode is RasterizeMode.CLASSIC
-    assert "another low-pass filter (antialiased)" in told[0]
-
-
-def test_what_cannot_be_added(tmp_path: Path) -> None:
-    def refused(path: Path, said: str) -> None:
-        with pytest.raises(DyngsError, match=said):
-            merged(SplatFile(row_of_balls()), None, (path,), print)
-
-    refused(write_moving_run(tmp_path), "moves, and --merge adds still scenes")
-    refused(tmp_path / "none.ply", "no such file")
-    path = write_splats(
-        tmp_path / "a.ply", SplatFile(Gaussians(**row_of_balls(100).tensors()))
-    ).path
-    path.write_bytes(path.read_bytes()[:2000])
-    refused(path, "is truncated|ends early|cut")

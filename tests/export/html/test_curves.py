@@ -6,9 +6,8 @@ import pytest
 import torch
 from tiny_fields import HEADS, KINDS, cloud, followed, stirred_field
 
+from dyngs.deform.control_nodes import Nodes, spline_basis
 from dyngs.deform.field import Offsets
-from dyngs.deform.nodes import Nodes
-from dyngs.deform.spline_fit import spline_basis
 from dyngs.export.html.curves import Curves, curves_of, fitted_curves
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.bake import with_harmonics
+from dyngs.gaussians.colour.network import with_harmonics
 from dyngs.gaussians.rendering import Shader
 from dyngs.ops.harmonics import evaluate_harmonics
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.view_dependence import (
+from dyngs.gaussians.colour.training import (
     MeasuredView,
     ViewDependence,
     find_view_dependent,

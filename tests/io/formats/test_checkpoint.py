@@ -78,13 +78,6 @@ def test_nerfstudio(tmp_path: Path) -> None:
     same(read_splats(tmp_path / "step-000029999.ckpt").gaussians, cloud(50, 3).replace(means=moved))
 
 
-def test_nerfstudio_without_harmonics_stores_logits_of_colours(tmp_path: Path) -> None:
-    state = nerfstudio(cloud(5, 0))
-    torch.save(state, tmp_path / "a.ckpt")
-    colours = torch.sigmoid(state["pipeline"]["_model.gauss_params.features_dc"])
-    torch.testing.assert_close(read_splats(tmp_path / "a.ckpt").gaussians.base_rgb, colours)
-
-
 def test_a_checkpoint_is_converted_upright(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -136,21 +129,6 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
             archive.writestr("a/data.pkl", content)
         with pytest.raises(DyngsError, match=r"a\.pt: (is damaged|holds no Gaussians)"):
             read_splats(path)
-
-
-def test_tensors_that_share_numbers_are_not_written_out(tmp_path: Path) -> None:
-    """An expanded tensor is a few bytes of a file, whatever its shape."""
-    whole = parameters(cloud(5, 1), False).state_dict()
-    torch.save(
-        {"splats": {**whole, "means": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt"
-    )
-    with pytest.raises(DyngsError, match=r"asks for 1,099,511,627,776 Gaussians"):
-        read_splats(tmp_path / "a.pt")
-    torch.save(
-        {"splats": {**whole, "scales": torch.zeros(1, 3).expand(1 << 40, 3)}}, tmp_path / "a.pt"
-    )
-    with pytest.raises(DyngsError, match=r"scales should hold 5 x 3 floats"):
-        read_splats(tmp_path / "a.pt")
 
 
 def test_other_checkpoints_are_refused(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import sys
 import zipfile
 from dataclasses import replace
 from importlib.util import find_spec
@@ -14,19 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scaled_files import FAR, scaled, write_far_ply
+from scaled_files import FAR, scaled
 from splat_scenes import cameras_turned, cloud, psnr, readable, seen
 
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.edit_note import note_path
 from dyngs.io.formats.formats import (
     FORMATS,
     Format,
-    format_named,
-    format_of,
-    known_format,
     moved_file,
     read_splats,
     undone_file,
@@ -35,7 +32,7 @@ from dyngs.io.formats.formats import (
 )
 from dyngs.io.formats.gltf import add_gaussians
 from dyngs.io.formats.similarity import UNMOVED, Similarity
-from dyngs.io.formats.splat_file import SplatFile, splat_options
+from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.limits import VARIABLE
 
@@ -73,35 +70,6 @@ def test_a_file_shows_what_was_written(kind: Format, tmp_path: Path) -> None:
     assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
-@pytest.mark.parametrize(
-    "suffix",
-    [
-        pytest.param(x, marks=without_usd if f.name == "usd" else ())
-        for f in FORMATS
-        for x in f.suffixes
-    ],
-)
-def test_a_full_disk_is_one_line_and_leaves_the_former_file(suffix: str, tmp_path: Path) -> None:
-    """No file may take more than 2 KB, of which the first scene needs less in every format."""
-    import resource
-
-    path = tmp_path / f"a{suffix}"
-    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
-    path.write_bytes(b"former")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, usual[1]))
-    try:
-        with pytest.raises(DyngsError) as caught:
-            write_splats(path, SplatFile(cloud(2000)))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
-    told = str(caught.value)
-    assert told.startswith(f"cannot write {path}: ")
-    assert "File too large" in told or "the disk may be full" in told
-    assert len(told) < 200 + len(str(path))
-    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"former"]
-
-
 @every
 def test_what_pointed_up_points_up_in_the_viewers_of_the_format(
     kind: Format, tmp_path: Path
@@ -130,21 +98,6 @@ def test_what_the_format_cannot_say_is_said(kind: Format, tmp_path: Path) -> Non
 
 
 @every
-def test_the_degree_that_is_asked_for(kind: Format, tmp_path: Path) -> None:
-    for degree in (1,) if kind.name == "usd" else range(kind.max_degree + 1):
-        scene = cloud(30, 1)
-        back = read_splats(
-            write_splats(file_of(kind, tmp_path), SplatFile(scene), sh_degree=degree).path
-        )
-        assert back.gaussians.sh_degree == degree
-        if degree > 1:
-            assert float(back.gaussians.sh[:, 4:].abs().max()) < 0.04  # bytes around zero
-    if kind.max_degree < 4:
-        with pytest.raises(DyngsError, match=f"at most degree {kind.max_degree}"):
-            write_splats(file_of(kind, tmp_path), SplatFile(scene), sh_degree=4)
-
-
-@every
 def test_one_gaussian_exactly_opaque_and_one_exactly_transparent(
     kind: Format, tmp_path: Path
 ) -> None:
@@ -165,13 +118,6 @@ def test_one_gaussian_exactly_opaque_and_one_exactly_transparent(
 
 
 @every
-def test_one_gaussian_alone(kind: Format, tmp_path: Path) -> None:
-    scene = cloud(1, 0)
-    back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(scene)).path)
-    torch.testing.assert_close(back.gaussians.means, scene.means, rtol=1e-3, atol=1e-3)
-
-
-@every
 def test_every_truncation_is_an_error(kind: Format, tmp_path: Path) -> None:
     path = file_of(kind, tmp_path)
     data = write_splats(path, SplatFile(cloud(40, min(1, kind.max_degree)))).path.read_bytes()
@@ -182,64 +128,6 @@ def test_every_truncation_is_an_error(kind: Format, tmp_path: Path) -> None:
         with pytest.raises(DyngsError, match="a\\.") as refused:
             read_splats(path)
         assert "\n" not in str(refused.value)
-
-
-@every
-def test_what_cannot_be_written(kind: Format, tmp_path: Path) -> None:
-    path = file_of(kind, tmp_path)
-    scene = cloud(3, 0)
-    bad = scene.replace(means=torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1, 1, 1]]))
-    for broken in (bad, scene.select(torch.zeros(0, dtype=torch.long))):
-        with pytest.raises(DyngsError, match="not written"):
-            write_splats(path, SplatFile(broken))
-    assert not path.exists()
-
-
-def test_values_that_are_not_finite_are_counted(tmp_path: Path) -> None:
-    scene = cloud(10, 0)
-    means = scene.means.clone()
-    logits = scene.logit_opacities.clone()
-    path = write_splats(tmp_path / "a.ply", SplatFile(scene)).path
-    data = bytearray(path.read_bytes())
-    row = (len(data) - data.index(b"end_header\n") - 11) // 10
-    names = ["x", "y", "z", "nx", "ny", "nz", "dc", "dc", "dc", "opacity"]
-    start = data.index(b"end_header\n") + 11
-    for i, (name, value) in enumerate(
-        (("x", torch.nan), ("opacity", torch.inf), ("opacity", torch.nan))
-    ):
-        at = start + row * i + 4 * names.index(name)
-        data[at : at + 4] = torch.tensor(value).numpy().tobytes()
-    path.write_bytes(data)
-    with pytest.raises(DyngsError, match="2 of 10 Gaussians have non-finite values"):
-        read_splats(path)
-    back = read_splats(path, nonfinite="skip")
-    assert [note.split(" Gaussians")[0] for note in back.notes] == ["1 exactly opaque", "2 of 10"]
-    assert len(back.gaussians) == 8
-    assert (means.shape, logits.shape) == ((10, 3), (10,))
-
-
-def test_suffixes() -> None:
-    assert format_of(Path("a/b.PLY")).name == "ply"
-    assert format_of(Path("b.compressed.ply")).name == "compressed-ply"
-    assert known_format(Path("b.xyz")) is None
-    assert known_format(Path(".ply")) is None
-    for name in ("b", "b.xyz"):
-        with pytest.raises(
-            DyngsError,
-            match=r"names no format of Gaussians; use one of \.compressed\.ply, \.ply, \.spz",
-        ):
-            format_of(Path(name))
-    assert [format_named(f.name) for f in FORMATS] == list(FORMATS)
-    with pytest.raises(DyngsError, match="no format 'xyz'"):
-        format_named("xyz")
-
-
-def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no such file"):
-        read_splats(tmp_path / "a.spz")
-    (tmp_path / "b.spz").mkdir()
-    with pytest.raises(DyngsError, match=r"b\.spz"):
-        read_splats(tmp_path / "b.spz")
 
 
 def test_counts_beyond_the_file_cost_nothing(
@@ -298,23 +186,6 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
         assert (back.world_offset, back.turned) == (FAR, turn.turn)
 
 
-def test_doubles_far_from_the_origin_show_the_same(tmp_path: Path) -> None:
-    near = cloud(400, 1)
-    positions = write_far_ply(tmp_path / "far.ply", SplatFile(near))
-    back = read_splats(tmp_path / "far.ply")
-    assert back.world_offset == back.file_offset
-    np.testing.assert_allclose(
-        back.gaussians.means.double().numpy() + back.file_offset, positions, rtol=0, atol=1e-6
-    )
-    assert "is subtracted from its positions" in back.notes[0]
-    x, y, z = (np.array(back.file_offset) - FAR).tolist()
-    moved = Similarity(shift=(x, y, z)).gaussians(back.gaussians)
-    assert psnr(seen(moved), seen(near)) > 70
-    again = read_splats(write_splats(tmp_path / "near.ply", back).path)
-    assert (again.world_offset, again.file_offset) == (back.world_offset, (0.0, 0.0, 0.0))
-    torch.testing.assert_close(again.gaussians.means, back.gaussians.means, rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("suffix", [".glb", pytest.param(".usda", marks=without_usd)])
 def test_nodes_far_from_the_origin_lose_nothing(suffix: str, tmp_path: Path) -> None:
     """Of other programs, which say nothing of an offset."""
@@ -357,24 +228,6 @@ def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
     assert read_splats(path).edited == UNMOVED  # another file by that name
 
 
-def test_an_edit_that_is_none_is_refused(tmp_path: Path) -> None:
-    path = write_splats(
-        tmp_path / "a.ply", moved_file(SplatFile(cloud(3)), Similarity(scale=2), None)
-    ).path
-    path.write_bytes(path.read_bytes().replace(b"edited: 1.0 0.0", b"edited: 3.0 0.0"))
-    with pytest.raises(DyngsError, match="is no similarity; remove it"):
-        read_splats(path)
-
-
-def test_large_scenes_keep_their_place_in_spz(tmp_path: Path) -> None:
-    scene = cloud(50, 0)
-    far = scene.replace(means=scene.means * 1e5)
-    back = read_splats(write_splats(tmp_path / "a.spz", SplatFile(far)).path)
-    torch.testing.assert_close(back.gaussians.means, far.means, rtol=0, atol=0.1)
-    with pytest.raises(DyngsError, match=r"a\.spz: not written: a \.spz holds positions up to 8e6"):
-        write_splats(tmp_path / "a.spz", SplatFile(scene.replace(means=scene.means * 1e8)))
-
-
 def test_spz_holds_small_scenes_and_says_where_it_does_not(tmp_path: Path) -> None:
     """Its steps are absolute: sizes from 4.5e-5 to 380."""
     scene = cloud(400)
@@ -396,17 +249,6 @@ def test_files_hold_scenes_of_any_unit(kind: Format, factor: float, tmp_path: Pa
     back = scaled(read_splats(written.path).gaussians, 1 / factor)
     least = LEAST_PSNR[kind.name] if kind.name != "spz" or factor < 1 else 30
     assert psnr(seen(back), seen(scene)) > min(least, 90)
-
-
-def test_quaternions_need_not_be_of_unit_length(tmp_path: Path) -> None:
-    scene: Gaussians = cloud(50, 0)
-    for kind in [kind for kind in readable() if kind.name != "usd"]:
-        back = read_splats(
-            write_splats(
-                file_of(kind, tmp_path), SplatFile(replace(scene, quats=scene.quats * 3))
-            ).path
-        )
-        assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
 
 
 KNOWN = Path(__file__).with_name("known")

@@ -15,8 +15,6 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.io.formats.formats import (
     GLB_OF_SPZ,
-    chosen_variant,
-    format_named,
     read_splats,
     write_splats,
 )
@@ -98,16 +96,6 @@ def test_compressions_that_are_not_read(own: dict[str, Any], problem: str, tmp_p
         read_splats(tmp_path / "a.glb")
 
 
-def test_a_damaged_spz_within_is_refused(tmp_path: Path) -> None:
-    as_cesium_writes(
-        tmp_path / "a.glb",
-        {"extensions": {SPZ: {"bufferView": 0}}},
-        packed_spz(SplatFile(cloud(50)))[:-50],
-    )
-    with pytest.raises(DyngsError, match=r"a\.glb.*truncated"):
-        read_splats(tmp_path / "a.glb")
-
-
 def test_what_is_written_compressed_comes_back(tmp_path: Path) -> None:
     scene = cloud(degree=2)
     path = tmp_path / "a.glb"
@@ -134,12 +122,3 @@ def test_what_is_written_compressed_comes_back(tmp_path: Path) -> None:
         document["accessors"][primitive["attributes"]["POSITION"]]["max"]
         == scene.means.amax(0).tolist()
     )
-
-
-def test_options_go_with_their_format() -> None:
-    assert chosen_variant(format_named("glb"), None, "spz") is GLB_OF_SPZ
-    assert chosen_variant(format_named("spz"), 3, None) is format_named("spz")
-    with pytest.raises(DyngsError, match=r"--spz-version goes with \.spz files, not with \.ply"):
-        chosen_variant(format_named("ply"), 4, None)
-    with pytest.raises(DyngsError, match=r"--compress goes with \.glb files, not with \.spz"):
-        chosen_variant(format_named("spz"), None, "spz")

@@ -15,7 +15,6 @@ from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import read_splats, write_splats
-from dyngs.io.formats.ply import write_ply
 from dyngs.io.formats.splat_file import SplatFile
 
 PLAYBOT = Path(__file__).parents[3] / "../shared/data/splats/playbot_125k_sh2.ply"
@@ -163,38 +162,6 @@ def test_other_elements_are_skipped(tmp_path) -> None:
     assert_same(gaussians, read_splats(tmp_path / "b.ply").gaussians)
 
 
-@pytest.mark.parametrize(
-    ("comment", "mode"),
-    [
-        ("SplatRenderMode: mip", RasterizeMode.ANTIALIASED),
-        ("SplatRenderMode: default", RasterizeMode.CLASSIC),
-        ("antialiased 1", RasterizeMode.ANTIALIASED),
-        ("antialiased 0", RasterizeMode.CLASSIC),
-        ("Vertical axis: y", RasterizeMode.CLASSIC),
-    ],
-)
-def test_render_mode_comments(tmp_path, comment, mode) -> None:
-    path = write_vertices(tmp_path / "a.ply", plain_columns(make_gaussians(1, 0)))
-    path.write_bytes(
-        path.read_bytes().replace(
-            b"element vertex", f"comment {comment}\r\nelement vertex".encode()
-        )
-    )
-    assert read_splats(path).mode is mode
-
-
-def test_quaternions_are_normalised(tmp_path) -> None:
-    gaussians = make_gaussians(4, 0)
-    scale = torch.tensor([1e-30, 1e30, 0.0, 7.0])[:, None]
-    path = write_vertices(
-        tmp_path / "a.ply", plain_columns(gaussians.replace(quats=gaussians.quats * scale))
-    )
-    back = read_splats(path).gaussians
-    wanted = gaussians.quats.clone()
-    wanted[2] = torch.tensor([1.0, 0, 0, 0])
-    torch.testing.assert_close(back.quats, wanted, rtol=0, atol=3e-7)
-
-
 def test_non_finite_values_are_refused_or_skipped(tmp_path) -> None:
     gaussians = make_gaussians(6, 1)
     columns = {name: x.copy() for name, x in plain_columns(gaussians).items()}
@@ -318,10 +285,3 @@ def test_bad_files_end_in_one_line(tmp_path, content, message) -> None:
     assert "\n" not in str(caught.value)
     assert "bad.ply" in str(caught.value)
     assert len(str(caught.value)) < 400
-
-
-def test_further_columns_are_skipped_by_our_reader(tmp_path) -> None:
-    gaussians = make_gaussians(5, 1)
-    column = np.arange(5)
-    write_ply(tmp_path / "x.ply", SplatFile(gaussians), {"joint_0": column, "weight_0": column / 4})
-    assert_same(read_splats(tmp_path / "x.ply").gaussians, gaussians)

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import gzip
-import json
-import os
-import shutil
 import struct
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -132,43 +128,3 @@ def test_extensions_that_are_unknown_or_damaged(tmp_path: Path) -> None:
         path.write_bytes(version_3(splat, broken))
         with pytest.raises(DyngsError, match=problem):
             read_splats(path)
-
-
-MODULES = Path(os.environ.get("DYNGS_NODE_MODULES", "node_modules"))
-"""Folder into which ``npm install three @playcanvas/splat-transform`` put its packages."""
-SPLAT_TRANSFORM = MODULES / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
-THREE = MODULES / "three" / "examples" / "jsm" / "loaders" / "SPZLoader.js"
-needs_node = pytest.mark.skipif(
-    shutil.which("node") is None or not SPLAT_TRANSFORM.is_file() or not THREE.is_file(),
-    reason="needs node, and DYNGS_NODE_MODULES with three and @playcanvas/splat-transform",
-)
-READ = """
-globalThis.self = globalThis;
-const { SPZLoader } = await import(process.argv[2]);
-const { readFileSync } = await import("fs");
-const data = new Uint8Array(readFileSync(process.argv[3]));
-const found = await new SPZLoader().parse(data.buffer);
-console.log(JSON.stringify(Array.from(found.attributes.position.array)));
-"""
-
-
-@needs_node
-def test_other_programs_read_both_versions(tmp_path: Path) -> None:
-    """Spark 2.2.0 does not read version 4, and the reader of PlayCanvas 2.23.3 nothing else."""
-    pytest.importorskip("zstandard")
-    scene = cloud(40, 1)
-    script = tmp_path / "read.mjs"
-    script.write_text(READ, encoding="utf-8")
-    for name, own in (("a3.spz", None), ("a4.spz", SPZ_4)):
-        path = write_splats(tmp_path / name, SplatFile(scene, up="y"), own=own).path
-        out = path.with_suffix(".ply")
-        subprocess.run(["node", SPLAT_TRANSFORM, "-q", path, out], check=True, timeout=60)
-        found = read_splats(out).gaussians
-        torch.testing.assert_close(found.means, scene.means, rtol=0, atol=1e-4)
-        assert psnr(seen(found), seen(scene)) > 36
-        command = ["node", script, THREE.resolve(), path]
-        shown = subprocess.run(
-            command, check=True, timeout=60, capture_output=True, text=True
-        ).stdout
-        means = np.array(json.loads(shown.splitlines()[-1])).reshape(-1, 3)
-        np.testing.assert_allclose(means, scene.means.numpy(), atol=1e-4)

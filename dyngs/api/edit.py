@@ -1,0 +1,337 @@
+"""One command's edits of a run or a file of Gaussians, in their order, and the file or run that
+they end in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dyngs.api.edited_run import write_edited_run
+from dyngs.compress.clean import cleaned_file, cleaned_run
+from dyngs.core.errors import DyngsError, counted, show
+from dyngs.export.edit.crop import Region, held_by
+from dyngs.export.edit.frame import Frame, GeoFrame
+from dyngs.export.edit.gps import gps_frame
+from dyngs.export.edit.merge import merged
+from dyngs.export.redrawn import Redrawn, compare_run, compare_splats
+from dyngs.export.splat_files import (
+    SUFFIX,
+    UP,
+    Writing,
+    read_moment,
+    splats_at,
+    up_of,
+    write_moving,
+)
+from dyngs.gaussians.rendering import drawing_options
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.io.formats.formats import (
+    all_suffixes,
+    format_of,
+    format_to_read,
+    known_format,
+    moved_file,
+    read_splats,
+    turned_file,
+    undone_file,
+    write_splats,
+)
+from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
+from dyngs.io.formats.splat_file import SplatFile
+from dyngs.runs.frame import RunFrame
+from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import Opened, open_scene, opened_scene
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Edits:
+    """What is to be done, in this order; the defaults do nothing.
+
+    Attributes:
+        max_loss: PSNR that cleaning may cost, dB; None: it is not cleaned.
+        region: part that is kept, or left out where ``outside``.
+        merge: files or runs whose Gaussians are added.
+        frame, geo: the frame that all of it gets.
+        gps: ``geo`` is found from the positions in the photos of the run.
+        undo: it gets the frame that it had before it was edited first.
+        time: in [0, 1], at which a moving scene is written.
+        threads: number of them that cleaning takes; 0: one per core.
+    """
+
+    max_loss: float | None = None
+    region: Region | None = None
+    outside: bool = False
+    merge: tuple[Path, ...] = ()
+    frame: Frame = field(default_factory=Frame)
+    geo: GeoFrame | None = None
+    gps: bool = False
+    undo: bool = False
+    time: float | None = None
+    threads: int = 0
+
+
+@dataclass(frozen=True)
+class EditedFile:
+    """A file that was written, how it differs from the edited scene when drawn, and what the format
+    does not hold.
+
+    Of a run, which holds all of it, there is only the path.
+    """
+
+    path: Path
+    redrawn: Redrawn | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What is edited: a scene; of a file also its contents, and what is up in files of its format
+    by default.
+
+    ``rows``: (N,) indices of the Gaussians that are left, of a run; None: all.
+    """
+
+    opened: Opened
+    splat: SplatFile | None = None
+    usual: str | None = None
+    rows: torch.Tensor | None = None
+
+    @property
+    def fixed(self) -> bool:
+        """Whether its axes stay, as control points have left them."""
+        if self.splat is not None:
+            return self.splat.up != self.usual
+        return self.opened.edited is not None and self.opened.edited.fixed
+
+    def kept(self, rows: torch.Tensor) -> _Source:
+        """Return the Gaussians where ``rows`` (N,) is true."""
+        scene: GaussianScene = self.opened.scene
+        before = torch.arange(len(scene), device="cpu") if self.rows is None else self.rows
+        return replace(
+            self,
+            opened=self.opened.showing(scene.select(rows.to(scene.device))),
+            rows=before[rows.cpu()],
+        )
+
+    def at(self, time: float) -> SplatFile:
+        """Return the Gaussians of one time, in the axes of the source."""
+        if self.splat is not None:
+            return replace(self.splat, gaussians=self.opened.scene.gaussians)
+        return splats_at(self.opened, self.opened.scene, time)
+
+
+def edit_scene(
+    source: Path,
+    out: Path,
+    edits: Edits,
+    reads: Sequence[Path] = (),
+    data_root: Path | None = None,
+    tell: Tell = show,
+) -> EditedFile:
+    """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the
+    format, none is a run.
+
+    ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done, and
+    nothing is written.
+    """
+    moves = out.name.lower().endswith(SUFFIX)
+    if known_format(out) is None and not moves and out.suffix:
+        wanted = f"give a name in {all_suffixes()} or {SUFFIX}, or without a suffix for a run"
+        raise DyngsError(f"{out}: edits end in a file of Gaussians or a run; {wanted}")
+    inputs_of(source, *edits.merge, *reads).require_output(out)
+    found = _opened(source, data_root)
+    for note in found.opened.notes:
+        tell(note)
+    if edits.gps:
+        edits = replace(edits, geo=gps_frame(found.opened))
+    if edits.max_loss is not None:
+        if found.splat is None:
+            found = found.kept(cleaned_run(source, edits.max_loss, edits.threads, data_root, tell))
+        else:
+            found = found.kept(cleaned_file(found.opened.scene.gaussians, tell))
+    found = _cropped(found, source, edits, tell)
+    if not out.suffix:
+        return EditedFile(_written_run(found, source, out, edits, data_root, tell))
+    return _written_moving(found, out, edits, tell) if moves else _written(found, out, edits, tell)
+
+
+def write_part(
+    opened: Opened, rows: torch.Tensor, out: Path, time: float | None = None
+) -> EditedFile:
+    """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of
+    the format.
+
+    Raises DyngsError: it was opened from no file or run, or cannot be written.
+    """
+    if opened.path is None:
+        raise DyngsError("this scene has no file or run of its own yet, so it cannot be edited")
+    found = _opened(opened.path, None) if opened.captured is None else _Source(opened)
+    return _written(found.kept(rows), out, Edits(time=time), lambda _: None)
+
+
+def _opened(source: Path, data_root: Path | None) -> _Source:
+    own = format_to_read(source)
+    if own is not None and data_root is None:
+        splat = read_splats(source, nonfinite="skip")
+        opened = opened_scene(
+            StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), source
+        )
+        info = replace(opened.info, world_offset=splat.file_offset)
+        return _Source(
+            replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, own.up
+        )
+    return _Source(open_scene(source, data_root=data_root))
+
+
+def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
+    if edits.region is None:
+        return found
+    scene: GaussianScene = found.opened.scene
+    rows = held_by(edits.region, scene, found.opened.world) ^ edits.outside
+    count = int(rows.sum())
+    if not count:
+        points = found.opened.world.points(scene.at(None).means.cpu().numpy())
+        low, high = (
+            ", ".join(f"{x:.10g}" for x in end.tolist()) for end in (points.min(0), points.max(0))
+        )
+        raise DyngsError(
+            f"{source}: --crop leaves none of {counted(len(scene), 'Gaussian')}; they lie between {low} and {high}"
+        )
+    tell(f"crop: {count:,} of {counted(len(scene), 'Gaussian')} stay")
+    return found.kept(rows)
+
+
+def _written(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
+    """Write a file of Gaussians, at one time of what moves."""
+    moving = not found.opened.scene.is_static
+    direction = _up(found, edits.frame)
+    if moving and edits.merge:
+        raise DyngsError(
+            "--merge adds to still scenes, and this one moves; `dyngs export --time T` makes one of it"
+        )
+    if moving and edits.time is None:
+        tell(
+            f"this is time 0 of a moving scene; --time T gives another one, --out {out.stem}{SUFFIX} all of them"
+        )
+    splat = found.at(edits.time or 0.0)
+    if edits.merge:
+        splat = merged(splat, direction, edits.merge, tell)
+    own = format_of(out)
+    if edits.undo:
+        if splat.edited == UNMOVED:
+            raise DyngsError(
+                "--undo: nothing says that this was edited; `dyngs edit` stores it in what it writes"
+            )
+        edited = undone_file(splat)
+        tell("the frame is that of before the first edit")
+    else:
+        how, up = _frame(found, edits, direction, own.up)
+        edited = (
+            moved_file(splat, how, up) if _has_frame(edits) else turned_file(splat, how.turn, up)
+        )
+        _tell_frame(edits, up, own.up, tell)
+        if edits.geo is not None and any(edits.geo.offset):
+            edited = replace(edited, comments=(*edited.comments, edits.geo.comment))
+    written = write_splats(out, edited)
+    return EditedFile(written.path, compare_splats(splat, written), written.notes)
+
+
+def _written_moving(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
+    """Write all training times of a moving scene."""
+    scene = found.opened.scene
+    if scene.is_static or edits.merge or edits.undo or edits.time is not None:
+        what = (
+            "a scene that moves"
+            if scene.is_static
+            else "all times, without --merge, --undo and --time"
+        )
+        raise DyngsError(f"{out}: {SUFFIX} holds {what}; give a name in {all_suffixes()}")
+    how, up = _frame(found, edits, _up(found, edits.frame), UP)
+    _tell_frame(edits, up, UP, tell)
+    writing = Writing(edit=how, up=up) if _has_frame(edits) else Writing(turn=how.turn, up=up)
+    written = write_moving(found.opened, out, scene.times, how=writing)
+    redrawn = compare_run(
+        found.opened, scene, scene.times[0], written.splats[0], read_moment(out, 0)
+    )
+    return EditedFile(out, redrawn, written.notes)
+
+
+def _written_run(
+    found: _Source, source: Path, out: Path, edits: Edits, data_root: Path | None, tell: Tell
+) -> Path:
+    """Write a run, which keeps all that it has learned."""
+    opened = found.opened
+    if opened.captured is None or edits.merge or edits.time is not None:
+        what = "a run of its own, of a run, without --merge and --time"
+        raise DyngsError(
+            f"{out}: a name without a suffix is {what}; give a name in {all_suffixes()}"
+        )
+    frame = opened.edited
+    if edits.undo:
+        if frame is None:
+            raise DyngsError("--undo: the frame of this run was not edited")
+        frame = None
+        tell("the frame is that of before the first edit")
+    elif _has_frame(edits):
+        how, up = _frame(found, edits, _up(found, edits.frame), "z")
+        offset = (0.0, 0.0, 0.0) if edits.geo is None else edits.geo.offset
+        fixed = edits.geo is not None or (found.fixed and edits.frame.up is None)
+        frame = RunFrame(how.after(opened.frame), offset, up, fixed)
+        _tell_frame(edits, up, "z", tell)
+    return write_edited_run(source, out, found.rows, frame, data_root)
+
+
+def _has_frame(edits: Edits) -> bool:
+    return edits.geo is not None or edits.frame != Frame()
+
+
+def _up(found: _Source, frame: Frame) -> tuple[float, ...] | None:
+    """Return the direction (3,) of the source that is up: as told, else as known; None: nothing
+    says."""
+    if isinstance(frame.up, tuple):
+        return frame.up
+    if frame.up is not None:
+        known = None if found.splat is not None else found.opened.up
+        if known is None:
+            raise DyngsError(
+                "--up auto needs the cameras of a run, and there are none; give the direction, as --up=-y"
+            )
+        return tuple((found.opened.frame.rotation @ known[0]).tolist())
+    known_axis = up_of(found.opened)
+    return None if known_axis is None else known_axis[0]
+
+
+def _frame(
+    found: _Source, edits: Edits, direction: tuple[float, ...] | None, wanted: str
+) -> tuple[Similarity, str | None]:
+    """Return the similarity to the frame that is asked for, and what is up there; ``wanted``: up
+    for viewers."""
+    if edits.geo is not None:
+        x, y, z = found.opened.world_offset.tolist()
+        return edits.geo.similarity.after(Similarity(shift=(x, y, z))), "z"
+    x, y, z = (np.array(edits.frame.origin or (0.0, 0.0, 0.0)) - found.opened.world_offset).tolist()
+    frame = edits.frame if edits.frame.origin is None else replace(edits.frame, origin=(x, y, z))
+    if found.fixed and frame.up is None:
+        return frame.similarity(None, ()), found.opened.stated_up
+    return frame.similarity(direction, axis_of(wanted)), None if direction is None else wanted
+
+
+def _tell_frame(edits: Edits, up: str | None, wanted: str, tell: Tell) -> None:
+    if edits.geo is not None:
+        for line in edits.geo.lines:
+            tell(line)
+        if wanted != up:
+            tell(
+                f"axes are those of the control points, with z up; viewers of the format take {wanted} for up"
+            )
+    elif up is None:
+        tell("nothing says which way is up, so nothing is turned; --up tells it")
+    else:
+        tell(f"up is {up} in what is written")

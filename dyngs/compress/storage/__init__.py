@@ -1,1 +1,0 @@
-"""The quantised scene file `scene.dyngs`."""

@@ -1,0 +1,130 @@
+"""Fields that are networks: HexPlane (4DGS: Wu et al. 2024) and a perceptron (Deformable-3DGS: Yang et al. 2024)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dyngs.config import HexplaneField, MlpField
+from dyngs.deform.field import (
+    MAX_KEY_TIMES,
+    Decoder,
+    DeformationField,
+    FieldSetup,
+    Offsets,
+    chosen,
+    head_sizes,
+    split_heads,
+)
+from dyngs.gaussians.parameters import Parameters
+from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
+
+WEIGHTS = (1e-4, 0.01, 1e-4)
+"""Of the smoothness of space planes, of that along time, and of the sparsity of planes with time
+(Wu et al.)."""
+LR_DECAY = 0.01  # Ratio of the last to the first learning rate
+SPACE_RANGE = (0.1, 0.5)
+"""Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not
+depend on time."""
+
+
+class Hexplane(DeformationField):
+    """Features from six planes per level, decoded into offsets.
+
+    Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the
+    field starts as the identity. Each head has as many hidden units as the trunk; the last layer
+    may mix them (in Wu et al. it is block-diagonal).
+    """
+
+    def __init__(
+        self, options: HexplaneField, setup: FieldSetup, generator: torch.Generator
+    ) -> None:
+        self.options, self.setup = options, setup
+        tensors: dict[str, Tensor] = {}
+        rows = time_rows(options, setup.num_times)
+        for level, multiplier in enumerate(options.levels):
+            side = options.resolution * multiplier
+            low, high = SPACE_RANGE
+            space = (
+                torch.rand((3, side, side, options.channels), generator=generator, device="cpu")
+                * (high - low)
+                + low
+            )
+            tensors[f"space{level}"] = space
+            tensors[f"time{level}"] = torch.ones(3, rows, side, options.channels, device="cpu")
+        hidden = [options.width] * options.depth + [options.width * len(head_sizes(options))]
+        self.decoder = Decoder(options.channels * len(options.levels), hidden, options)
+        rates = dict.fromkeys(tensors, options.lr_planes * setup.extent)
+        weights = self.decoder.start_values(generator)
+        rates |= dict.fromkeys(weights, options.lr_decoder * setup.extent)
+        self.parameters = Parameters(tensors | weights, rates, LR_DECAY)
+
+    @property
+    def levels(self) -> list[PlaneLevel]:
+        indices = range(len(self.options.levels))
+        return [
+            PlaneLevel(self.parameters[f"space{i}"], self.parameters[f"time{i}"]) for i in indices
+        ]
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        coords = self.setup.normalized(chosen(means.detach(), rows))
+        features = hexplane_features(coords, time, self.levels)
+        return split_heads(self.decoder(features, self.parameters), self.options)
+
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        return {"plane smoothness": plane_penalty(self.levels, WEIGHTS)}
+
+    @torch.no_grad()
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        """Copy the outermost rows of time that have been trained to those that will be next."""
+        for level in self.levels:
+            planes = level.time.data
+            last = level.time.shape[1] - 1
+            low = max(math.floor(seen[0] * last), 0)
+            high = min(math.ceil(seen[1] * last), last)
+            planes[:, max(math.floor(soon[0] * last), 0) : low] = planes[:, low, None]
+            planes[:, high + 1 : math.ceil(soon[1] * last) + 1] = planes[:, high, None]
+
+
+def time_rows(options: HexplaneField, num_times: int) -> int:
+    """Return the number of rows of the planes with time: as configured, or half as many as times, 2
+    at least."""
+    return options.time_resolution or min(max(2, (num_times + 1) // 2), MAX_KEY_TIMES)
+
+
+SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # Octaves of the positional encodings
+MLP_LR_DECAY = 0.002  # Ratio of the last to the first learning rate
+# The input is fed once more into this layer (counted from 0), where there are that many hidden ones
+SKIP_LAYER = 5
+
+
+class Mlp(DeformationField):
+    """Offsets by a deep network; starts as the identity, because its last layer starts at zero.
+
+    Differs from Deformable-3DGS in two small ways: time is encoded like position instead of by a
+    network of its own, and scales change in the logarithm, so that they stay positive.
+    """
+
+    def __init__(self, options: MlpField, setup: FieldSetup, generator: torch.Generator) -> None:
+        self.options, self.setup = options, setup
+        inputs = 3 * (1 + 2 * SPACE_FREQUENCIES) + 1 + 2 * TIME_FREQUENCIES
+        skip = SKIP_LAYER if options.depth > SKIP_LAYER else None
+        self.decoder = Decoder(inputs, [options.width] * options.depth, options, skip=skip)
+        weights = self.decoder.start_values(generator)
+        self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), MLP_LR_DECAY)
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        space = encoded(self.setup.normalized(chosen(means.detach(), rows)), SPACE_FREQUENCIES)
+        moment = encoded(space.new_full((1, 1), time), TIME_FREQUENCIES)
+        features = torch.cat([space, moment.expand(len(space), -1)], dim=1)
+        return split_heads(self.decoder(features, self.parameters), self.options)
+
+
+def encoded(x: Tensor, num_frequencies: int) -> Tensor:
+    """Return (M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF:
+    Mildenhall et al. 2020)."""
+    octaves = 2.0 ** torch.arange(num_frequencies, dtype=x.dtype, device=x.device)
+    angles = (x[:, None, :] * octaves[:, None]).flatten(1)
+    return torch.cat([x, angles.sin(), angles.cos()], dim=1)

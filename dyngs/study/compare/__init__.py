@@ -1,2 +1,0 @@
-"""Several models on one bench: trained on one capture with the same time, steps or size, and
-compared."""

@@ -1,0 +1,337 @@
+"""The report of a study: its table as .csv, .json and .md, a page as .html, and, with matplotlib of
+the extra ``plots``, a plot as .svg and .png."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dyngs.core.errors import escaped, printable
+from dyngs.export.html.template import filled, script_safe, source_hash
+from dyngs.io.write import atomic_file, write_text
+from dyngs.study.measure import TRUTH, Measurement
+from dyngs.study.sweep import ExchangeRate, Row, pareto_mask
+from dyngs.study.variants import SEVERAL
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'"
+MODEL_COLUMNS = [
+    "psnr",
+    "ssim",
+    "lpips",
+    "psnr_foreground",
+    "psnr_moving",
+    "fps",
+    "mb",
+    "gaussians",
+    "steps",
+    "seconds",
+]
+VARIANT_COLUMNS = ["psnr", "ssim", "lpips", "fps", "gain", "mb", "memory_mb", "gaussians"]
+_LABELS = {
+    "psnr": ("PSNR", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "lpips": ("LPIPS", ".4f"),
+    "psnr_foreground": ("foregr.", ".2f"),
+    "psnr_moving": ("moving", ".2f"),
+    "fps": ("fps", ".1f"),
+    "gain": ("speed x", ".2f"),
+    "mb": ("MB", ".2f"),
+    "memory_mb": ("RAM MB", ".0f"),
+    "gaussians": ("Gaussians", ",.0f"),
+    "steps": ("steps", ",.0f"),
+    "seconds": ("s", ".0f"),
+}
+_HERE = Path(__file__).parent
+Cells = Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts; ``marked``: which rows stand out."""
+
+    title: str
+    head: Sequence[str]
+    cells: Cells
+    marked: Sequence[bool] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a report is made of; ``views``: name, and the name and PSNR of each image of it, whose
+    files are in ``images``."""
+
+    title: str
+    about: str
+    rows: Sequence[Row]
+    tables: Sequence[Table]
+    values: Mapping[str, Any] = field(default_factory=dict)  # further ones of the .json
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    views: Sequence[Mapping[str, Any]] = ()
+    figure: Figure | None = None
+
+
+def can_plot() -> bool:
+    return find_spec("matplotlib") is not None
+
+
+def scores_table(title: str, rows: Sequence[Row], columns: Sequence[str]) -> Table:
+    """Return a table of scenes, without columns in which none has a figure; the Pareto front is
+    marked."""
+    shown = [key for key in columns if any(row[key] is not None for row in rows)]
+    cells = [
+        [
+            row["name"],
+            *("-" if row[key] is None else format(row[key], _LABELS[key][1]) for key in shown),
+        ]
+        for row in rows
+    ]
+    head = ["", *(_LABELS[key][0] for key in shown)]
+    title += "; * Pareto front of PSNR, speed and size"
+    return Table(title, head, cells, [row["on_front"] for row in rows])
+
+
+def exchange_table(rates: Sequence[ExchangeRate]) -> Table:
+    cells = []
+    for rate in rates:
+        costs = (
+            "no gain" if x is None else f"{x:+.2f}" for x in (rate.db_per_speed, rate.db_per_size)
+        )
+        cells.append([rate.setting, *costs, f"{rate.speed:.2f}", f"{rate.size:.2f}"])
+    costs = ("dB lost per doubled speed", "dB lost per halved size")
+    head = ("setting", *costs, "most speed, times", "most size, times")
+    return Table("each setting alone", head, cells)
+
+
+def shown_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:
+    """Return the views that a page shows, each with its images: the truth first, then those of the
+    models."""
+
+    def image(name: str, index: int) -> str:
+        content = (out / "images" / name / f"{index:02d}.png").read_bytes()
+        return f"data:image/png;base64,{base64.b64encode(content).decode()}"
+
+    return [
+        {
+            "name": name,
+            "truth": image(TRUTH, index),
+            "models": [
+                {
+                    "name": result.name,
+                    "psnr": result.views[index][1],
+                    "image": image(result.name, index),
+                }
+                for result in results
+            ],
+        }
+        for index, (name, _) in enumerate(results[0].views)
+    ]
+
+
+def write_report(stem: Path, report: Report) -> list[Path]:
+    """Write the files of a report, whose path without a suffix is ``stem``; return their paths."""
+    left_out = "".join(
+        f"\nLeft out: {markdown_text(f'{name}: {why}')}\n" for name, why in report.left_out.items()
+    )
+    tables = "\n".join(markdown_table(table.head, table.cells) for table in report.tables)
+    svg = "" if report.figure is None else svg_of(report.figure)
+    values = {"rows": list(report.rows), **report.values, "left_out": dict(report.left_out)}
+    texts = {
+        "csv": csv_text(report.rows),
+        "json": json.dumps(values, indent=2, allow_nan=False) + "\n",
+        "md": f"{markdown_text(report.about)}\n\n{tables}{left_out}",
+        "html": page_text(report, svg),
+    }
+    texts |= {"svg": svg} if svg else {}
+    paths = []
+    for suffix, text in texts.items():
+        paths.append(stem.parent / f"{stem.name}.{suffix}")
+        write_text(paths[-1], text)
+    if report.figure is not None:
+        paths.append(stem.parent / f"{stem.name}.png")
+        with atomic_file(paths[-1]) as temporary:
+            report.figure.savefig(temporary, format="png", dpi=200, metadata={"Software": None})
+    return paths
+
+
+def page_text(report: Report, svg: str) -> str:
+    """Return a page with tables, the plot as SVG or "", and synchronised crops, which asks no host
+    for anything."""
+    script = _file("page.js") if report.views else ""
+    left_out = "".join(
+        f"<p>Left out: <b>{escape(name)}</b>: {escape(why)}</p>"
+        for name, why in report.left_out.items()
+    )
+    tables = "".join(
+        f"<h2>{escape(table.title)}</h2>{html_table(table.head, table.cells, table.marked)}"
+        for table in report.tables
+    )
+    pieces = {
+        "title": escape(report.title),
+        "about": escape(report.about),
+        "style": _file("page.css"),
+        "tables": tables,
+        "left_out": left_out,
+        "plot": svg,
+        "crops": _file("crops.html") if report.views else "",
+        "views": script_safe(report.views),
+        "script": script,
+        "script_hash": source_hash(script),
+    }
+    return filled(_file("page.html"), pieces)
+
+
+def _file(name: str) -> str:
+    return (_HERE / name).read_text(encoding="utf-8")
+
+
+# Tables as texts
+
+
+def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
+    """Return rows, at least one, whose keys are the columns.
+
+    Texts that a spreadsheet would take for formulas begin with an apostrophe.
+    """
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({key: _no_formula(value) for key, value in row.items()} for row in rows)
+    return table.getvalue()
+
+
+def _no_formula(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    return escaped(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
+
+
+def html_table(head: Sequence[str], cells: Cells, marked: Sequence[bool] = ()) -> str:
+    def line(cell: str, texts: Sequence[str], mark: bool) -> str:
+        inner = "".join(f"<{cell}>{escape(text)}</{cell}>" for text in texts)
+        return f"<tr{' class=marked' if mark else ''}>{inner}</tr>"
+
+    marks = marked or [False] * len(cells)
+    lines = [line("td", row, mark) for row, mark in zip(cells, marks, strict=True)]
+    return "\n".join(["<table>", line("th", head, False), *lines, "</table>"])
+
+
+def markdown_table(head: Sequence[str], cells: Cells) -> str:
+    rows = [head, ["---"] * len(head), *cells]
+    return "".join("| " + " | ".join(map(markdown_text, row)) + " |\n" for row in rows)
+
+
+def markdown_text(text: str) -> str:
+    """Return ``text`` as one line of Markdown in which names are no HTML, links or columns."""
+    return re.sub(r"([\\`*<>\[\]|&])", r"\\\1", printable(text))
+
+
+# Plots
+
+
+def svg_of(figure: Figure) -> str:
+    """Return a figure as an SVG element, whose points have their labels as tooltips; equal figures
+    give equal text."""
+    import matplotlib
+
+    file = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "dyngs", "svg.fonttype": "none"}):
+        figure.savefig(file, format="svg", metadata={"Date": None})
+    text = file.getvalue()
+    text = text[text.index("<svg") :]
+    tips = {line.get_gid() for axes in figure.axes for line in axes.lines if line.get_gid()}
+    for tip in map(str, tips):
+        text = text.replace(f'<g id="{tip}">', f"<g><title>{escape(tip)}</title>")
+    return text
+
+
+def _logarithmic(axes: Axes, label: str, title: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.6g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="#e4e4e4")
+    axes.set_title(title, loc="left", fontweight="bold")
+    axes.set_xlabel(f"{label}, logarithmic")
+    axes.set_ylabel("dB")
+
+
+def plot_curves(results: Sequence[Measurement]) -> Figure:
+    """Return quality over seconds, a line per model."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for result in results:
+        points = [point for point in result.curve if point.seconds > 0]
+        seconds = [point.seconds for point in points]
+        axes.plot(seconds, [point.psnr for point in points], "o-", ms=3, label=result.name)
+    _logarithmic(axes, "seconds of training", "PSNR of some held-out views while training")
+    axes.legend(frameon=False)
+    return figure
+
+
+def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
+    """Return two panels, PSNR against speed and against size, and a legend; ``settings``: of each
+    row.
+
+    A thin line joins the run with the values of one setting in their order; the thick grey line is
+    the Pareto front of the two axes. Values that are not positive are left out of the logarithmic
+    axes. The run itself comes first.
+    """
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    names = sorted(dict.fromkeys(settings), key=lambda name: name == SEVERAL)
+    shades = colormaps["tab20"].resampled(20)
+    colours: dict[str, Any] = {name: shades(i % 20) for i, name in enumerate(names)}
+    colours |= {"": "#222222", SEVERAL: "#888888"}
+    figure = Figure(figsize=(10.4, 4.6), layout="constrained")
+    speed, size = figure.subplots(1, 2)
+    for axes, key, sign, title, label in (
+        (speed, "fps", 1, "PSNR and speed", "frames per second (more is better)"),
+        (size, "mb", -1, "PSNR and size", "MB on disk (less is better)"),
+    ):
+        _logarithmic(axes, label, title)
+        axes.margins(0.06)
+        shown = [(row, name) for row, name in zip(rows, settings, strict=True) if row[key] > 0]
+        best = pareto_mask([(row["psnr"], sign * row[key]) for row, _ in shown])
+        front = sorted(
+            (row[key], row["psnr"]) for (row, _), on in zip(shown, best, strict=True) if on
+        )
+        axes.plot([x for x, _ in front], [y for _, y in front], color="#d4d4d4", linewidth=5)
+        for setting in names:
+            if setting not in ("", SEVERAL):
+                joined = [row for row, name in shown if name in ("", setting)]
+                places = [row[key] for row in joined], [row["psnr"] for row in joined]
+                axes.plot(*places, color=colours[setting], linewidth=0.75)
+        for row, name in reversed(shown):  # draws the run itself on top
+            axes.plot(
+                row[key],
+                row["psnr"],
+                "o",
+                color=colours[name],
+                markeredgecolor="white",
+                ms=7 if name else 9,
+                gid=f"{row['name']}: {row['psnr']:.2f} dB, {row['fps']:.1f} fps, {row['mb']:.2f} MB",
+            )
+    handles = [
+        speed.plot([], [], "o", color=colours[name], label=name or "the run itself")[0]
+        for name in names
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+    return figure

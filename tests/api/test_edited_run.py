@@ -1,0 +1,123 @@
+"""Edited runs: one similarity in all that leaves them, and nothing lost on the way back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import write_moving_run
+
+from dyngs.api.edit import Edits, edit_scene
+from dyngs.core.errors import DyngsError
+from dyngs.export.cameras import write_cameras
+from dyngs.export.edit.frame import Frame
+from dyngs.export.splat_files import AS_THEY_ARE, splats_at, tracks_of, write_run_splats, writing_of
+from dyngs.gaussians.rendering import render, splat_options
+from dyngs.io.formats.formats import read_splats
+from dyngs.io.formats.similarity import Similarity
+from dyngs.models.views import training_cameras
+from dyngs.runs.opened import Opened, open_run
+
+EDITS = Edits(frame=Frame(up=(0.0, 0.6, 0.8), origin=(0.5, 0.25, 0.0), scale=3.0))
+
+
+def silent(text: str) -> None:
+    """What is told does not matter here."""
+
+
+def edited(run: Path, edits: Edits = EDITS, name: str = "edited") -> Path:
+    return edit_scene(run, run.parent / name, edits, tell=silent).path
+
+
+def expected(run: Path) -> Similarity:
+    return EDITS.frame.similarity((0.0, 0.6, 0.8), (0.0, 0.0, 1.0))
+
+
+def test_files_of_gaussians_cameras_and_tracks_move_as_one(tmp_path: Path) -> None:
+    """What exported cameras see of exported Gaussians is what cameras of the capture see of the
+    scene."""
+    run = write_moving_run(tmp_path)
+    opened = open_run(edited(run))
+    how = expected(run)
+    times = (0.0, 0.75)
+    wanted = [how.points(opened.scene.at(t).means.numpy()) for t in times]
+    tracks = tracks_of(opened.scene, times, opened.world)
+    for i, found in enumerate(wanted):
+        np.testing.assert_allclose(tracks.positions[:, i], found, atol=1e-5)
+    file = write_run_splats(opened, tmp_path / "a.ply", 0.75).path
+    read = read_splats(file)
+    np.testing.assert_allclose(read.gaussians.means.numpy(), wanted[1], atol=1e-5)
+    path = write_cameras(
+        tmp_path / "cameras" / "transforms.json",
+        opened.capture,
+        opened.capture.splits,
+        opened.world,
+    )
+    frames = json.loads(path.read_text())["frames"]
+    cameras = training_cameras(opened.capture.splits["train"][:1], opened.config.data)[0]
+    pose = np.array(frames[0]["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
+    there = replace(cameras, cam_from_world=torch.from_numpy(np.linalg.inv(pose)).float()[None])
+    options = replace(splat_options(read), near=0.6)
+    seen = render(read.gaussians, there, options, background=torch.ones(3)).rgb
+    torch.testing.assert_close(seen, opened.scene.render(cameras, 0.75).rgb, rtol=0, atol=2e-4)
+    assert (seen < 0.9).any()
+
+
+def test_files_have_the_up_of_their_format_and_can_be_undone(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path)
+    opened = open_run(edited(run))
+    assert opened.up is not None
+    np.testing.assert_allclose(opened.up[0], [0.0, 0.6, 0.8], atol=1e-7)
+    how, line = writing_of(opened, "-y")
+    assert line == "up is -y in the file (turned, it was z in the edited run, says the edit)"
+    splat = splats_at(opened, opened.scene, 0.0, how)
+    np.testing.assert_allclose(splat.frame.rotation @ [0.0, 0.6, 0.8], [0, -1, 0], atol=1e-7)
+    back = splat.edited.inverse().gaussians(splat.gaussians)
+    torch.testing.assert_close(back.means, opened.scene.at(0.0).means, rtol=0, atol=1e-5)
+    assert writing_of(opened, "-y", up="keep")[0] == replace(AS_THEY_ARE, up="z")
+
+
+def test_edits_add_up_and_are_undone_to_the_bytes(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path, offset=(100.0, 0.0, 0.0))
+    once = edited(run, replace(EDITS, frame=replace(EDITS.frame, origin=(100.5, 0.25, 0.0))))
+    np.testing.assert_allclose(
+        open_run(once).frame.points(np.array([0.5, 0.25, 0.0])), 0, atol=1e-9
+    )
+    twice = open_run(edited(once, Edits(frame=Frame(scale=0.5, origin=(1.0, 2.0, 3.0))), "twice"))
+    assert twice.frame.scale == pytest.approx(1.5)
+    np.testing.assert_allclose(
+        twice.world.points(open_run(once).frame.inverse().points(np.array([1.0, 2, 3]))),
+        0,
+        atol=1e-12,
+    )
+    assert twice.stated_up == "z"
+    back = edited(tmp_path / "twice", Edits(undo=True), "back")
+    assert open_run(back).edited is None
+    first, last = (next((folder / "checkpoints").iterdir()).read_bytes() for folder in (run, back))
+    assert first == last
+    with pytest.raises(DyngsError, match="the frame of this run was not edited"):
+        edited(back, Edits(undo=True), "more")
+    assert not (tmp_path / "more").exists()
+
+
+def test_what_is_no_run(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path)
+    file = write_run_splats(open_run(run), tmp_path / "a.ply").path
+    for source, edits, said in (
+        (file, EDITS, "a name without a suffix is a run of its own"),
+        (run, Edits(merge=(file,)), "without --merge and --time"),
+        (run, Edits(time=0.5), "without --merge and --time"),
+    ):
+        with pytest.raises(DyngsError, match=said):
+            edit_scene(source, tmp_path / "new", edits, tell=silent)
+        assert not (tmp_path / "new").exists()
+    taken = edited(run)
+    with pytest.raises(DyngsError, match="exists already"):
+        edited(run)
+    with pytest.raises(DyngsError, match="exists already"):
+        edit_scene(run, run, EDITS, tell=silent)
+    assert isinstance(open_run(taken), Opened)

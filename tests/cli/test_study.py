@@ -1,0 +1,363 @@
+"""``dyngs compare`` and ``dyngs tradeoff`` as a user calls them."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moving_scene import write_moving_run
+from PIL import Image
+from refused import error_line
+from tiny_stereo import stereo_config, stereo_people
+from toy_kind import registered
+
+from dyngs.api.budget import time as budget_time
+from dyngs.api.train import train
+from dyngs.cli import main
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.evaluate.report import evaluate_run
+from dyngs.io.lock import LOCK_NAME, writing
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.study import models
+from dyngs.study.measure import TRUTH
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+OPTIONS = ("--steps", "20", "--threads", "1", "init.num_random=100", "--views", "2")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("captures") / "box"
+    write_still_capture(folder, StillOptions(size=16, num_train=6, num_test=3, samples=1))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out") / "comparison"
+    assert (
+        main(
+            ["compare", str(capture), "--models", "static,mip,dynamic", *OPTIONS, "--out", str(out)]
+        )
+        == 0
+    )
+    return out
+
+
+def test_a_table_curves_and_a_page(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = list(csv.DictReader((finished / "comparison.csv").read_text().splitlines()))
+    assert {row["name"] for row in rows} == {"static", "mip"}
+    assert all(
+        float(row["psnr"]) > 5 and float(row["fps"]) > 0 and row["steps"] == "20" for row in rows
+    )
+    stored = json.loads((finished / "points" / "static.json").read_text())
+    report = evaluate_run(finished / "runs" / "static", threads=1)
+    assert (stored["psnr"], stored["ssim"]) == (report.psnr, report.ssim)
+    assert stored["psnr_foreground"] == report.psnr_foreground
+    assert "Left out: dynamic: the images have no times" in (finished / "comparison.md").read_text()
+    assert (finished / "comparison.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_page_has_everything_in_it(finished: Path) -> None:
+    text = (finished / "comparison.html").read_text()
+    fetched: list[str] = []
+    parser = HTMLParser()
+    parser.handle_starttag = lambda tag, attrs: fetched.extend(  # type: ignore[method-assign]
+        str(value) for name, value in attrs if name in ("src", "href")
+    )
+    parser.feed(text)
+    assert fetched
+    assert all(address.startswith("data:") for address in fetched)
+    (views,) = re.findall(
+        r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL
+    )
+    shown = json.loads(views)
+    assert [[model["name"] for model in view["models"]] for view in shown] == [
+        ["static", "mip"]
+    ] * 2
+    png = base64.b64decode(shown[1]["truth"].partition(",")[2])
+    assert png == (finished / "images" / TRUTH / "01.png").read_bytes()
+    truth, model = (
+        np.asarray(Image.open(finished / "images" / name / "01.png"), np.float64)
+        for name in (TRUTH, "static")
+    )
+    assert 10 * np.log10(255**2 / ((truth - model) ** 2).mean()) == pytest.approx(
+        shown[1]["models"][0]["psnr"], abs=0.2
+    )
+
+
+def test_the_same_command_trains_nothing(
+    finished: Path,
+    capture: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.delattr(models, "finished")
+    words = [
+        "compare",
+        str(capture),
+        "--models",
+        "mip,static,dynamic",
+        *OPTIONS,
+        "--out",
+        str(finished),
+    ]
+    capsys.readouterr()
+    assert main([*words, "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert {row["name"] for row in values["rows"]} == {"static", "mip"}
+    assert "dynamic" in values["left_out"]
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+    said = error_line(capsys, *words, "init.half_extent=2", "--split", "train")
+    assert "split is test there and train here" in said
+    assert (
+        "overrides is init.num_random=100 there and init.num_random=100, init.half_extent=2 here"
+        in said
+    )
+    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+
+
+def test_what_was_stopped_goes_on(
+    finished: Path, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As if killed while the second model was trained, and before the report."""
+    out = tmp_path / "comparison"
+    shutil.copytree(finished, out)
+    (out / "points" / "mip.json").unlink()
+    (out / "comparison.html").unlink()
+    shutil.rmtree(out / "runs" / "mip")
+    kept = checkpoint_paths(out / "runs" / "static")[-1].stat().st_mtime_ns
+    note = json.loads((out / "study.json").read_text())
+    (out / "study.json").write_text(json.dumps(note | {"settings": {}}))
+    words = ["compare", str(capture), "--models", "static,mip,dynamic", *OPTIONS, "--out", str(out)]
+    assert "settings" in error_line(capsys, *words), "a preset was changed meanwhile"
+    (out / "study.json").unlink()
+    assert main(words) == 0
+    assert "mip (2 of 2)" in capsys.readouterr().out
+    assert checkpoint_paths(out / "runs" / "static")[-1].stat().st_mtime_ns == kept
+    again, first = (json.loads((f / "points" / "mip.json").read_text()) for f in (out, finished))
+    assert (again["psnr"], again["steps"]) == (first["psnr"], first["steps"])
+    assert (out / "comparison.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("--models static --minutes 0", "argument --minutes: '0' is not possible"),
+        ("--models static --minutes nan", "write a number above 0"),
+        ("--models statik --steps 3", "statik: no such preset (did you mean 'static'?)"),
+        ("--models static,static --steps 3", "two models called static"),
+        ("--models static,,mip --steps 3", "has an empty name"),
+        (
+            "--models static",
+            "say what all models get the same of: --minutes M, --steps N or --max-mb MB",
+        ),
+        ("--models static --steps 3 --minutes 2", "not allowed with"),
+        (
+            "--models dynamic,human,human_predictor --steps 3",
+            "none of the models can be trained on",
+        ),
+        ("--models static --steps 3 train.steps=9", "the comparison sets this itself"),
+        ("--models static --steps 3 --split val", "the split 'val' has no views"),
+        ("--models static --steps 3 train.stesp=2", "did you mean 'train.steps'?"),
+    ],
+)
+def test_wrong_usage_ends_in_one_line(
+    words: str, part: str, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert part in error_line(capsys, "compare", str(capture), *words.split(), "--out", str(out))
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "part"),
+    [
+        ("unposed", "pictures without cameras"),
+        ("single", "has one picture"),
+        ("black", "are of one colour"),
+    ],
+)
+def test_captures_on_which_nothing_can_be_compared(
+    kind: str, part: str, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / kind
+    out = tmp_path / "out"
+    shutil.copytree(capture, folder)
+    match kind:
+        case "unposed":
+            for path in folder.glob("*.json"):
+                path.unlink()
+        case "single":
+            file = folder / "transforms_train.json"
+            content = json.loads(file.read_text())
+            file.write_text(json.dumps(content | {"frames": content["frames"][:1]}))
+        case _:
+            for path in folder.rglob("*.png"):
+                Image.new("RGB", (16, 16)).save(path)
+    words = ("--models", "static", "--steps", "3", "--out", str(out))
+    assert part in error_line(capsys, "compare", str(folder), *words)
+    assert not out.exists()
+
+
+def test_what_is_not_made_of_gaussians_takes_part(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "grid.yaml"
+    out = tmp_path / "out"
+    own.write_text("model:\n  kind: toy\n")
+    with registered():
+        words = ["compare", str(capture), "--models", str(own), "--out", str(out)]
+        assert "has no Gaussians that could be limited" in error_line(
+            capsys, *words, "--max-mb", "1"
+        )
+        assert main([*words, "--steps", "20", "--threads", "1"]) == 0
+    stored = json.loads((out / "points" / "grid.json").read_text())
+    assert stored["steps"] == 20
+
+
+def test_a_model_whose_images_were_shrunk_is_left_out(
+    capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(budget_time, "FIT", replace(budget_time.FIT, smallest_side=8))
+    words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
+    assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
+    said = "static: too few steps fit into 0.001 minutes of training, so its images were shrunk to 8 px"
+    assert said in capsys.readouterr().err
+
+
+def test_a_comparison_that_comes_to_nothing_leaves_nothing(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert (
+        main(
+            ["compare", str(capture), "--models", "static", "--max-mb", "0.0001", "--out", str(out)]
+        )
+        == 2
+    )
+    said = capsys.readouterr()
+    assert "no model could be trained; static: budget.max_mb=0.0001: has no room" in said.err
+    assert "static (1 of 1): left out" in said.out
+    assert not out.exists()
+
+
+def test_to_the_same_size(capture: Path, tmp_path: Path) -> None:
+    words = [
+        "--models",
+        "static",
+        "--max-mb",
+        "0.05",
+        *OPTIONS[2:],
+        "train.steps=20",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(["compare", str(capture), *words]) == 0
+    stored = json.loads((tmp_path / "out" / "points" / "static.json").read_text())
+    file = tmp_path / "out" / "runs" / "static" / "export" / "scene.dyngs"
+    assert stored["mb"] == pytest.approx(1e-6 * file.stat().st_size)
+    assert 0 < stored["mb"] <= 0.05
+    assert stored["seconds"] > 0
+
+
+def test_networks_are_compared_on_people(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = stereo_people(tmp_path / "set")
+    network = train(stereo_config(folder, tmp_path / "net"))
+    given = ["compare", str(folder), "--models", str(network), "--predict", "2"]
+    assert main([*given, "data.longest_side=32", "--out", str(tmp_path / "out")]) == 0
+    assert "2 views" in capsys.readouterr().out
+    assert (tmp_path / "out" / "comparison.csv").is_file()
+    assert "only data.* can be given" in error_line(capsys, *[*given, "model.eps2d=1"])
+    assert "--steps does not go with --predict" in error_line(capsys, *[*given, "--steps", "3"])
+    assert "--spread goes with --predict" in error_line(
+        capsys, *[*given[:4], "--spread", "--steps", "3"]
+    )
+
+
+def test_variants_and_a_chosen_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.study.measure.peak_megabytes", lambda *_: None)
+    run = str(write_moving_run(tmp_path))
+    out = tmp_path / "out"
+    words = [
+        "tradeoff",
+        run,
+        "--out",
+        str(out),
+        "--vary",
+        "scale=0.5",
+        "--vary",
+        "storage=2",
+        "--rounds",
+        "1",
+    ]
+    assert (
+        main([*words, "--threads", "1", "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
+    )
+    text = capsys.readouterr().out
+    for word in (
+        "as it is",
+        "scale=0.5",
+        "storage=2",
+        "each setting alone",
+        "tradeoff.csv",
+        "chosen:",
+    ):
+        assert word in text
+    assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 100
+    assert {f.name for f in out.iterdir()} >= {
+        f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html", "png")
+    }
+    (chosen,) = (out / "chosen").iterdir()
+    assert len(load_run(chosen).scene) == 5
+    error = error_line(capsys, *words, "--require", "mb<=0.000001", begun=True)
+    assert "no measured variant has mb<=1e-06; mb<=1e-06 is too strict" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("nowhere", "nowhere: no such preset"),
+        ("nowhere", "nor is it the folder of a run"),
+        ("static data.root=x", "give --out DIR"),
+        (". --vary prun", "no such setting"),
+        (". --require psnr>30", "is no condition"),
+        (". --minimize size", "no such metric"),
+        (". --rounds 0", "argument --rounds: '0' is not a number; write a whole number from 1"),
+        (". ", "not a run folder"),
+        (". --minimize mb --maximize psnr", "not allowed with"),
+    ],
+)
+def test_wrong_usage_of_tradeoff_ends_in_one_line(
+    words: str, part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = [] if "static" in words else ["--out", "x"]
+    assert part in error_line(capsys, "tradeoff", *words.split(), *out)
+    assert list(Path().iterdir()) == []
+
+
+def test_two_sweeps_do_not_mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_moving_run(tmp_path)
+    out = tmp_path / "out"
+    with writing(out):
+        assert main(["tradeoff", str(run), "--out", str(out), "--vary", "scale=0.5"]) == 2
+        assert [path.name for path in out.iterdir()] == [LOCK_NAME]
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "has been writing there since" in told

@@ -1,0 +1,88 @@
+"""How exactly a scene is stored is measured on images of its capture."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import write_moving_run
+
+from dyngs.compress.measure import (
+    FACTORS,
+    StoragePlan,
+    coarsest_file,
+    storage_plan,
+)
+from dyngs.compress.precision import assumed_precision
+from dyngs.config import SceneModel
+from dyngs.config.io import load_resolved
+from dyngs.gaussians.restored import restored_scene
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.runs.stored_file import decoded
+
+
+def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:
+    run = load_run(run_dir)
+    assert isinstance(run.config.model, SceneModel)
+    return storage_plan(run.config, latest_checkpoint(run_dir), run.scene, max_change)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_what_is_stored_changes_images_by_what_is_allowed(tmp_path: Path, moves: bool) -> None:
+    run_dir = write_moving_run(tmp_path, moves=moves)
+    fine = plan_of(run_dir, 0.1)
+    coarse = plan_of(run_dir, 3.0)
+    for plan, most in ((fine, 0.1), (coarse, 3.0)):
+        assert plan.precision.allowed == pytest.approx(most)
+        assert plan.precision.change is not None
+        assert plan.precision.change <= most
+        assert plan.coarseness is not None
+        assert plan.coarseness.dtype == torch.uint8
+        assert plan.coarseness.shape == (5,)
+    steps = [(step, coarse.precision.steps[name]) for name, step in fine.precision.steps.items()]
+    assert all(a <= b for a, b in steps)
+    assert any(a < b for a, b in steps)
+
+
+def test_what_is_not_said_follows_the_errors_of_the_images(tmp_path: Path) -> None:
+    allowed = plan_of(write_moving_run(tmp_path)).precision.allowed
+    assert allowed is not None
+    assert 0.1 < allowed < 255 * (10 ** (0.025 / 10) - 1) ** 0.5
+
+
+def test_without_a_capture_steps_are_assumed(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    shutil.rmtree(tmp_path / "capture")
+    plan = plan_of(run_dir)
+    assert plan == StoragePlan(assumed_precision(load_run(run_dir).scene.gaussians))
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path)
+    config = load_resolved(run)
+    checkpoint = latest_checkpoint(run)
+    exact = restored_scene(checkpoint, config.model).at(0.5).means
+
+    def quality(scene: GaussianScene) -> float:
+        """Minus the sum of squares of how far the Gaussians are from where they were: their order
+        does not matter."""
+        return -float((scene.at(0.5).means.sum(0) - exact.sum(0)).square().sum())
+
+    every = coarsest_file(config, checkpoint, lambda scene: 1.0, 0.0)
+    assert every is not None
+    assert (every.factor, every.refused) == (FACTORS[-1], None)
+    some = coarsest_file(config, checkpoint, quality, -1e-3)
+    assert some is not None
+    assert some.quality >= -1e-3
+    stored = restored_scene(
+        type(checkpoint)(checkpoint.info, decoded(some.data).tensors), config.model
+    )
+    assert quality(stored) == some.quality
+    assert len(every.data) <= len(some.data)
+    assert coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None

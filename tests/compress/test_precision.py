@@ -1,0 +1,137 @@
+"""Steps are as coarse as the images allow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+import torch
+from moving_scene import camera
+from scenes import random_scene
+from torch import Tensor
+
+from dyngs.compress.precision import (
+    Draw,
+    Precision,
+    coarseness_of,
+    measured_precision,
+)
+from dyngs.core.state import part_of
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import render
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.runs.stored_tensors import (
+    MAX_COARSENESS,
+    TensorKind,
+    coding_of,
+    completed,
+    drawable,
+    restored,
+)
+
+
+def tensors() -> dict[str, Tensor]:
+    """Of a static scene."""
+    gaussians = random_scene(n=60, seed=1).to(torch.float32).gaussians
+    return {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
+
+
+def scene_of(stored: Mapping[str, Tensor]) -> StaticScene:
+    """The scene of a checkpoint's tensors."""
+    return StaticScene(gaussians=Gaussians(**part_of(stored, "gaussians")))
+
+
+def measured(stored: Mapping[str, Tensor], draw: Draw, max_change: float) -> Precision:
+    """How exactly a static scene must be stored."""
+    return measured_precision(drawable(scene_of(stored)), draw(stored), draw, max_change)
+
+
+def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
+    """One image."""
+    fields = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    return [
+        render(Gaussians(**{name: state[f"gaussians.{name}"] for name in fields}), camera()).rgb[0]
+    ]
+
+
+@pytest.mark.parametrize("max_change", [0.1, 2.0])
+def test_the_change_is_what_is_allowed_or_less(max_change: float) -> None:
+    precision = measured(tensors(), draw, max_change)
+    exact = drawable(scene_of(tensors()))
+    rounded = {name: restored(x, coding_of(name, x, precision.steps)) for name, x in exact.items()}
+    before = draw(tensors())[0].clamp(0, 1)
+    after = draw(completed(rounded))[0].clamp(0, 1)
+    change = 255 * float((before - after).double().square().mean().sqrt())
+    assert precision.change == pytest.approx(change)
+    assert max_change / 4 < change <= max_change
+
+
+def test_what_does_not_show_is_kept_finely_but_not_for_nothing() -> None:
+    def draw_grey(state: Mapping[str, Tensor]) -> list[Tensor]:
+        return draw(dict(state) | {"gaussians.sh": torch.zeros_like(state["gaussians.sh"])})
+
+    mean_size = float(drawable(scene_of(tensors()))["gaussians.sh_rest"].square().mean().sqrt())
+    step = measured(tensors(), draw_grey, 1.0).steps["gaussians.sh_rest"]
+    assert mean_size / 128 < step < mean_size / 8
+
+
+def test_coarseness_is_half_an_octave_per_octave() -> None:
+    visibility = torch.tensor([1.0] * 8 + [2.0**-4, 0.0])
+    assert coarseness_of(visibility).tolist() == [0] * 8 + [2, MAX_COARSENESS]
+    assert coarseness_of(torch.zeros(0)).shape == (0,)
+    assert coarseness_of(torch.zeros(3)).tolist() == [MAX_COARSENESS] * 3
+
+
+def change_after(
+    stored: dict[str, Tensor], exact: dict[str, Tensor], steps: Mapping[str, float]
+) -> float:
+    """Grey levels by which rounding with ``steps`` changes the image."""
+    rounded = {name: restored(x, coding_of(name, x, steps)) for name, x in exact.items()}
+    before = draw(stored)[0].clamp(0, 1)
+    after = draw(completed(rounded))[0].clamp(0, 1)
+    return 255 * float((before - after).double().square().mean().sqrt())
+
+
+@pytest.mark.parametrize("name", ["means", "sh", "log_scales"])
+def test_an_outlier_does_not_decide_the_steps_of_the_others(name: str) -> None:
+    """A Gaussian far behind the camera, or of absurd colour or size there."""
+    usual = tensors()
+    with_outlier = tensors()
+    with_outlier["gaussians.means"][5] = torch.tensor([0.0, 0.0, -1e8])
+    usual["gaussians.means"][5] = torch.tensor([0.0, 0.0, -50.0])
+    if name != "means":
+        with_outlier[f"gaussians.{name}"][5] = -1e8
+    precision = measured(with_outlier, draw, 0.5)
+    assert precision.change is not None
+    assert precision.change <= 0.5
+    assert change_after(
+        with_outlier, drawable(scene_of(with_outlier)), precision.steps
+    ) == pytest.approx(precision.change)
+    stored = "sh_base" if name == "sh" else name
+    steps = measured(usual, draw, 0.5).steps
+    assert (
+        steps[f"gaussians.{stored}"] / 4
+        <= precision.steps[f"gaussians.{stored}"]
+        <= 4 * steps[f"gaussians.{stored}"]
+    )
+
+
+def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
+    """Half of the Gaussians are 1e9 times as far away as the others, beyond what one step can
+    serve."""
+    far = tensors()
+    far["gaussians.means"][::2] *= 1e9
+    precision = measured(far, draw, 0.01)
+    assert precision.change is not None
+    assert precision.change <= 0.01
+    means = drawable(scene_of(far))["gaussians.means"]
+    assert coding_of("gaussians.means", means, precision.steps).kind is TensorKind.EXACT
+
+
+def test_a_image_that_is_not_finite_is_not_within_what_is_allowed() -> None:
+    def draw_nan(state: Mapping[str, Tensor]) -> list[Tensor]:
+        return [x.fill_(torch.nan) for x in draw(state)]
+
+    change = measured(tensors(), draw_nan, 1.0).change
+    assert change is not None
+    assert not change <= 1.0

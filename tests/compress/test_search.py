@@ -1,0 +1,105 @@
+"""Bisection keeps the most that it may, says what limits it, and holds out what nothing is trained
+on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tiny_fields import busy_config
+
+from dyngs.compress.cut import Cut
+from dyngs.compress.search import (
+    Candidate,
+    Search,
+    SearchLimit,
+    evenly_held_out,
+)
+from dyngs.config import PruneConfig
+from dyngs.training.new_trainer import assemble
+from dyngs.training.trainer import Trainer
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture
+def trainer(moving: Path) -> Trainer:
+    """At the end of its run, untrained: what is searched does not matter here."""
+    config = busy_config(moving, moving, "control_nodes")
+    trainer = assemble(config.model_copy(update={"prune": PruneConfig(steps=3)}))
+    trainer.done = config.train.steps
+    return trainer
+
+
+def test_views_held_out_are_spread_and_few() -> None:
+    assert evenly_held_out(1) == ()
+    assert evenly_held_out(2) == (1,)
+    assert evenly_held_out(16) == (4, 12)
+    assert len(evenly_held_out(100)) == 12
+    assert len(evenly_held_out(10_000)) == 32
+    assert 0 not in evenly_held_out(100)
+    assert 99 not in evenly_held_out(100)
+
+
+@pytest.mark.parametrize("allowed", [0.0, 0.05, 0.31, 0.69, 9.0])
+def test_the_last_step_that_keeps_the_promise(
+    trainer: Trainer, allowed: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of twelve, in at most four trials; and the first that does not is named."""
+    search = Search(trainer, trainer.checkpoint(), lambda text: None)
+    tried: list[float] = []
+
+    def loss_of(cut: Cut) -> Candidate:
+        tried.append(cut.fraction)
+        return Candidate(cut, trainer.config, search.start, 10, 30.0, cut.fraction - 0.05)
+
+    monkeypatch.setattr(search, "_tried", loss_of)
+    levels = [(f"{k}", Cut(fraction=k / 12)) for k in range(1, 13)]
+    found, limit = search._bisected("Gaussians", levels, allowed)
+    fits = [k for k in range(1, 13) if k / 12 - 0.05 <= allowed]
+    assert (None if found is None else found.cut) == (Cut(fraction=fits[-1] / 12) if fits else None)
+    assert len(tried) <= 4
+    if len(fits) == 12:
+        assert limit == SearchLimit("Gaussians", "12", None)
+        assert str(limit) == "Gaussians: 12; there was no more to try"
+    else:
+        assert limit.refused is not None
+        assert limit.refused[0] == f"{len(fits) + 1}"
+        assert limit.refused[1] > allowed
+
+
+def test_nothing_is_trained_on_what_is_held_out(trainer: Trainer) -> None:
+    search = Search(trainer, trainer.checkpoint(), lambda text: None)
+    assert search.held_out
+    names = {trainer.images[i].name for i in search.held_out}
+    seen = {trainer.step().image.name for _ in range(2 * len(trainer.images))}
+    assert not names & seen
+    assert len(seen | names) == len(trainer.images)
+    assert search.views == f"{len(names)} training views held out"
+
+
+def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> None:
+    """And the run is compared as it is: nothing of it is memory."""
+    search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.images[0]])
+    assert (search.held_out, trainer.held_out) == ((), frozenset())
+    assert search.views == "1 view never trained on"
+    whole = search.accepted(-100.0)[0]
+    assert [candidate.cut for candidate in whole] == [Cut()]
+    assert whole[0].psnr == search._reference
+
+
+def test_what_views_trained_on_lose_counts_too(
+    trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Views held out may be kind to a cut by chance."""
+    search = Search(trainer, trainer.checkpoint(), lambda text: None)
+    monkeypatch.setattr(
+        search,
+        "_tried",
+        lambda cut: Candidate(cut, trainer.config, search.start, 10, 30.0, -0.1, cut.fraction),
+    )
+    found, _ = search._bisected(
+        "Gaussians", [(f"{k}", Cut(fraction=k / 12)) for k in range(1, 13)], 0.5
+    )
+    assert found is not None
+    assert found.cut == Cut(fraction=0.5)

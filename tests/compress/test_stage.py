@@ -1,0 +1,225 @@
+"""The last stage of a run: exact, repeatable, the same as pruning the finished run, and drawn with
+masks."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import camera, row_of_balls
+from tiny_fields import ALL_KINDS, busy_config, cloud, tiny_setup
+from torch import Tensor
+
+from dyngs.api.train import train
+from dyngs.compress.stage import (
+    Importance,
+    ScoringViews,
+    importance,
+    pruning,
+    there_after,
+)
+from dyngs.config import (
+    Config,
+    DataConfig,
+    FreeField,
+    McmcStrategy,
+    PruneConfig,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.config.io import load_resolved
+from dyngs.deform.free import FreePrimitives, FreeStart
+from dyngs.deform.scene import DynamicScene
+from dyngs.gaussians.densify import Densifier
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
+from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.training.new_trainer import assemble
+from dyngs.training.trainer import Trainer
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+STAGE = PruneConfig(fraction=0.5, steps=6, mask_times=3)
+
+
+def moving_config(
+    capture: Path, run_dir: Path, kind: str = "control_nodes", stage: PruneConfig = STAGE
+) -> Config:
+    return busy_config(capture, run_dir, kind).model_copy(update={"prune": stage})
+
+
+def still_config(
+    capture: Path, run_dir: Path, stage: PruneConfig = STAGE, **changes: object
+) -> Config:
+    return Config(
+        data=DataConfig(root=capture),
+        model=StaticModel(sh_degree=1, filter_3d=True),
+        init=RandomInit(num_random=60),
+        train=TrainConfig(steps=8, log_every=1),
+        prune=stage,
+        run=RunConfig(dir=run_dir, threads=1),
+    ).model_copy(update=changes)
+
+
+def final_bytes(run_dir: Path) -> bytes:
+    return checkpoint_paths(run_dir)[-1].read_bytes()
+
+
+def trained(config: Config) -> Trainer:
+    """A trainer at the end of ``train.steps``."""
+    trainer = assemble(config)
+    while trainer.done < config.train.steps:
+        trainer.step()
+    return trainer
+
+
+@pytest.mark.parametrize("kind", ALL_KINDS)
+def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(
+    kind: str, moving: Path, tmp_path: Path
+) -> None:
+    """From the checkpoint before the stage, and from one in its middle."""
+    config = moving_config(moving, tmp_path / "run", kind)
+    config = config.model_copy(update={"train": config.train.model_copy(update={"save_every": 27})})
+    folder = train(config)
+    run = load_run(folder)
+    paths = checkpoint_paths(folder)
+    assert [p.stem for p in paths] == ["step_0000027", "step_0000030"]
+    wanted = final_bytes(folder)
+    paths[-1].unlink()
+    assert final_bytes(train(load_resolved(folder), resume_from=folder)) == wanted
+    if run.scene.is_static:
+        return
+    assert run.scene.masks is not None
+    assert run.scene.masks.count == len(run.scene)
+    assert len(run.scene.masks.times) == 3
+    assert len(run.scene.at(0.4)) == len(run.scene.masks.active(0)) <= len(run.scene)
+    assert len(run.scene.part("moving").at(0.4)) == len(run.scene.rows)
+
+
+def test_a_still_run_has_no_masks_and_resumes_exactly(still: Path, tmp_path: Path) -> None:
+    wanted = final_bytes(train(still_config(still, tmp_path / "whole")))
+    config = still_config(still, tmp_path / "parts")
+    folder = train(
+        config.model_copy(update={"train": config.train.model_copy(update={"save_every": 11})})
+    )
+    assert load_run(folder).step == 14
+    checkpoint_paths(folder)[-1].unlink()
+    assert load_run(folder).step == 11
+    train(load_resolved(folder), resume_from=folder)
+    assert final_bytes(folder) == wanted
+    assert not [
+        name for name in load_checkpoint(checkpoint_paths(folder)[-1]).tensors if "masks" in name
+    ]
+
+
+def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
+    """No noise, no relocation: the number stays, and the state of the strategy is gone."""
+    strategy = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90)
+    trainer = trained(still_config(still, tmp_path, strategy=strategy))
+    before = len(trainer.model.scene.gaussians)
+    trainer.apply(pruning(trainer))
+    assert isinstance(trainer.model.densifier, Densifier)
+    for _ in range(4):
+        trainer.step()
+    assert len(trainer.model.scene.gaussians) == before - before // 2
+
+
+@pytest.mark.parametrize("score", ["variation", "sensitivity", "contribution"])
+def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> None:
+    stage = STAGE.model_copy(update={"score": score})
+    trainer = trained(moving_config(moving, tmp_path, "control_nodes", stage))
+    before = trainer.model.scene.gaussians.detach()
+    trainer.apply(pruning(trainer))
+    after = trainer.model.scene.gaussians
+    assert len(after) == len(before) - len(before) // 2
+    assert _all_rows_of(after.means, before.means)
+    assert isinstance(trainer.model.scene, DynamicScene)
+    assert trainer.num_moving <= len(after)
+
+
+def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
+    return bool((some[:, None] == everything[None]).all(-1).any(1).all())
+
+
+def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
+    """What no key time sees is not drawn, and receives no gradient."""
+    trainer = trained(moving_config(moving, tmp_path, "control_nodes"))
+    trainer.apply(pruning(trainer))
+    scene = trainer.model.scene
+    assert scene.masks is not None
+    image = trainer.images[3]
+    drawn = trainer.model.training.time_step(scene, image, trainer.done + 1)
+    active = scene.masks.active(scene.masks.interval(image.time or 0.0))
+    assert len(drawn.gaussians) == len(active)
+    drawn.gaussians.means.sum().backward()
+    grad = trainer.model.scene.gaussians.means.grad
+    assert grad is not None
+    assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
+
+
+BLACK = torch.zeros(3)
+
+
+def views(
+    scene: GaussianScene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+) -> ScoringViews:
+    return ScoringViews(scene, [camera(), camera(40, 28)], times, RenderOptions(), BLACK)
+
+
+def test_what_is_hidden_or_transparent_is_worth_least() -> None:
+    """Of five balls the second lies behind a wall, the fourth is faint."""
+    balls = row_of_balls()
+    means = balls.means.clone()
+    log_scales = balls.log_scales.clone()
+    logits = balls.logit_opacities.clone()
+    means[0] = torch.tensor([-0.5, 0.0, -1.0])  # before the second, which is at x = -0.5
+    log_scales[0] = -1.0
+    logits[0] = 9.0
+    logits[3] = -4.0
+    scene = StaticScene(
+        gaussians=balls.replace(means=means, log_scales=log_scales, logit_opacities=logits)
+    )
+    found = importance(views(scene, (None,)), slopes=True)
+    assert found.slopes is not None
+    for scores in (found.contribution, found.variation, found.slopes):
+        assert set(scores.argsort()[:2].tolist()) == {1, 3}
+
+
+def constant(
+    fractions: list[list[float]], opacities: list[list[float]] | None = None
+) -> Importance:
+    """K moments of N Gaussians of one size."""
+    c = torch.tensor(fractions)
+    o = torch.full_like(c, 0.5) if opacities is None else torch.tensor(opacities)
+    return Importance(c, None, o, torch.zeros_like(c))
+
+
+def test_opacity_that_changes_is_the_profile() -> None:
+    """1 / (tanh(4 |d|) / 2 + 1/2) by hand: p = (1, 0, 1), d = (-1, 2, -1) with repeated ends."""
+    found = constant([[1.0, 1.0]] * 3, [[0.8, 0.5], [0.0, 0.5], [0.8, 0.5]])
+    g = [2 / (math.tanh(4 * d) + 1) for d in (1.0, 2.0, 1.0)]
+    torch.testing.assert_close(found.variation, torch.tensor([sum(g), 6.0]))
+    volumes = torch.tensor([[0.0, 3.0]])  # the tenth power: e^3 times the volume
+    found = Importance(torch.ones(1, 2), None, torch.ones(1, 2), volumes)
+    assert float(found.variation[1] / found.variation[0]) == pytest.approx(math.exp(0.3))
+
+
+def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
+    """Between key times, too: three of ten training times are key times, and none of the Gaussians
+    is there at them."""
+    centers = torch.tensor([2, 3, 6, 7]) / 9
+    start = FreeStart(torch.zeros(0), (), centers, torch.full((4,), 0.03), torch.zeros(4, 3))
+    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
+    times = tuple(k / 9 for k in range(10))
+    scene = DynamicScene(gaussians=cloud(5), seen_at=times, field=field, moving=torch.arange(4))
+    keys = (times[0], times[5], times[9])
+    masks = VisibilityMasks.pack(keys, there_after(scene, keys, 1 / 255))
+    assert masks.seen.sum(0).tolist() == [1, 1, 1, 1, 3]
+    for time in times:
+        drawn = set(masks.active(masks.interval(time)).tolist())
+        assert set(torch.nonzero(scene.at(time).opacities > 1 / 255)[:, 0].tolist()) <= drawn
