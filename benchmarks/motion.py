@@ -30,7 +30,7 @@ from torch import Tensor
 
 from dyngs.api.load import read_capture
 from dyngs.api.train import train
-from dyngs.config import Config, PointsInit, RandomInit, StaticModel
+from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.config.io import load_config
 from dyngs.core.metrics import Lpips
 from dyngs.core.state import Role
@@ -65,6 +65,7 @@ from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"

@@ -14,12 +14,13 @@ from synthetic_bodies import model, write_npz, write_obj, write_pickle
 from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
-from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
+from dyngs.config import Config, DataConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.camera import Cameras
 from dyngs.core.state import tensors_of
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
+from dyngs.deform.keys import DynamicModel
 from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
@@ -31,6 +32,7 @@ from dyngs.io.tensor_file import write_tensors
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.runs.stored_file import encoded
+from dyngs.static.keys import StaticModel
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel
+from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import SH_C0
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import new_corrections
@@ -20,6 +20,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
 from dyngs.runs.checkpoint import CheckpointInfo, LoadedRun
 

@@ -14,9 +14,10 @@ from moving_scene import camera
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
+from dyngs.config import NetworkColour, SceneModel
 from dyngs.core.state import prefixed, tensors_of
 from dyngs.deform.fields import WindowedField, field_state
+from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
@@ -31,6 +32,7 @@ from dyngs.runs.stored_file import (
     compressed,
 )
 from dyngs.runs.stored_tensors import Coding, TensorKind
+from dyngs.static.keys import StaticModel
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

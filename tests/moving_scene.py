@@ -10,14 +10,7 @@ import torch
 from scaled_captures import scaled_capture
 from torch import Tensor
 
-from dyngs.config import (
-    Config,
-    ControlNodesField,
-    DataConfig,
-    DynamicModel,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, tensors_of
@@ -25,11 +18,13 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.fields import field_state
+from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.static.keys import StaticModel
 
 MOVING_ROWS = (1, 3)
 TRAIN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -11,12 +11,12 @@ from scenes import look_around
 from tiny_fields import cloud
 from torch import Tensor
 
-from dyngs.config import ControlNodesField, DynamicModel
 from dyngs.core.camera import Cameras
 from dyngs.core.state import part_of, tensors_of
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
+from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, OptimConfig, RunConfig, TrainConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image
@@ -17,6 +17,7 @@ from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import apply_transforms, joint_transforms
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
 from dyngs.training.new_trainer import assemble
 

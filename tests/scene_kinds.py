@@ -7,10 +7,10 @@ from scenes import look_around
 from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel, HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.core.state import State, part_of, tensors_of
 from dyngs.deform.fields import OPEN, WindowedField
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
@@ -25,6 +25,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs

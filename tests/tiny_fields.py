@@ -8,24 +8,19 @@ import torch
 from scenes import random_scene
 from torch import Tensor
 
-from dyngs.config import (
-    Config,
+from dyngs.config import Config, DataConfig, DefaultStrategy, RandomInit, RunConfig, TrainConfig
+from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.deform.control_nodes import Nodes, follow
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
+from dyngs.deform.fields import new_field
+from dyngs.deform.keys import (
     ControlNodesField,
-    DataConfig,
-    DefaultStrategy,
     DeformField,
     DynamicModel,
     FreeField,
     HexplaneField,
     MlpField,
-    RandomInit,
-    RunConfig,
-    TrainConfig,
 )
-from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.control_nodes import Nodes, follow
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
-from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians
 from dyngs.ops.quaternions import identity_quat
 

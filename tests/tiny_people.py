@@ -6,9 +6,10 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from dyngs.config import Config, DataConfig, HumanPredictorModel
+from dyngs.config import Config, DataConfig
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.ghg.learner import Filmed, filmed
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dyngs.config import Config, GpsModel
+from dyngs.config import Config
+from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.human.synthetic.people import PeopleOptions, write_people
 
 STEREO = GpsModel(person_px=32, widths=(8, 8, 8), depth_fraction=0.5)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from dyngs.api.first_scene import first_of
-from dyngs.config import BudgetConfig, Config, DynamicModel, FreeField, PruneConfig, StaticModel
+from dyngs.config import BudgetConfig, Config, PruneConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import psnr
@@ -29,10 +29,11 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
+from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.io.write import write_text
-from dyngs.models.kind import kind_of
+from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
@@ -218,8 +219,9 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
     folds = _held_out(views)
     small = _small(config, MOTION, MOTION.steps, math.inf)
     small = _with(small, "init", num_random=min(config.init.num_random, MOTION.gaussians))
-    added = min(config.model.added_for_motion, MOTION_RANDOM)
-    small = _with(small, "model", num_random_moving=added)
+    made_of = capability(config.model, HasGaussians)
+    assert made_of is not None
+    small = small.model_copy(update={"model": made_of.adding(config.model, MOTION_RANDOM)})
     step = _work_of_step(config, views[0])
     # a step with motion costs two without
     work = len(folds) * 1.4 * MOTION.steps * _work_of_step(small, views[0])
@@ -280,10 +282,10 @@ def _open_settings(config: Config) -> list[tuple[str, str, PairScore]]:
         ("camera", "refine", after_pose_fit),
         ("train", "exposure", after_colour_fit),
     ]
-    if isinstance(config.model, StaticModel):
+    kind = kind_of(config.model)
+    if not isinstance(kind, Moves):
         found.append(("train", "robust", explained))
-    elif not isinstance(config.model, DynamicModel):
-        return []
+    found = [x for x in found if f"{x[0]}.{x[1]}" in kind.uses]
     return [x for x in found if getattr(getattr(config, x[0]), x[1]) == "auto"]
 
 

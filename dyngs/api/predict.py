@@ -15,7 +15,7 @@ from dyngs.core.errors import DyngsError, show
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import KINDS, kind_of
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.prediction import Predictor, named_views
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
@@ -71,8 +71,9 @@ def predict(
     config, checkpoint = trained_network(network)
     require_empty(out)  # before the work
     data = config.data.model_copy(update={"root": capture.absolute()})
-    predictor = kind_of(config.model).predictor(config, checkpoint, data, say=say, report=report)
-    chosen = _chosen(predictor, config.model.source_views if views is None else views)
+    network_kind = require_network(config, network)
+    predictor = network_kind.networks()[1](config, checkpoint, data, say, report)
+    chosen = _chosen(predictor, network_kind.num_views(config.model) if views is None else views)
     began = time.perf_counter()
     done = predictor.adapt(chosen, steps, report)
     start = time.perf_counter()
@@ -99,12 +100,19 @@ def network_config(run_dir: Path) -> Config:
     """Return the configuration of the run of a network. Raises DyngsError: it is of something
     else."""
     config = load_resolved(run_dir)
-    if not config.model.is_network:
-        known = " or ".join(kind.section().kind for kind in KINDS if kind.section.is_network)
-        raise DyngsError(
-            f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs one of {known}"
-        )
+    require_network(config, run_dir)
     return config
+
+
+def require_network(config: Config, run_dir: Path) -> Predicts:
+    """Return the kind of a network. Raises DyngsError: it is another kind."""
+    network = capability(config.model, Predicts)
+    if network is None:
+        raise DyngsError(
+            f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs the run of a network "
+            "(docs/people_network.md)"
+        )
+    return network
 
 
 def write_run(

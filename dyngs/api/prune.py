@@ -18,6 +18,7 @@ from dyngs.core.errors import DyngsError, show
 from dyngs.data.read import require_folder
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
+from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
@@ -129,7 +130,7 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
     done = [f"train.steps={start.info.step}", "train.minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
-    if not config.model.made_of_gaussians:
+    if capability(config.model, HasGaussians) is None:
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to prune")
     return config
 

@@ -8,21 +8,14 @@ from pathlib import Path
 
 from dyngs.api.choose import choose
 from dyngs.api.first_scene import first_of
-from dyngs.capture.unposed import is_unposed, with_poses
-from dyngs.config import (
-    AutoColour,
-    FixedStrategy,
-    HumanModel,
-    SceneInit,
-    ShColour,
-    StaticModel,
-)
+from dyngs.capture.unposed import with_poses
+from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ReportProgress
 from dyngs.core.errors import DyngsError, counted, show, warn
 from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
-from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
+from dyngs.models.kind import HasBody, Moves, Predicts, capability, kind_of
 from dyngs.models.views import training_times
 from dyngs.runs.capture_record import changed_files, named
 from dyngs.runs.checkpoint import SCENE_FILE
@@ -71,21 +64,16 @@ def find_poses(report: ReportProgress) -> Stage:
         config = plan.resolved
         data = config.data
         model = config.model
-        if model.is_network:
+        kind = kind_of(model)
+        if isinstance(kind, Predicts):
             return plan, None  # its folder holds a capture per person
         root = data.root
         folder = capture_folder(root)
         data = data.model_copy(update={"root": folder})
-        if not model.is_posed:
-            data = with_poses(data, needs_times=model.may_move, report=report)
+        if isinstance(kind, HasBody):
+            data = kind.find_body(data, model, show, report)
         else:
-            if is_unposed(data):
-                # late: other kinds need no detector
-                from dyngs.human.detect.find_person import with_found_person
-
-                data = with_found_person(data, say=show, report=report)
-            if isinstance(model, HumanModel):
-                data = with_fitted_body(data, model, only_if_needed=not model.fit, report=report)
+            data = with_poses(data, needs_times=isinstance(kind, Moves), report=report)
         if data.root == folder:  # the archive outlives the cache
             data = data.model_copy(update={"root": root})
         message = None if folder == root else f"{root} is unpacked in {folder}"
@@ -101,7 +89,7 @@ def continue_scene(plan: RunPlan) -> tuple[RunPlan, None]:
     init = config.init
     if not isinstance(init, SceneInit):
         return plan, None
-    if not isinstance(config.model, StaticModel):
+    if "init.scene" not in kind_of(config.model).uses:
         raise DyngsError(
             f"init.kind=scene goes with model.kind=static, not with {config.model.kind}"
         )
@@ -120,7 +108,7 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
 
     def stage(plan: RunPlan) -> tuple[RunPlan, None]:
         data = plan.resolved.data
-        if plan.resolved.model.is_network:
+        if capability(plan.resolved.model, Predicts) is not None:
             return plan, None
         capture = read_capture_of(data, resumed.info)
         changed = changed_files(folder, data, capture)
@@ -135,7 +123,7 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
 def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
     """Read the capture, find initial points, and resolve ``auto`` settings by pilot runs."""
     config = plan.resolved
-    if config.model.is_network:
+    if capability(config.model, Predicts) is not None:
         return plan, None
     config, choices, capture = choose(config, require_images(read_capture(config.data)))
     return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None

@@ -210,7 +210,7 @@ def follows_links(overrides: Sequence[str]) -> bool:
         if word.startswith("data") and "=" in word
         for leaf in read_override(word)
     ]
-    return any(leaf.keys == ("data", "follow_links") and leaf.value is True for leaf in leaves)
+    return any(leaf.keys == ("data", "follow_links") and leaf.value == "true" for leaf in leaves)
 
 
 def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:

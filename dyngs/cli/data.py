@@ -327,8 +327,8 @@ def _starts(words: list[str]) -> dict[str, float] | None:
 
 def run_fit(arguments: argparse.Namespace) -> int:
     """Fit a body and print how good the fit is, and the next command."""
-    from dyngs.config import HumanModel
     from dyngs.human.fit.fitted_capture import FitInputs, write_fitted_capture
+    from dyngs.human.keys import HumanModel
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
     passed = {name: getattr(arguments, name) for name in _OF_A_FIT}

@@ -539,7 +539,9 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
         raise DyngsError(
             f"{source}: a file has no training views, whose depths make a surface; give the run"
         )
-    return source.is_dir() and not load_resolved(source).model.is_posed
+    from dyngs.models.kind import HasBody, capability
+
+    return source.is_dir() and capability(load_resolved(source).model, HasBody) is None
 
 
 def _export_surface(arguments: argparse.Namespace) -> int:

@@ -98,7 +98,9 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
         print(line)
     word = as_word(folder)
     print(f"trained: {folder}")
-    if config.model.is_network:
+    from dyngs.models.kind import Predicts, capability
+
+    if capability(config.model, Predicts) is not None:
         print(f"next:    dyngs predict {word} CAPTURE --out RUN")
     else:
         print(
@@ -120,20 +122,17 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
     """Return lines about the moving part of a dynamic model."""
-    from dyngs.config import DynamicModel
+    from dyngs.models.kind import Moves, capability
     from dyngs.runs.checkpoint import load_run
 
-    if not isinstance(config.model, DynamicModel):
+    if capability(config.model, Moves) is None:
         return []
     run = load_run(folder)
     scene = run.scene
-    limit = config.model.freeze_below_px
-    if not run.config.model.may_move:
+    if capability(run.config.model, Moves) is None:
         return ["motion:  none, so this is a static model, like those of configs/static.yaml"]
-    if not scene.times:
-        return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_static:
-        return [f"motion:  nothing moves by {limit:g} px or more, so this became a static model"]
+        return ["motion:  nothing moves, so this became a static model"]
     return [
         f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"
     ]

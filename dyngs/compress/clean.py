@@ -21,6 +21,7 @@ from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
@@ -108,7 +109,7 @@ def cleaned_run(
     Deterministic. Raises DyngsError: no such run, or its capture cannot be read.
     """
     config = load_resolved(run_dir, data_root=data_root)
-    if not config.model.made_of_gaussians:
+    if capability(config.model, HasGaussians) is None:
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to clean")
     with (
         kernel_threads(threads or num_cores()),

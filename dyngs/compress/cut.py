@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from dyngs.compress.stage import removal
-from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
+from dyngs.config import AutoColour, Config
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import innermost, with_innermost
+from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY, MeasuredView, find_view_dependent
 from dyngs.gaussians.scene import GaussianScene

@@ -12,9 +12,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyngs.config import StaticModel
 from dyngs.core.errors import counted
 from dyngs.gaussians.rendering import depths_and_contributions
+from dyngs.models.kind import kind_of
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
 from dyngs.training.trainer import Edit, Trainer
@@ -38,7 +38,8 @@ def remove_floaters(loop: Loop) -> Edit | None:
     options = trainer.config.train
     if trainer.done != options.steps or not options.remove_floaters:
         return None
-    if not isinstance(trainer.config.model, StaticModel) or len(trainer.images) < FEWEST_VIEWS:
+    is_still = "init.scene" in kind_of(trainer.config.model).uses
+    if not is_still or len(trainer.images) < FEWEST_VIEWS:
         return None
     found = floaters(trainer)
     count = int(found.sum())

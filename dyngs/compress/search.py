@@ -30,6 +30,7 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.renderable import Posable
 from dyngs.training.new_trainer import GaussianTrainer
 
 HELD_OUT_FRACTION = 1 / 8
@@ -129,7 +130,7 @@ def unseen_images(trainer: GaussianTrainer) -> list[Image]:
     They play other motions there, in which poses are not refined.
     """
     views = trainer.capture.splits.get("val", ())
-    if not views or trainer.config.model.is_posed:
+    if not views or isinstance(trainer.model.scene, Posable):
         return []
     loader = ImageLoader(views, trainer.config.data)
     loader.device = trainer.device

@@ -31,6 +31,7 @@ from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.models.kind import Moves, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
@@ -193,7 +194,8 @@ def removal(trainer: GaussianTrainer, scores: Tensor | None) -> Edit:
     whole = trainer.model.scene.unmasked()
     kept = None if scores is None else highest(scores, options.fraction)
     masks = None
-    if options.mask_times > 1 and trainer.config.model.may_move and not whole.is_static:
+    moves = capability(trainer.config.model, Moves) is not None and not whole.is_static
+    if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
     return Edit(kept=kept, masks=masks, stops_growing=True)
 

@@ -13,18 +13,6 @@ from dyngs.config.keys.strategy import (
 )
 from dyngs.config.keys.train import TrainConfig
 from dyngs.core.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
-from dyngs.deform.keys import (
-    ControlNodesField,
-    DeformField,
-    DynamicModel,
-    FieldSection,
-    FreeField,
-    HexplaneField,
-    MlpField,
-)
-from dyngs.human.keys import HumanModel, HumanPredictorModel
-from dyngs.human.predict.gps.keys import GpsModel
-from dyngs.static.keys import StaticModel
 
 __all__ = [
     "AutoColour",
@@ -32,22 +20,12 @@ __all__ = [
     "CameraConfig",
     "ColourSection",
     "Config",
-    "ControlNodesField",
     "CutOff",
     "DataConfig",
     "DefaultStrategy",
-    "DeformField",
-    "DynamicModel",
-    "FieldSection",
     "FixedStrategy",
     "Fraction",
-    "FreeField",
-    "GpsModel",
-    "HexplaneField",
-    "HumanModel",
-    "HumanPredictorModel",
     "McmcStrategy",
-    "MlpField",
     "ModelSection",
     "NetworkColour",
     "OptimConfig",
@@ -60,7 +38,6 @@ __all__ = [
     "SceneModel",
     "Section",
     "ShColour",
-    "StaticModel",
     "Strategy",
     "TrainConfig",
 ]

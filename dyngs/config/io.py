@@ -13,25 +13,29 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic.fields import FieldInfo
 
 from dyngs.config import Config
+from dyngs.config.kinds import is_kind, package_of
 from dyngs.config.schema import (
     allowed_values,
+    as_written,
     choices_of,
     config_keys,
-    keys_of_location,
+    default_kind,
+    has_kinds,
+    is_kind_of,
+    is_section,
     kinds_of,
-    section_at,
     section_class,
     section_classes,
 )
-from dyngs.config.yaml_reader import Leaf, read_file, read_override, require_usable
-from dyngs.core.errors import DyngsError, as_word, printable
+from dyngs.config.yaml_reader import Leaf, read_file, read_override
+from dyngs.core.errors import DyngsError, as_word, printable, reading, require_name
 from dyngs.io.containment import follows_links_of_runs
 from dyngs.io.write import write_text
 from dyngs.io.wrong_place import command_for
@@ -39,8 +43,6 @@ from dyngs.io.wrong_place import command_for
 RESOLVED_NAME = "config.yaml"
 """Name of the resolved configuration inside a run folder."""
 
-MAX_WHOLE = 2**63 - 1
-"""The largest whole number of a configuration."""
 REMOVED_KEYS: dict[tuple[str, ...], object] = {
     ("model", "loose"): False,
     ("budget", "min_fps"): None,
@@ -83,14 +85,13 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
         if file.resolve() not in [packaged.resolve() for packaged in packaged_presets().values()]:
             own |= _own_keys(layers)
     given = layers.add_overrides(overrides)
-    if layers.value_at(_FOLLOW_LINKS) and _FOLLOW_LINKS not in given:
-        where = layers.origin_of(_FOLLOW_LINKS)
-        raise DyngsError(
-            f"{where}: only the command line may set data.follow_links; remove it here and, if you "
-            "trust the capture, give data.follow_links=true there"
-        )
     own |= given
-    config = _validate(layers)
+    config = _validated(layers)
+    if config.data.follow_links and _FOLLOW_LINKS not in given:
+        raise DyngsError(
+            f"{layers.origin_of(_FOLLOW_LINKS)}only the command line may set data.follow_links; remove it here and, "
+            "if you trust the capture, give data.follow_links=true there"
+        )
     _note_requested(config, (), own)
     body = config.data.body
     paths = {"root": config.data.root.absolute(), "body": None if body is None else body.absolute()}
@@ -119,7 +120,11 @@ def load_resolved(
         raise DyngsError(f"{path}: not a run folder; {command_for(path)}")
     layers = _Layers()
     leaves = read_file(file)
-    layers.add(x for x in leaves if x.keys not in REMOVED_KEYS or x.value != REMOVED_KEYS[x.keys])
+    layers.add(
+        x
+        for x in leaves
+        if x.keys not in REMOVED_KEYS or not _is_same(x.value, REMOVED_KEYS[x.keys])
+    )
     if not layers.tree.get("data"):
         raise DyngsError(
             f"{file}: does not say which capture the run was trained on (data.root); restore the file"
@@ -131,7 +136,7 @@ def load_resolved(
         layers.tree["data"]["body"] = str(file.parent.absolute() / body)
     stored_root = layers.value_at(("data", "root"))
     layers.add_overrides(overrides)
-    config = _validate(layers)
+    config = _validated(layers)
     root = data_root or config.data.root
     if data_root is None and root == Path(str(stored_root)):
         return config
@@ -147,6 +152,9 @@ def save_config(config: Config, path: Path) -> None:
     A ``data.body`` next to the file is written relative to it, so that their folder may be moved.
     """
     values = config.model_dump(mode="json")
+    package = package_of(config.model.kind)
+    if package is not None:
+        values["model"]["package"] = package
     body = config.data.body
     beside = path.parent.absolute()
     if body is not None and body.is_relative_to(beside):
@@ -180,23 +188,10 @@ def find_preset(path: Path) -> Path:
         raise DyngsError(f"{path}: no configuration; {found}")
     if path.exists() and not path.is_dir():
         raise DyngsError(f"{path}: not a regular file; give a YAML preset")
-    close = _close_presets(path.stem, packaged)
+    close = get_close_matches(path.stem, packaged, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     raise DyngsError(
         f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}"
-    )
-
-
-def _close_presets(name: str, packaged: Iterable[str]) -> list[str]:
-    """Return the packaged preset that is meant by another name, if one is."""
-    usual = {"3dgs": "static", "gaussian": "static", "splat": "static", "photos": "static"}
-    usual |= {"4dgs": "dynamic", "video": "dynamic", "avatar": "human", "body": "human"}
-    names = sorted(packaged)
-    within = [preset for preset in names if len(name) > 2 and name.lower() in preset]
-    return (
-        [usual[name.lower()]]
-        if name.lower() in usual
-        else get_close_matches(name, names, n=1) or within[:1]
     )
 
 
@@ -228,11 +223,10 @@ def packaged_presets() -> dict[str, Path]:
 
 @dataclass
 class _Layers:
-    """Nested values of a preset and overrides, and for each value where it was written."""
+    """Nested texts of a preset and overrides, and for each where it was written."""
 
     tree: dict[str, Any] = field(default_factory=dict)
     origins: dict[tuple[str, ...], str] = field(default_factory=dict)
-    written: dict[tuple[str, ...], str] = field(default_factory=dict)
 
     def add(self, leaves: Iterable[Leaf]) -> None:
         for leaf in leaves:
@@ -253,15 +247,26 @@ class _Layers:
     def _drop_other_kind(self, keys: tuple[str, ...], kind: Any) -> None:
         """Empty the section at ``keys`` if it is of another kind than ``kind``."""
         section = self.value_at(keys)
-        info = section_at(self.tree, keys).model_fields.get(keys[-1]) if keys else None
-        if not isinstance(section, dict) or info is None or not kinds_of(info):
+        info = self.field_at(keys)
+        if not isinstance(section, dict) or info is None or not has_kinds(info):
             return
-        if section.get("kind", info.get_default().kind) != kind:
+        if section.get("kind", default_kind(info)) != kind:
             section.clear()
             self.origins = {k: v for k, v in self.origins.items() if k[: len(keys)] != keys}
 
+    def field_at(self, keys: tuple[str, ...]) -> FieldInfo | None:
+        """Return the field of a section, by the kinds that are there; None: there is none."""
+        section: type[BaseModel] = Config
+        info: FieldInfo | None = None
+        for depth, key in enumerate(keys, 1):
+            info = section.model_fields.get(key)
+            if info is None or not is_section(info):
+                return None
+            node = self.value_at(keys[:depth])
+            section = section_class(info, node.get("kind") if isinstance(node, dict) else None)
+        return info
+
     def _set(self, leaf: Leaf) -> None:
-        require_usable(leaf)
         keys = leaf.keys
         value = leaf.value
         section = self.tree
@@ -274,24 +279,31 @@ class _Layers:
                     f"{leaf.origin}: {'.'.join(keys[:depth])} is a value, it has no key {keys[depth]!r}"
                 )
             section = inner
-        if isinstance(value, str) and value.startswith("~/"):
-            value = os.path.expanduser(value)
+        if isinstance(value, str):
+            with reading(f"{leaf.origin}: {printable('.'.join(keys), 100)}"):
+                require_name(value)
+            value = os.path.expanduser(value) if value.startswith("~/") else value
         section[keys[-1]] = value
         self.origins[keys] = leaf.origin
-        self.written[keys] = leaf.text
 
     def value_at(self, keys: tuple[str, ...]) -> Any:
-        """The value or section at ``keys``; None where there is none."""
+        """Return the value or section at ``keys``; None where there is none."""
         node: Any = self.tree
         for key in keys:
             node = node.get(key) if isinstance(node, dict) else None
         return node
 
     def origin_of(self, keys: tuple[str, ...]) -> str:
-        """Where the value at ``keys``, or else the first one below it, was written; "" if
-        nowhere."""
+        """Return where the value at ``keys``, or else the first one below it, was written; with a
+        colon."""
         below = (origin for k, origin in self.origins.items() if k[: len(keys)] == keys)
-        return self.origins.get(keys) or next(below, "")
+        origin = self.origins.get(keys) or next(below, "")
+        return f"{origin}: " if origin else ""
+
+
+def _is_same(written: object, value: object) -> bool:
+    """Return whether a text is how a value is written."""
+    return str(written).lower() == as_written(value) or written == value
 
 
 def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
@@ -314,33 +326,89 @@ def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
     return own
 
 
-def _fill_in_kinds(section: type[BaseModel], node: dict[str, Any]) -> None:
-    """Put an empty section where one is absent, and the default ``kind`` where a section with
-    variants has none."""
-    for name, info in section.model_fields.items():
-        if section_classes(info):
-            inner = node[name] = {} if node.get(name) is None else node[name]
-            if isinstance(inner, dict):
-                if kinds_of(info):
-                    inner.setdefault("kind", info.get_default().kind)
-                _fill_in_kinds(section_class(info, inner.get("kind")), inner)
-
-
-def _validate(layers: _Layers) -> Config:
-    _fill_in_kinds(Config, layers.tree)
-    try:
-        config = Config.model_validate(layers.tree)
-        _require_countable(config.model_dump(), (), layers)
-        return config
-    except ValidationError as error:
-        problems = sorted(
-            error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden"
+def _validated(layers: _Layers) -> Config:
+    tree = layers.tree
+    model = tree.get("model")
+    package = model.pop("package", None) if isinstance(model, dict) else None
+    if isinstance(model, dict) and package is not None and not is_kind(model.get("kind")):
+        raise DyngsError(
+            f"model.kind={model.get('kind')} is of the package {package}, which is not installed; "
+            f"pip install {package}"
         )
-    if _take_as_text(layers, problems):
-        return _validate(layers)
-    others = len({keys_of_location(problem["loc"]) for problem in problems}) - 1
-    more = f" (and {others} more)" if others else ""
-    raise DyngsError(_explain(layers, problems[0]) + more)
+    return cast(Config, _section(Config, tree, (), layers))
+
+
+def _section(
+    section: type[BaseModel], given: dict[str, Any], above: tuple[str, ...], layers: _Layers
+) -> BaseModel:
+    """Return the section of the texts in ``given``. Raises DyngsError: the first fault."""
+    values = dict(given)
+    for key in given:
+        if key not in section.model_fields:
+            raise DyngsError(
+                layers.origin_of((*above, key)) + _about_unknown(section, (*above, key), layers)
+            )
+    for name, info in section.model_fields.items():
+        keys = (*above, name)
+        if not is_section(info):
+            continue
+        inner = {} if given.get(name) is None else given[name]
+        if not isinstance(inner, dict):
+            raise DyngsError(f"{layers.origin_of(keys)}{'.'.join(keys)} {_of_section(info)}")
+        kind = inner.get("kind") or default_kind(info)
+        if has_kinds(info) and not is_kind_of(info, kind):
+            where = layers.origin_of((*keys, "kind"))
+            allowed = f"one of {', '.join(kinds_of(info))}"
+            raise DyngsError(where + _not_allowed((*keys, "kind"), allowed, kind, kinds_of(info)))
+        values[name] = _section(section_class(info, kind), inner, keys, layers)
+    try:
+        return section.model_validate(values)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+    keys = (*above, str(problem["loc"][0]))
+    info = section.model_fields[keys[-1]]
+    where = layers.origin_of(keys)
+    if problem["type"] == "missing":
+        name = ".".join(keys)
+        example = "data.root=FOLDER" if name == "data.root" else f"{name}=..."
+        raise DyngsError(f"{where}{name} is missing ({info.description}); give {example}")
+    if problem["type"] == "value_error":
+        raise DyngsError(f"{where}{'.'.join(keys)} {problem.get('ctx', {}).get('error')}")
+    choices = choices_of(info.annotation)
+    raise DyngsError(where + _not_allowed(keys, allowed_values(info), values[keys[-1]], choices))
+
+
+def _not_allowed(keys: tuple[str, ...], allowed: str, value: object, choices: list[str]) -> str:
+    close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"{'.'.join(keys)} must be {allowed}, not {printable(as_written(value), 60)}{hint}"
+
+
+def _of_section(info: FieldInfo) -> str:
+    keys = dict.fromkeys(key for variant in section_classes(info) for key in variant.model_fields)
+    rest = ", ... (docs/cli.md has all)" if len(keys) > MOST_KEYS else ""
+    return f"is a section, not a value; its keys: {', '.join([*keys][:MOST_KEYS])}{rest}"
+
+
+def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:
+    """Return which kind has a key that its section does not have, or which keys are similar."""
+    *above, key = keys
+    name = ".".join(keys)
+    holder = layers.field_at(tuple(above))
+    variants = [] if holder is None else section_classes(holder)
+    owners = [x.model_fields["kind"].default for x in variants if key in x.model_fields]
+    if owners:
+        kind = section.model_fields["kind"].default
+        return f"{name} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {kind}"
+    full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
+    everything = list(dict.fromkeys(key.name for key in config_keys()))
+    siblings = get_close_matches(key, list(section.model_fields), n=1) if full == keys else []
+    same_word = [x for x in everything if x.split(".")[-1] == full[-1]]
+    close = get_close_matches(".".join(full), same_word if len(keys) > 1 else everything, n=1)
+    found = [".".join((*above, x)) for x in siblings if above] or close[:1] or same_word
+    found = found or get_close_matches(".".join(full), everything, n=1)
+    hint = f"; did you mean {' or '.join(repr(x) for x in found)}?" if found else ""
+    return f"unknown key {printable(repr(name), 60)}{hint}"
 
 
 def _note_requested(
@@ -353,107 +421,3 @@ def _note_requested(
             _note_requested(inner, (*above, name), requested)
         elif (*above, name) not in requested:
             section.model_fields_set.discard(name)
-
-
-def _require_countable(section: dict[str, Any], above: tuple[str, ...], layers: _Layers) -> None:
-    """Raise DyngsError if a whole number needs more than 64 bits."""
-    for key, value in section.items():
-        keys = (*above, key)
-        if isinstance(value, dict):
-            _require_countable(value, keys, layers)
-        elif any(
-            isinstance(x, int) and abs(x) > MAX_WHOLE
-            for x in (value if isinstance(value, tuple) else (value,))
-        ):
-            raise DyngsError(
-                f"{layers.origin_of(keys)}: {'.'.join(keys)} must be below 2^63, not {_shorten(value)}"
-            )
-
-
-def _take_as_text(layers: _Layers, problems: list[ErrorDetails]) -> bool:
-    """Replace numbers, dates and such by what was written where the schema wants text; True if
-    anything changed."""
-    changed = False
-    for problem in problems:
-        keys = keys_of_location(problem["loc"])
-        if problem["type"] in ("string_type", "path_type") and layers.written.get(keys):
-            section = layers.value_at(keys[:-1])
-            changed = changed or section[keys[-1]] != layers.written[keys]
-            section[keys[-1]] = layers.written[keys]
-    return changed
-
-
-def _explain(layers: _Layers, problem: ErrorDetails) -> str:
-    keys = keys_of_location(problem["loc"])
-    section = section_at(layers.tree, keys)
-    what = problem["type"]
-    dotted = ".".join(keys)
-    origin = layers.origin_of((*keys, "kind") if what == "union_tag_invalid" else keys)
-    prefix = f"{origin}: " if origin else ""
-    if what == "extra_forbidden":
-        return prefix + _explain_unknown(layers, keys)
-    info = section.model_fields[keys[-1]]
-    if what == "missing":
-        example = "data.root=FOLDER" if dotted == "data.root" else f"{dotted}=..."
-        return f"{prefix}{dotted} is missing ({info.description}); give {example}"
-    if what in ("model_type", "model_attributes_type", "dict_type"):
-        inside = dict.fromkeys(
-            key for variant in section_classes(info) for key in variant.model_fields
-        )
-        shown = [*inside][:MOST_KEYS]
-        rest = ", ... (docs/cli.md has all)" if len(inside) > len(shown) else ""
-        return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(shown)}{rest}"
-    if what == "union_tag_invalid":
-        dotted = f"{dotted}.kind"
-        value = layers.value_at((*keys, "kind"))
-        choices = kinds_of(info)
-        allowed = f"one of {', '.join(choices)}"
-    else:
-        value = layers.value_at(keys)
-        choices = choices_of(info.annotation)
-        allowed = allowed_values(info)
-    close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"{prefix}{dotted} must be {allowed}, not {_shorten(value)}{hint}"
-
-
-def _explain_unknown(layers: _Layers, keys: tuple[str, ...]) -> str:
-    """Return a message for a key that its section does not have: which kind has it, or which keys
-    are similar."""
-    above = keys[:-1]
-    dotted = ".".join(keys)
-    holder = section_at(layers.tree, above).model_fields.get(above[-1]) if above else None
-    variants = section_classes(holder) if holder is not None else []
-    owners = [str(v.model_fields["kind"].default) for v in variants if keys[-1] in v.model_fields]
-    if owners:
-        present = layers.value_at((*above, "kind"))
-        return f"{dotted} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {present}"
-    full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
-    section = section_at(layers.tree, keys)
-    return f"unknown key {_shorten(dotted)}{_did_you_mean_key(full, section, inside=bool(above) and full == keys)}"
-
-
-def _shorten(value: object) -> str:
-    try:
-        return printable(repr(value), 60)
-    except (ValueError, RecursionError):  # a number of more digits than Python writes
-        return "something very long"
-
-
-def _did_you_mean_key(keys: tuple[str, ...], section: type[BaseModel], inside: bool) -> str:
-    """``; did you mean ...?`` with the nearest key: of ``section`` if ``inside``, else the same
-    last word elsewhere."""
-    everything = list(dict.fromkeys(key.name for key in config_keys()))
-    dotted = ".".join(keys)
-    siblings = get_close_matches(keys[-1], list(section.model_fields), n=1)
-    if siblings and inside:
-        return f"; did you mean {'.'.join((*keys[:-1], siblings[0]))!r}?"
-    elsewhere = [name for name in everything if name.split(".")[-1] == keys[-1]]
-    if len(keys) > 1:
-        elsewhere = get_close_matches(dotted, elsewhere, n=1) or elsewhere
-    if elsewhere:
-        return f"; did you mean {' or '.join(repr(name) for name in elsewhere)}?"
-    close = get_close_matches(dotted, everything, n=1)
-    if close:
-        return f"; did you mean {close[0]!r}?"
-    return f"; known here: {', '.join(section.model_fields)}"

@@ -19,6 +19,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from dyngs.config import Config
+from dyngs.config.kinds import is_kind, kind_names, section_of_kind
+from dyngs.core.section import ModelSection
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> Co
         f"{name}.kind",
         (),
         f"one of {', '.join(kinds_of(info))}",
-        info.get_default().kind,
+        str(default_kind(info)),
         description,
     )
 
@@ -151,66 +153,74 @@ def choices_of(annotation: Any) -> list[str]:
 
 
 def default_text(info: FieldInfo) -> str:
-    if info.default is PydanticUndefined:
-        return ""
-    value = info.default.value if isinstance(info.default, Enum) else info.default
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, tuple):
-        return f"[{', '.join(str(v) for v in value)}]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return "" if info.default is PydanticUndefined else as_written(info.default)
+
+
+def as_written(value: object) -> str:
+    """Return a value as one writes it in YAML."""
+    match value:
+        case Enum():
+            return str(value.value)
+        case bool():
+            return str(value).lower()
+        case None:
+            return "null"
+        case list() | tuple():
+            return f"[{', '.join(as_written(item) for item in value)}]"
+        case float():
+            return f"{value:g}"
+        case _:
+            return str(value)
+
+
+def is_section(info: FieldInfo) -> bool:
+    return _is_any_kind(info) or bool(section_classes(info))
+
+
+def has_kinds(info: FieldInfo) -> bool:
+    """Return whether a section may be of several kinds."""
+    return _is_any_kind(info) or len(section_classes(info)) > 1
+
+
+def _is_any_kind(info: FieldInfo) -> bool:
+    return info.annotation is ModelSection
 
 
 def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
     """Return the section classes that a field may hold: several for a section with a ``kind``, none
     for a value."""
+    if _is_any_kind(info):
+        return [section_of_kind(name) for name in kind_names()]
     options = get_args(info.annotation) or (info.annotation,)
     return [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
 
 
 def kinds_of(info: FieldInfo) -> list[str]:
     """Return the kinds that a section may have; empty where there is only one class."""
-    variants = section_classes(info)
-    return (
-        [k for v in variants for k in choices_of(v.model_fields["kind"].annotation)]
-        if len(variants) > 1
-        else []
-    )
+    if _is_any_kind(info):
+        return kind_names()
+    variants = section_classes(info) if has_kinds(info) else []
+    return [kind for v in variants for kind in choices_of(v.model_fields["kind"].annotation)]
+
+
+def is_kind_of(info: FieldInfo, kind: object) -> bool:
+    """Return whether a section may be of this kind."""
+    return is_kind(kind) if _is_any_kind(info) else kind in kinds_of(info)
+
+
+def default_kind(info: FieldInfo) -> str | None:
+    """Return the kind of a section that does not say it; None: there is only one."""
+    default = info.get_default(call_default_factory=True)
+    return getattr(default, "kind", None)
 
 
 def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
     """Return the class of a section of this ``kind``; the default one where there is no such
     kind."""
+    kind = kind if is_kind_of(info, kind) else default_kind(info)
+    if _is_any_kind(info):
+        return section_of_kind(str(kind))
     variants = section_classes(info)
     if len(variants) == 1:
         return variants[0]
-    chosen = (v for v in variants if kind in choices_of(v.model_fields["kind"].annotation))
-    return next(chosen, type(info.get_default()))
-
-
-def section_at(tree: dict[str, Any], keys: tuple[str, ...]) -> type[BaseModel]:
-    """Return the class of the section that holds the last of ``keys`` (innermost known), by the
-    kinds in ``tree``."""
-    section: type[BaseModel] = Config
-    node: Any = tree
-    for key in keys[:-1]:
-        info = section.model_fields.get(key)
-        if info is None or not section_classes(info):
-            break
-        node = node.get(key) if isinstance(node, dict) else None
-        section = section_class(info, node.get("kind") if isinstance(node, dict) else None)
-    return section
-
-
-def keys_of_location(location: tuple[int | str, ...]) -> tuple[str, ...]:
-    """Return the keys of a pydantic location, without the kinds of sections and without indices."""
-    keys: list[str] = []
-    section: type[BaseModel] = Config
-    parts = iter(location)
-    for part in parts:
-        keys.append(str(part))
-        info = section.model_fields.get(str(part))
-        if info is None or not section_classes(info):
-            break
-        section = section_class(info, next(parts, None) if kinds_of(info) else None)
-    return tuple(keys)
+    return next(v for v in variants if kind in choices_of(v.model_fields["kind"].annotation))

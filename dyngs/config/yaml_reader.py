@@ -1,51 +1,37 @@
-"""Read YAML of presets and overrides as values with their origin (file, line); every YAML error
-becomes a DyngsError.
+"""Read YAML of presets and overrides as texts with their origin (file, line).
 
-A scalar that looks like a number or a date but is none (``2024-02-30``, ``0x_``, 5,000 digits) is
-read as text; the schema then says what it must be.
+Values stay as they were written (``007``, ``2024-02-30``); the keys of the configuration say what
+is a number. What is no YAML is a DyngsError of one line.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
-from copy import deepcopy
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-from yaml.composer import ComposerError
-from yaml.reader import ReaderError
 
-from dyngs.core.errors import DyngsError, printable, reason, require_name
+from dyngs.core.errors import DyngsError, printable, reason
 
 MAX_BYTES = 2**18
-"""Largest size of a preset or an override: read in 3 s; the longest that we know has 5 KB."""
-MAX_DEPTH = 40
-"""Deepest nesting of mappings and lists; a configuration has 4."""
-_BITS = 63
-"""Largest size of an integer."""
+"""Largest size of a preset or an override; the longest that we know has 5 KB."""
+MAX_BRACKETS = 500
+"""Most brackets of a file; thousands take the scanner seconds. A configuration has ten."""
 _SHOWN = 100
 """Characters of an override that a message repeats."""
-_NUMBER_TAGS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
-_ODD_NUMBER = re.compile(r"[-+_\s]*(0[\d_]|[\d_]+:)")
-"""YAML 1.1 takes 010 for 8 and 1:30 for 90: nobody means that."""
-_LONGEST_NUMBER = 400
-"""Characters; longer numbers take quadratic time."""
-_EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
+_NULL = ("", "~", "null", "Null", "NULL")
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One value of a file or an override: its keys, its value, its text, and its origin for
-    messages."""
+    """One value of a file or an override: a text, a list of values, None, or {} for a section
+    without keys; ``origin`` is for messages."""
 
     keys: tuple[str, ...]
     value: Any
-    text: str
     origin: str
 
 
@@ -54,30 +40,21 @@ def read_file(path: Path) -> list[Leaf]:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
+        text = data.decode("utf-8-sig")
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
     if len(data) > MAX_BYTES:
         raise DyngsError(
             f"{path}: is larger than {MAX_BYTES // 2**10} KiB, no configuration is; give a YAML preset"
         )
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
-    return [replace(leaf, value=deepcopy(leaf.value)) for leaf in _leaves(text, str(path))]
-
-
-@lru_cache(maxsize=16)
-def _leaves(text: str, origin: str) -> tuple[Leaf, ...]:
-    """Read the values of the text of a file; a command asks several times for those of the same
-    run."""
-    with _loaded(text, origin) as loader:
-        root = loader.get_single_node()
-        if root is None:
-            return ()
-        if not isinstance(root, yaml.MappingNode):
-            raise DyngsError(f"{origin}: must be a mapping of sections (data:, train:, ...)")
-        return tuple(_walk(loader, root, (), origin, lines=True))
+    root = _root(text, str(path))
+    if root is None:
+        return []
+    if not isinstance(root, yaml.MappingNode):
+        raise DyngsError(f"{path}: must be a mapping of sections (data:, train:, ...)")
+    return list(_leaves(root, (), str(path), lines=True))
 
 
 def read_override(text: str) -> list[Leaf]:
@@ -94,106 +71,45 @@ def read_override(text: str) -> list[Leaf]:
     if len(written) > MAX_BYTES:
         raise DyngsError(f"{origin}: has {len(written)} characters; no value is as long")
     try:
-        with _loaded(written, origin) as loader:
-            node = loader.get_single_node()
-            if isinstance(node, yaml.MappingNode) and not node.flow_style:
-                # "10:", which only looks like a mapping
-                return [Leaf(keys, written, written, origin)]
-            if isinstance(node, yaml.MappingNode) and node.value:
-                return [replace(leaf, origin=origin) for leaf in _walk(loader, node, keys, origin)]
-            value = None if node is None else loader.construct_object(node, deep=True)  # type: ignore[no-untyped-call]
-    except _NotYaml:
-        value = written  # a path or a name that happens not to be YAML
-    return [Leaf(keys, value, written, origin)]
-
-
-class _NotYaml(DyngsError):
-    """Text that is not valid YAML, as opposed to YAML that is not allowed here."""
-
-
-class _PresetLoader(yaml.SafeLoader):
-    """Safe YAML without aliases, of limited depth, and with ``1e-4`` read as the number that it
-    is."""
-
-    depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-        if self.check_event(yaml.AliasEvent):
-            raise ComposerError(None, None, "aliases (*name) are not allowed here", mark)
-        if self.depth > MAX_DEPTH:
-            raise ComposerError(None, None, "nested too deeply for a configuration", mark)
-        self.depth += 1
-        try:
-            return super().compose_node(parent, index)
-        finally:
-            self.depth -= 1
-
-    def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level > MAX_DEPTH:
-            # before composing: thousands of brackets take the scanner seconds
-            raise ComposerError(
-                None, None, "nested too deeply for a configuration", self.get_mark()
-            )
-        super().fetch_flow_collection_start(TokenClass)  # type: ignore[no-untyped-call]
-
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """Return the value of a node; its text where it only looks like a number or date, or is too
-        large a number."""
-        if not isinstance(node, yaml.ScalarNode):
-            return super().construct_object(node, deep)  # type: ignore[no-untyped-call]
-        is_number = node.tag in _NUMBER_TAGS
-        if is_number and (_ODD_NUMBER.match(node.value) or len(node.value) > _LONGEST_NUMBER):
-            return node.value
-        try:
-            value = super().construct_object(node, deep)  # type: ignore[no-untyped-call]
-        except Exception:  # of int(), date() and the like, which YAML passes on
-            return node.value
-        return node.value if isinstance(value, int) and value.bit_length() > _BITS else value
-
-
-_PresetLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, list("-+.0123456789"))
-
-
-@contextmanager
-def _loaded(text: str, origin: str) -> Iterator[_PresetLoader]:
-    """Yield a loader of ``text``; whatever YAML raises in the block is one line."""
-    loader: _PresetLoader | None = None
-    try:
-        loader = _PresetLoader(text)
-        yield loader
+        node = _root(written, origin)
     except DyngsError:
-        raise
-    except Exception as error:
-        raise _NotYaml(f"{origin}{_problem(error, text)}") from error
-    finally:
-        if loader is not None:
-            loader.dispose()
+        return [Leaf(keys, written, origin)]  # a path or a name that happens not to be YAML
+    match node:
+        case yaml.MappingNode(flow_style=True) if node.value:
+            return list(_leaves(node, keys, origin))
+        case yaml.SequenceNode(flow_style=True) | yaml.MappingNode(flow_style=True):
+            return [Leaf(keys, _value(node), origin)]
+        case None:
+            return [Leaf(keys, None, origin)]
+        case _:  # a block such as "10:" only looks like one
+            is_null = isinstance(node, yaml.ScalarNode) and _value(node) is None
+            quoted = isinstance(node, yaml.ScalarNode) and node.style is not None
+            return [Leaf(keys, None if is_null else _value(node) if quoted else written, origin)]
 
 
-def _problem(error: Exception, text: str) -> str:
-    """Return the line and what is wrong there, after the origin."""
-    if isinstance(error, RecursionError):
-        return ": nested too deeply for a configuration"
-    if isinstance(error, ReaderError):
-        line = text.count("\n", 0, error.position) + 1
-        return f":{line}: not valid YAML: the control character {chr(error.character)!r}; remove it"
-    if isinstance(error, yaml.MarkedYAMLError):
-        mark = error.problem_mark or error.context_mark
-        problem = printable(error.problem or error.context or "not valid YAML", 2 * _SHOWN)
+def _root(text: str, origin: str) -> yaml.Node | None:
+    """Return the node of a YAML text. Raises DyngsError: its line and what is wrong there."""
+    if text.count("[") + text.count("{") > MAX_BRACKETS:
+        raise DyngsError(f"{origin}: nested too deeply for a configuration")
+    try:
+        for event in yaml.parse(text, yaml.BaseLoader):
+            if isinstance(event, yaml.AliasEvent):
+                line = event.start_mark.line + 1
+                raise DyngsError(f"{origin}:{line}: aliases (*name) are not allowed here")
+        return yaml.compose(text, yaml.BaseLoader)
+    except (yaml.YAMLError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark is not None else ""
+        problem = getattr(error, "problem", None) or reason(error)
         if "'\\t'" in problem:
             problem = "a tab where YAML wants spaces; indent with spaces"
-        return f"{f':{mark.line + 1}' if mark is not None else ''}: not valid YAML: {problem}"
-    return f": not valid YAML: {reason(error)}"
+        raise DyngsError(
+            f"{origin}{line}: not valid YAML: {printable(problem, 2 * _SHOWN)}"
+        ) from error
 
 
-def _walk(
-    loader: yaml.SafeLoader,
-    node: yaml.MappingNode,
-    above: tuple[str, ...],
-    origin: str,
-    *,
-    lines: bool = False,
+def _leaves(
+    node: yaml.MappingNode, above: tuple[str, ...], origin: str, *, lines: bool = False
 ) -> Iterator[Leaf]:
     seen: set[str] = set()
     for key_node, value_node in node.value:
@@ -201,28 +117,22 @@ def _walk(
         if not isinstance(key_node, yaml.ScalarNode):
             raise DyngsError(f"{where}: keys must be plain words")
         key = key_node.value
-        shown = printable(key, _SHOWN)
+        shown = printable(".".join((*above, key)), _SHOWN)
         if "." in key:
-            raise DyngsError(
-                f"{where}: {shown!r} must be nested in YAML: {shown.replace('.', ': {', 1)}: ...}}"
-            )
+            raise DyngsError(f"{where}: {shown!r} must be nested in YAML: {key.split('.')[0]}: ...")
         if key in seen:
-            dotted = printable(".".join((*above, key)), _SHOWN)
-            raise DyngsError(f"{where}: duplicate key {dotted}; keep one of the two")
+            raise DyngsError(f"{where}: duplicate key {shown}; keep one of the two")
         seen.add(key)
         if isinstance(value_node, yaml.MappingNode) and value_node.value:
-            yield from _walk(loader, value_node, (*above, key), origin, lines=lines)
+            yield from _leaves(value_node, (*above, key), origin, lines=lines)
         else:
-            text = value_node.value if isinstance(value_node, yaml.ScalarNode) else ""
-            yield Leaf((*above, key), loader.construct_object(value_node, deep=True), text, where)
+            yield Leaf((*above, key), _value(value_node), where)
 
 
-def require_usable(leaf: Leaf) -> None:
-    """Raise DyngsError if a text cannot be a file name: NUL, or not a character."""
-    if isinstance(leaf.value, str):
-        try:
-            require_name(leaf.value)
-        except DyngsError as error:
-            raise DyngsError(
-                f"{leaf.origin}: {printable('.'.join(leaf.keys), _SHOWN)}: {error}"
-            ) from None
+def _value(node: yaml.Node) -> Any:
+    """Return the text of a node, or the list of those in it; None for a plain null."""
+    if isinstance(node, yaml.ScalarNode):
+        return None if node.style is None and node.value in _NULL else node.value
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item) for item in node.value]
+    return {key.value: _value(value) for key, value in node.value}

@@ -3,9 +3,9 @@ use."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from dyngs.core.conventions import RasterizeMode
 
@@ -17,45 +17,34 @@ CutOff = Annotated[float, Field(ge=1e-6, le=0.5)]
 """Opacity or transmittance below which the rasterizer stops."""
 
 
+def as_number(value: object) -> object:
+    """Return the number that a text of digits is, for choices between numbers."""
+    return int(value) if isinstance(value, str) and value.isdecimal() else value
+
+
 class Section(BaseModel):
     """Base of every section: immutable, unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    @field_validator("*")
+    @classmethod
+    def _require_countable(cls, value: object) -> object:
+        if isinstance(value, int) and abs(value) >= 2**63:
+            raise ValueError("must be below 2^63")
+        return value
+
 
 class ModelSection(Section):
-    """Base of the sections of all kinds, with what code that does not otherwise care for kinds asks
-    of them.
+    """Base of the section ``model`` of every kind."""
 
-    Attributes:
-        made_of_gaussians: it has Gaussians, which a strategy adds and limits remove.
-        begins_with_points: they begin where the points of the capture are.
-        is_network: it predicts scenes, and is trained on several captures.
-        is_posed: a body moves it: priors on motion say nothing, and poses are refined instead of
-            cameras.
-        source_views: images that a network predicts from, unless it is told otherwise.
-        may_move: a field moves it over the times of the capture.
-        draws_whole_images: in training; what needs these (priors, masks of what disagrees, refined
-            cameras, exposures) does not go with a model that draws some pixels of an image.
-        is_trained: not only predicted, so that a run may be unfinished.
-    """
-
-    made_of_gaussians: ClassVar[bool] = False
-    begins_with_points: ClassVar[bool] = False
-    is_network: ClassVar[bool] = False
-    is_posed: ClassVar[bool] = False
-    may_move: ClassVar[bool] = False
-    draws_whole_images: ClassVar[bool] = True
-    is_trained: ClassVar[bool] = True
     if TYPE_CHECKING:
         kind: Any = None
         """Name of the kind."""
-        source_views: Any = 0
-        lr: Any = 0.0
 
     @property
     def added_for_motion(self) -> int:
-        """Number of random Gaussians that are added where motion begins."""
+        """Number of Gaussians that are added when motion begins."""
         return 0
 
     @property
@@ -75,8 +64,6 @@ class ModelSection(Section):
 
 class SceneModel(ModelSection):
     """Keys that all models of Gaussians share: how these are coloured and drawn."""
-
-    made_of_gaussians: ClassVar[bool] = True
 
     sh_degree: int = Field(
         default=3,

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from dyngs.config import ControlNodesField
 from dyngs.core.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import (
@@ -33,6 +32,7 @@ from dyngs.deform.field import (
     head_sizes,
     offsets_of,
 )
+from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.nodes import SPAN, cubic_fractions, node_penalties, spline_motion

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dyngs.config import FieldSection
 from dyngs.core.initialisation import glorot
 from dyngs.core.state import State, moved_to, part_of, prefixed
+from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.config import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
 from dyngs.core.state import Role, State, part_of, prefixed, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, OuterField, chosen
 from dyngs.deform.free import FreePrimitives
+from dyngs.deform.keys import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
 from dyngs.deform.networks import Hexplane, Mlp
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
@@ -93,6 +93,14 @@ def new_field(
             return FreePrimitives(options, setup, generator)
         case _:
             assert_never(options)
+
+
+def num_values(options: DeformField, num_times: int, num_moving: int = 0) -> int:
+    """Return the number of values that a field learns for so many Gaussians that move."""
+    setup = FieldSetup(
+        torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0
+    )
+    return new_field(options, setup, torch.Generator()).parameters.num_values
 
 
 def field_state(field: DeformationField) -> State:

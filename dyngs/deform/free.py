@@ -16,11 +16,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.config import FreeField
 from dyngs.core.state import Role
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.fixed_cameras.start import Moment
-from dyngs.deform.keys import COPIES_OF_MOVING
+from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -113,9 +113,6 @@ it."""
 
 class DynamicModel(SceneModel):
     """Canonical Gaussians and a deformation field over time (docs/dynamic.md)."""
-
-    begins_with_points: ClassVar[bool] = True
-    may_move: ClassVar[bool] = True
 
     kind: Literal["dynamic"] = Field(
         default="dynamic",

@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.config import HexplaneField, MlpField
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
     Decoder,
@@ -18,6 +17,7 @@ from dyngs.deform.field import (
     head_sizes,
     split_heads,
 )
+from dyngs.deform.keys import HexplaneField, MlpField
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import DynamicModel
 from dyngs.core.state import Role, State, StateTensor, part_of, prefixed
 from dyngs.core.tensor_checks import require_ascending, require_indices
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
+from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import DynamicModel, FreeField
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, with_role
 from dyngs.data.loader import Image
@@ -26,6 +25,7 @@ from dyngs.deform.fields import WindowedField, new_field
 from dyngs.deform.fixed_cameras.hulls import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.free import FreePrimitives, FreeStart, free_start
+from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene

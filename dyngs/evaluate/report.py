@@ -27,6 +27,7 @@ from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.kind import Moves, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
@@ -376,14 +377,14 @@ def parameter_megabytes(scene: GaussianScene) -> float:
 
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     notes = []
-    if run.step < run.config.total_steps and run.config.model.is_trained:
+    if 0 < run.step < run.config.total_steps:
         notes.append(
             f"the run is not finished: it stands at step {run.step:,} of {run.config.total_steps:,}, and its schedules "
             "where they were then"
         )
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
-    if run.config.model.may_move and run.renderable.is_static:
+    if capability(run.config.model, Moves) is not None and run.renderable.is_static:
         notes.append(
             "the model is dynamic, but nothing moves in it: it is drawn as fast as a static one"
         )

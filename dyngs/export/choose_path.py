@@ -23,6 +23,7 @@ from dyngs.export.camera_paths import (
 from dyngs.export.images import file_stems
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
 from dyngs.models.renderable import Renderable
@@ -142,8 +143,9 @@ def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras
     front."""
     ring = orbit_around(opened, _RING, size)
     front = 0
-    if opened.person is not None:
-        facing = axis_angle_to_matrix(opened.person.clip.poses[0, 0])[:, 2]
+    person = avatar_of(opened.renderable)
+    if person is not None:
+        facing = axis_angle_to_matrix(person.clip.poses[0, 0])[:, 2]
         front = int((ring.centers @ facing).argmax())
     return pick_cameras(ring, [(front + i) % _RING for i in (-1, 0, 1)])
 

@@ -1,6 +1,6 @@
 """Scenes that can be trained and drawn: N Gaussians with their motion and colours.
 
-There is one class per kind of model: ``static.scene.StaticScene``, ``deform.scene.DynamicScene``
+There is one class per kind of model: ``gaussians.static_scene.StaticScene``, ``deform.scene.DynamicScene``
 and ``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the
 same class. How it is trained is the business of ``gaussians.model``.
 """

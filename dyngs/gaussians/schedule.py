@@ -8,16 +8,9 @@ from dataclasses import dataclass
 
 from typing_extensions import assert_never
 
-from dyngs.config import (
-    Config,
-    DefaultStrategy,
-    McmcStrategy,
-    OptimConfig,
-    StaticModel,
-    Strategy,
-    TrainConfig,
-)
+from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
 from dyngs.gaussians.densify import DensifySchedule
+from dyngs.models.kind import HasGaussians, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 
 MIN_START = 100  # Densification never starts earlier: the first gradients say little
@@ -74,9 +67,9 @@ def rate_factors(config: Config) -> tuple[float, float]:
     short = PUBLISHED_STEPS / max(SHORTEST, min(config.train.steps, PUBLISHED_STEPS))
     if asked is not None:
         return asked, asked
-    return (
-        (short**MEANS_POWER, short**POWER) if isinstance(config.model, StaticModel) else (1.0, 1.0)
-    )
+    kind = capability(config.model, HasGaussians)
+    speeds_up = kind is not None and kind.speeds_up_short_runs
+    return (short**MEANS_POWER, short**POWER) if speeds_up else (1.0, 1.0)
 
 
 def learning_rates(config: Config) -> OptimConfig:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import DefaultStrategy, SceneInit, StaticModel
+from dyngs.config import DefaultStrategy, SceneInit
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_tensor
@@ -27,6 +27,7 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
+from dyngs.static.keys import StaticModel
 
 # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
 SURVEYED = 200

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -12,8 +12,6 @@ from dyngs.core.section import Fraction, Positive, SceneModel
 
 class _OnTemplate(SceneModel):
     """Keys that models of people share: a body template."""
-
-    is_posed: ClassVar[bool] = True
 
     body: Path | None = Field(
         default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template"
@@ -79,13 +77,19 @@ class HumanModel(_OnTemplate):
         description="weight of the squared difference between neighbours' offsets, cm^2",
     )
 
+    @property
+    def moving_bytes(self) -> int:
+        """Bytes of its anchor, weights of joints, their gradients, and the Gaussian in a pose, where
+        the body fit is refined."""
+        return 2600
+
+    def size_key(self, count: int) -> tuple[str, float, float]:
+        return "model.resolution", self.resolution, 0.5
+
 
 class HumanPredictorModel(_OnTemplate):
     """A network that predicts people from a few images, trained on others
     (docs/people_network.md)."""
-
-    made_of_gaussians: ClassVar[bool] = False
-    is_network: ClassVar[bool] = True
 
     kind: Literal["human_predictor"] = Field(
         default="human_predictor",

@@ -1,8 +1,8 @@
 """Networks that predict scenes from a few images: what each of them is, in training and at work.
 
-A kind of network has a module with ``learner(config, generator)``, which returns its ``Learner``,
-and ``predictor(config, checkpoint, data)``, which returns its ``Predictor`` for one capture. One
-trainer (``dyngs.training.prediction``) and one command (``dyngs.api.predict``) serve all kinds.
+A kind of network (``dyngs.models.kind.Predicts``) makes its ``Learner``, and its ``Predictor`` for
+one capture. One trainer (``dyngs.training.prediction``) and one command (``dyngs.api.predict``)
+serve all kinds.
 What is predicted is any ``Renderable``: Gaussians, an avatar, a field.
 """
 
@@ -86,11 +86,13 @@ class Learner(ABC, Generic[N]):
 
     Attributes:
         network: its weights are learned.
+        lr: highest learning rate of AdamW.
         names: of the people.
         background: "white", "black" or "random".
     """
 
     network: N
+    lr: float
     names: Sequence[str]
     background: str
 

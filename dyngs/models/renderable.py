@@ -17,10 +17,12 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, fields_moved_to
+from dyngs.data.capture import Capture, Split
 from dyngs.ops.checks import check_choice, check_finite, check_number
 
 R = TypeVar("R", bound="Renderable")
 T = TypeVar("T")
+P = TypeVar("P", bound="Posable")
 Images = TypeVar("Images", bound="Rendering")
 
 
@@ -312,3 +314,23 @@ def clamped_time(time: float | None) -> float:
     if time is not None and math.isnan(time):
         raise DyngsError("the time to draw is not a number; give one from 0 to 1")
     return min(max(0.0 if time is None else time, 0.0), 1.0)
+
+
+class Posable(Renderable):
+    """A person, whose body can play other motions than that of training."""
+
+    @abstractmethod
+    def up_of_body(self) -> Tensor:
+        """Return the direction (3,) that is up for the body at rest."""
+
+    @abstractmethod
+    def at_rest(self: P) -> P:
+        """Return it in the rest pose of its template, upright on the floor."""
+
+    @abstractmethod
+    def placed(self: P, rotation: Tensor, scale: float, shift: Tensor) -> P:
+        """Return it moved by a similarity: rotation (3, 3), then scale, then shift (3,)."""
+
+    @abstractmethod
+    def as_filmed(self: P, capture: Capture, split: Split) -> P:
+        """Return it as the views of a split of its capture show it."""

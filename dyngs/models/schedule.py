@@ -2,9 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from dyngs.config import TrainConfig
 
 PUBLISHED_STEPS = 30_000
+
+
+@dataclass(frozen=True)
+class Length:
+    """A change of the length of a run."""
+
+    done: int
+    was: int
+    steps: int
+
+    def kept(self, step: int | float) -> float:
+        """Return the fraction of the new length at which ``step`` of the old one lies, at most
+        1."""
+        return min(step / self.steps, 1.0)
+
+    def share(self, fraction: float) -> float:
+        """Return the fraction of the new length for what began, or shall begin, after ``fraction``
+        of a run."""
+        if self.done >= round(fraction * self.was):
+            return self.kept(fraction * self.was)
+        return (
+            max(fraction, self.kept(self.done + 1))
+            if self.done >= round(fraction * self.steps)
+            else fraction
+        )
 
 
 def scaled(step: int, steps: int) -> int:

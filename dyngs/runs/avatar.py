@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel
+from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, printable
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
@@ -26,6 +26,7 @@ from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import TERMS, PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
 from dyngs.human.body.body_reader import template_path
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.views import background_colour

@@ -28,6 +28,7 @@ from dyngs.io.limits import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.runs.stored_file import read_scene
 
@@ -149,7 +150,7 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
     """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has
     none."""
     config = load_resolved(run_dir, data_root=data_root)
-    if config.model.is_network:
+    if capability(config.model, Predicts) is not None:
         raise DyngsError(
             f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
         )

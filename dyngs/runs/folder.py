@@ -15,6 +15,7 @@ from dyngs.data.read import read_capture
 from dyngs.io.lock import LOCK_NAME, writing
 from dyngs.io.outputs import new_folder
 from dyngs.io.temporary import remove_leftovers
+from dyngs.models.kind import Predicts, capability
 from dyngs.runs.capture_record import RECORD_NAME, changed_files
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
@@ -146,7 +147,8 @@ def note_root(folder: Path, data: DataConfig) -> None:
     for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:
-            capture = None if stored.model.is_network else read_capture(data)
+            is_network = capability(stored.model, Predicts) is not None
+            capture = None if is_network else read_capture(data)
             changed_files(folder, data, capture)
             save_config(
                 stored.model_copy(

@@ -15,6 +15,7 @@ from dyngs.config import Config
 from dyngs.core.errors import DyngsError, reading
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import Predicts, capability
 from dyngs.runs.checkpoint import info_of
 from dyngs.runs.inputs import inputs_of
 
@@ -70,7 +71,7 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
         if not isinstance(model, dict) or model.get("body") is not None:
             raise ValueError("its section model is not that of a network")
         config = Config.model_validate({"data": {"root": path.parent}, "model": model})
-        if not config.model.is_network:
+        if capability(config.model, Predicts) is None:
             raise ValueError(f"it is of model.kind={config.model.kind}")
     return config, Checkpoint(
         info, {n: x.float() if x.is_floating_point() else x for n, x in tensors.items()}, path

@@ -3,7 +3,6 @@ training in progress."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, StaticModel
+from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.aim import up_direction
@@ -21,20 +20,19 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.human.body.body_reader import load_template
-from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
 from dyngs.io.formats.splat_file import Nonfinite
 from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
-from dyngs.models.renderable import Renderable
+from dyngs.models.kind import HasBody, capability
+from dyngs.models.renderable import Posable, Renderable
 from dyngs.models.views import background_colour, training_cameras
 from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
+from dyngs.static.keys import StaticModel
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""
@@ -185,9 +183,9 @@ class Opened(LoadedRun):
         return own if self.edited is None else self.edited.similarity.rotation.T @ own
 
     @property
-    def person(self) -> HumanScene | None:
+    def person(self) -> Posable | None:
         """The scene if it is of a person."""
-        return avatar_of(self.renderable)
+        return self.renderable if isinstance(self.renderable, Posable) else None
 
     @property
     def up(self) -> tuple[np.ndarray, str] | None:
@@ -198,10 +196,7 @@ class Opened(LoadedRun):
                 self.stated_up
             ), "the file" if self.edited is None else "the edit"
         if self.person is not None:
-            # late: scipy, as below
-            from dyngs.human.motion.placement import up_direction as up_of_body
-
-            return up_of_body(self.person.clip).double().cpu().numpy(), "the body at rest"
+            return self.person.up_of_body().double().cpu().numpy(), "the body at rest"
         cameras = self.cameras
         return None if cameras is None else (up_direction(cameras), "the mean camera")
 
@@ -240,88 +235,48 @@ class Opened(LoadedRun):
         return self.showing(scene_of_split(self, self.capture, split))
 
     def in_motion(self, path: Path, *, keep_feet: bool = False) -> Opened:
-        """Return the same with its person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM
-        animation).
-
-        A file with ``scale`` is a fit to this person in the world of the capture; any other motion
-        is adapted to the size, position and up direction of the person. With ``keep_feet`` the root
-        moves so that feet on the floor stay where they are (``dyngs.human.motion.feet``); a note
-        says by how much they slide before and after.
+        """Return the same with its person in the motion of a file, see ``HasBody.in_motion``.
 
         Raises:
             DyngsError: it is no person, or the file cannot be read.
         """
-        # late: they need scipy, which no other drawing does
-        from dyngs.human.motion.placement import place_like
-        from dyngs.human.motion.retarget import read_motion
-
-        person, model = self._person_for(f"--motion {path}")
-        scene = person.to("cpu")
-        motion = read_motion(path, load_template(model))
-        if motion.poses.shape[1] != len(scene.skeleton.joints):
-            motion = motion.for_joints(len(scene.skeleton.joints))
-        is_fit = bool((motion.scale != 1).any())
-        if is_fit:
-            trans = motion.trans - motion.trans.new_tensor(self.info.world_offset)
-            unit = self.info.world_scale
-            motion = replace(motion, trans=trans / unit, scale=motion.scale / unit)
-        clip = motion_clip(motion)
-        if not is_fit:
-            clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-        playing = scene.playing(clip)
-        notes = (*self.notes, *motion.notes)
-        if keep_feet:
-            from dyngs.human.motion.feet import feet_kept, sole_points  # late: scipy, as above
-            from dyngs.human.motion.placement import up_direction as up_of_body
-
-            skeleton = playing.learned_skeleton
-            floor = float(scene.anchors.points[:, 1].min())
-            soles = sole_points(playing.moves_as, skeleton.joints, skeleton.parents, floor)
-            clip, before, after = feet_kept(clip, soles, up_of_body(scene.clip), motion.fps)
-            playing = scene.playing(clip)
-            notes = (*notes, before.compared(after))
-        playing = playing.to(person.gaussians.means.device)
-        return replace(self, renderable=playing, fps=motion.fps, as_captured=False, notes=notes)
+        wanted = f"--motion {path}"
+        person = self.require_person(wanted)
+        body = capability(self.config.model, HasBody)
+        if body is None:
+            raise self._no_person(wanted)
+        found = body.in_motion(self.config.model, person, self.info, path, keep_feet=keep_feet)
+        notes = (*self.notes, *found.notes)
+        return replace(self, renderable=found.scene, fps=found.fps, as_captured=False, notes=notes)
 
     def at_rest(self) -> Opened:
         """Return the same with its person in the rest pose of the template, upright on the floor.
         Raises DyngsError."""
-        from dyngs.human.motion.placement import rest_clip  # late: scipy, as above
-
-        scene, _ = self._person_for("--pose rest")
-        rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-        return replace(self, renderable=scene.playing(rest), as_captured=False)
+        person = self.require_person("--pose rest")
+        return replace(self, renderable=person.at_rest(), as_captured=False)
 
     def in_own_frame(self) -> Opened:
         """Return the same with its person moved into the frame of the edit, for files that hold
         nothing but them."""
-        person = self.person
         how = self.frame
-        if self.edited is None or person is None:
+        if self.edited is None or self.person is None:
             return self
-        from dyngs.human.motion.placement import moved  # late: scipy, as above
-
-        like = person.clip.trans
-        pelvis = person.learned_skeleton.joints[0] * math.exp(person.fit.log_scale)
-        rotation = torch.from_numpy(how.rotation).to(like)
-        shift = like.new_tensor(how.shift)
-
-        def there(clip: MotionClip) -> MotionClip:
-            return moved(clip, rotation, how.scale, shift, pelvis)
-
-        played = None if person.played is None else there(person.played)
-        scene = replace(person, clip=there(person.clip), played=played)
+        rotation = torch.from_numpy(how.rotation)
+        scene = self.person.placed(rotation, how.scale, torch.tensor(how.shift))
         info = replace(self.info, world_offset=self.edited.offset, world_scale=1.0)
         return replace(self, renderable=scene, info=info, edited=None, stated_up=None)
 
-    def _person_for(self, wanted: str) -> tuple[HumanScene, HumanModel]:
-        model = self.config.model
-        if self.person is None or not isinstance(model, HumanModel):
-            kind = self.config.model.kind
-            raise DyngsError(
-                f"{wanted} needs the run of a person (model.kind=human), this one is {kind}"
-            )
-        return self.person, model
+    def require_person(self, wanted: str) -> Posable:
+        """Return the person. Raises DyngsError: ``wanted`` needs one, and it is none."""
+        if self.person is None:
+            raise self._no_person(wanted)
+        return self.person
+
+    def _no_person(self, wanted: str) -> DyngsError:
+        kind = self.config.model.kind
+        return DyngsError(
+            f"{wanted} needs the run of a person (model.kind=human), this one is {kind}"
+        )
 
 
 def _once(kept: dict[str, Any], name: str, compute: Callable[[], T]) -> T:
@@ -416,17 +371,8 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
 
 def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
     """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that
-    split.
-
-    The split pose, and splits with body parameters of their own, have the poses of their files.
-    Others show the clip of training with its refined poses, interpolated at times between.
-    """
-    avatar = avatar_of(run.renderable)
-    if avatar is None or capture.body is None:
+    split."""
+    if not isinstance(run.renderable, Posable):
         return run.renderable
-    own = capture.body[cast(Split, split)]
-    trained = capture.body["train"]
-    if split != "pose" and same_bodies(own, trained):
-        return run.renderable
-    shown = captured_motion(capture.root, own, split_views(capture, split), avatar.skeleton.joints)
-    return avatar.playing(shown.clip)
+    split_views(capture, split)
+    return run.renderable.as_filmed(capture, cast(Split, split))

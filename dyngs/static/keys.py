@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -11,8 +11,6 @@ from dyngs.core.section import SceneModel
 
 class StaticModel(SceneModel):
     """3D Gaussian splatting, Mip-Splatting's filters as options."""
-
-    begins_with_points: ClassVar[bool] = True
 
     kind: Literal["static"] = Field(
         default="static", description="3D Gaussians of a static scene (3DGS)"

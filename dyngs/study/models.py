@@ -27,7 +27,7 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture, require_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import Drawing
-from dyngs.models.kind import kind_of
+from dyngs.models.kind import Predicts, capability, kind_of
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import EXPORT_FOLDER
@@ -138,7 +138,7 @@ def planned(comparison: Comparison, models: Sequence[str]) -> Plan:
             config = load_config(file, comparison.words(name))
             require_possible(config)
             problem = kind_of(config.model).refusal(capture)
-            if config.model.is_network:
+            if capability(config.model, Predicts) is not None:
                 problem = "is a network, which is trained on many people"
         except DyngsError as error:
             problem = str(error)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.api.predict import trained_network
+from dyngs.api.predict import require_network, trained_network
 from dyngs.api.train import train
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -30,7 +30,6 @@ from dyngs.data.read import read_capture
 from dyngs.human.predict.gps.pairs import angle, around
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
-from dyngs.models.kind import kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import load_run
@@ -109,10 +108,8 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
             for name, config, checkpoint in loaded:
                 own = {key: getattr(given, key) for key in changed}
                 data = config.data.model_copy(update={"root": person.root, "test_every": 0} | own)
-                kind = kind_of(config.model)
-                make = partial(
-                    kind.predictor, config, checkpoint, data, say=show, report=report_nothing
-                )
+                kind = require_network(config, Path(name))
+                make = partial(kind.networks()[1], config, checkpoint, data, show, report_nothing)
                 views = make().views
                 methods: dict[str, Method] = {name: partial(_predicted, make, False)}
                 if config.model.kind == "human_predictor":

@@ -11,14 +11,16 @@ from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import num_cores
 from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.compress.stage import pruning
-from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
+from dyngs.config import BudgetConfig, Config, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.schema import section_class
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
+from dyngs.deform.keys import DynamicModel, FieldSection
 from dyngs.gaussians.restored import restored_model
 from dyngs.models.checkpoint import read_capture_of, settings_of
+from dyngs.models.kind import Moves, capability
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -99,7 +101,7 @@ class VariantRuns:
         out = self.out / "training" / wanted.slug
         run = load_resolved(self.run_dir)
         changes = [*field_changes(run, wanted)]
-        if run.model.may_move:
+        if capability(run.model, Moves) is not None:
             # a variant is what it says: nothing is chosen, and it stays a moving scene
             changes += ["model.choose=false"]
         if wanted.colour is not None:

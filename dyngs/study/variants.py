@@ -8,10 +8,11 @@ from dataclasses import dataclass, fields, replace
 
 from pydantic import ConfigDict
 
-from dyngs.config import Config, DynamicModel
+from dyngs.config import Config
 from dyngs.config.schema import kinds_of
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, printable
+from dyngs.deform.keys import DynamicModel
 
 Value = float | int | str
 SEVERAL = "several"

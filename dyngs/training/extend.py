@@ -8,41 +8,12 @@ measured a second time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.config import Config, DynamicModel, HumanModel, TrainConfig
+from dyngs.config import Config, TrainConfig
 from dyngs.core.errors import DyngsError, counted
-from dyngs.deform.schedule import deform_schedule
-from dyngs.deform.training import DeformSchedule
-from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
-from dyngs.models.schedule import PUBLISHED_STEPS, scaled
+from dyngs.gaussians.schedule import learning_rates, means_rate, rates_of
+from dyngs.models.kind import ExtendsTo, HasGaussians, capability
+from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
 from dyngs.training.corrections.exposure import WARM_UP
-
-
-@dataclass(frozen=True)
-class Length:
-    """A change of the length of a run."""
-
-    done: int
-    was: int
-    steps: int
-
-    def kept(self, step: int | float) -> float:
-        """Return the fraction of the new length at which ``step`` of the old one lies, at most
-        1."""
-        return min(step / self.steps, 1.0)
-
-    def share(self, fraction: float) -> float:
-        """Return the fraction of the new length for what began, or shall begin, after ``fraction``
-        of a run."""
-        if self.done >= round(fraction * self.was):
-            return self.kept(fraction * self.was)
-        return (
-            max(fraction, self.kept(self.done + 1))
-            if self.done >= round(fraction * self.steps)
-            else fraction
-        )
 
 
 def with_length(config: Config, done: int, steps: int) -> Config:
@@ -65,17 +36,9 @@ def with_length(config: Config, done: int, steps: int) -> Config:
         )
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
-    match config.model:
-        case DynamicModel():
-            changed["model"] = _dynamic(config.model, length)
-        case HumanModel():
-            fraction = length.share(config.model.refine_from)
-            changed["model"] = config.model.model_copy(update={"refine_from": fraction})
-        case BgTriangleModel():
-            fraction = length.share(config.model.texture_from)
-            changed["model"] = config.model.model_copy(update={"texture_from": fraction})
-        case _:
-            pass
+    extends = capability(config.model, ExtendsTo)
+    if extends is not None:
+        changed["model"] = extends.extended(config.model, length)
     return config.model_copy(update=changed)
 
 
@@ -93,7 +56,7 @@ def told(before: Config, after: Config, done: int) -> str:
     was = before.train.steps
     steps = after.train.steps
     line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {counted(steps, 'step')}"
-    if not after.model.made_of_gaussians:
+    if capability(after.model, HasGaussians) is None:
         return line
     then, now = (
         means_rate(learning_rates(c), rates_of(c).progress(done), 1.0) for c in (before, after)
@@ -115,30 +78,3 @@ def _train(options: TrainConfig, length: Length) -> TrainConfig:
         pace = scaled(options.sh_every, length.was)
         changed["sh_every"] = max(1, pace * PUBLISHED_STEPS // length.steps)
     return options.model_copy(update=changed)
-
-
-def _dynamic(model: DynamicModel, length: Length) -> DynamicModel:
-    old = deform_schedule(model, Rates(length.was))
-    fractions = {"motion_from": _motion_from(old, model, length)}
-    if length.done >= old.opens:
-        fractions |= {
-            "time_window_grows_from": length.kept(old.opens),
-            "time_window_full_at": length.kept(old.full),
-        }
-    changed = model.model_copy(update=fractions)
-    begins = changed.moves_after(length.steps)
-    if old.fine <= length.done < begins:
-        raise DyngsError(
-            f"train.steps={length.steps}: motion began after {old.fine:,} steps, and a run of {length.steps:,} trains "
-            f"{begins:,} before anything moves; train anew with so many steps"
-        )
-    return changed
-
-
-def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
-    """Return the share after which motion is learned: the step where it began, else one that is
-    still to come."""
-    if length.done >= old.fine:
-        return length.kept(old.fine)
-    new = deform_schedule(model, Rates(length.steps))
-    return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from

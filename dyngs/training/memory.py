@@ -14,6 +14,7 @@ from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy, R
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.schedule import densify_schedule, growth_per_change
+from dyngs.models.kind import kind_of
 from dyngs.ops.device import gpu_memory, num_gpus
 from dyngs.training.trainer import Trainer
 
@@ -159,7 +160,11 @@ def require_room(config: Config) -> None:
     """Raise where the random Gaussians that a run is to begin with cannot fit on this machine."""
     init = config.init
     whole = whole_memory()
-    if not isinstance(init, RandomInit) or whole is None or not config.model.made_of_gaussians:
+    if (
+        not isinstance(init, RandomInit)
+        or whole is None
+        or "init" not in kind_of(config.model).uses
+    ):
         return
     each = 4 * COSTS.needed_copies * stored_values(config)
     if init.num_random * each > whole:

@@ -20,7 +20,7 @@ from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.gaussians.start import FirstGaussians, surroundings
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
-from dyngs.models.kind import RunStart, kind_of
+from dyngs.models.kind import Moves, Predicts, RunStart, capability, kind_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import (
     background_colour,
@@ -62,8 +62,9 @@ def build(
     images: ImageLoader | None = None,
 ) -> Trainable:
     """Return what the loop steps; see ``assemble`` for arguments and errors."""
-    if config.model.is_network:
-        return network_trainer(config)
+    network = capability(config.model, Predicts)
+    if network is not None:
+        return network_trainer(config, network)
     return assemble(
         config, capture, restored=restored, first=first, uncapped=uncapped, images=images
     )
@@ -180,7 +181,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
     """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
     need none."""
     lines: list[str] = []
-    if config.model.begins_with_points:
+    if "init" in kind_of(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
             capture, lines = with_first_points(capture, config.data, init)
@@ -202,15 +203,20 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
 def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors:
     """Return the priors of the capture that are used; none for people, whose poses say how they
     move."""
-    if config.model.is_posed or not config.model.draws_whole_images:
+    if "train.priors" not in kind_of(config.model).uses:
         return UsedPriors()
-    moves = config.model.may_move and len(set(training_times(capture))) > 1
+    moves = capability(config.model, Moves) is not None and len(set(training_times(capture))) > 1
     return used_priors(config, capture, images, moves=moves)
 
 
 def _robust(config: Config, capture: Capture, images: ImageLoader) -> RobustMasks | None:
     """Return the masks of what disagrees between views of a static scene, if they are requested."""
-    if config.model.is_posed or config.model.may_move or config.train.robust != "always":
+    kind = kind_of(config.model)
+    if (
+        config.train.robust != "always"
+        or "train.robust" not in kind.uses
+        or isinstance(kind, Moves)
+    ):
         return None
     cameras = training_cameras(capture.splits["train"], config.data)
     return RobustMasks(images, cameras, config.train.steps, images.corrected)

@@ -14,7 +14,7 @@ from dyngs.config import Config
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
-from dyngs.models.kind import kind_of
+from dyngs.models.kind import Predicts
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
 from dyngs.training.trainer import Edit, ViewSampler
@@ -60,7 +60,7 @@ class NetworkTrainer:
 
     def update(self, loss: Tensor, step: int) -> None:
         """Do a step of AdamW; none for gradients that are not finite."""
-        rate = rate_at(self.config.model.lr, step, self.config.train.steps)
+        rate = rate_at(self.learner.lr, step, self.config.train.steps)
         self.bad_gradients += not updated(self.optimizer, self.learner.network, loss, rate)
 
     def apply(self, edit: Edit) -> None:
@@ -90,15 +90,15 @@ class NetworkTrainer:
         self.done = checkpoint.info.step
 
 
-def network_trainer(config: Config) -> NetworkTrainer:
+def network_trainer(config: Config, network: Predicts) -> NetworkTrainer:
     """Return the trainer of a network of any kind before the first step."""
     generator = torch.Generator().manual_seed(config.run.seed)
-    learner = kind_of(config.model).learner(config, generator)
+    learner = network.networks()[0](config, generator)
     return NetworkTrainer(
         config=config,
         learner=learner,
         optimizer=torch.optim.AdamW(
-            learner.network.parameters(), lr=config.model.lr, weight_decay=WEIGHT_DECAY
+            learner.network.parameters(), lr=learner.lr, weight_decay=WEIGHT_DECAY
         ),
         sampler=ViewSampler(len(learner.names)),
         generator=generator,

@@ -15,6 +15,7 @@ from dyngs.data.aim import look_at_point
 from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import orbit_around, points_at
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, scene_of_split
 
@@ -120,8 +121,9 @@ def _viewpoint(opened: Opened) -> Viewpoint:
         )
         center = look_at_point(together)
         eyes = together.centers.double().cpu().numpy()
-        if opened.person is not None:
-            center = opened.person.at(None).means.double().cpu().numpy().mean(0)
+        person = avatar_of(opened.renderable)
+        if person is not None:
+            center = person.at(None).means.double().cpu().numpy().mean(0)
     else:
         means = points_at(opened.renderable).double().cpu().numpy()
         start = orbit_around(opened, 1)

@@ -17,6 +17,7 @@ from dyngs.export.camera_paths import resize_cameras
 from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
@@ -193,18 +194,15 @@ def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> 
 
 def shows_filled(opened: Opened) -> bool:
     """Return whether it is known which surface of a person no training view shows."""
-    return (
-        opened.person is not None
-        and opened.person.seen is not None
-        and opened.person.colour is None
-    )
+    person = avatar_of(opened.renderable)
+    return person is not None and person.seen is not None and person.colour is None
 
 
 def _filled(opened: Opened, camera: Cameras, time: float | None) -> np.ndarray:
     """Return the image (H, W, 3) uint8 with marked what is filled in; the plain one where that is
     not known."""
     scene = opened.scene
-    person = opened.person
+    person = avatar_of(opened.renderable)
     if person is None or person.seen is None or not shows_filled(opened):
         return to_uint8(_rendering(opened, "all", camera, time).rgb[0].clamp(0, 1).numpy())
     now = scene.time_step(time)

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from dyngs.core.errors import DyngsError
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.motion.placement import rest_clip
 from dyngs.runs.opened import Opened
@@ -92,7 +93,7 @@ def posed(opened: Opened, angles: Angles) -> Opened:
     """Return the person of ``opened`` in the rest pose with joints rotated by ``angles``."""
     from scipy.spatial.transform import Rotation
 
-    person = opened.person
+    person = avatar_of(opened.renderable)
     if person is None:
         raise ValueError("only a person can be posed")
     clip = rest_clip(person.clip, person.skeleton.joints, person.skeleton.parents)

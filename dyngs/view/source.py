@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from dyngs.api.predict import network_config, predict
+from dyngs.api.predict import network_config, predict, require_network
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.errors import DyngsError
@@ -18,6 +18,7 @@ from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.io.formats.formats import format_to_read
 from dyngs.io.wrong_place import command_for
+from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import Opened, open_scene
@@ -74,16 +75,15 @@ def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
     Raises DyngsError: not the run of a network, or no captures there.
     """
     config = network_config(run)
+    num_views = require_network(config, run).num_views(config.model)
     data = (
         config.data
         if capture is None
         else config.data.model_copy(update={"root": capture.absolute()})
     )
     if capture is not None and _is_capture(data):
-        return PeopleNetwork(run, {capture.absolute().name: data}, config.model.source_views)
-    return PeopleNetwork(
-        run, {one.root.name: one for one in captures_in(data)}, config.model.source_views
-    )
+        return PeopleNetwork(run, {capture.absolute().name: data}, num_views)
+    return PeopleNetwork(run, {one.root.name: one for one in captures_in(data)}, num_views)
 
 
 def _is_capture(data: DataConfig) -> bool:
@@ -199,7 +199,9 @@ def first_of(source: Source) -> Opened:
 
 def is_network(path: Path) -> bool:
     """Return whether ``path`` is the run of a network that predicts people."""
-    return path.is_dir() and _is_run(path) and load_resolved(path).model.is_network
+    if not (path.is_dir() and _is_run(path)):
+        return False
+    return capability(load_resolved(path).model, Predicts) is not None
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -221,7 +223,7 @@ def _is_run(folder: Path) -> bool:
 def _has_scene(run: Path) -> bool:
     try:
         has_any = (run / SCENE_FILE).is_file() or bool(checkpoint_paths(run))
-        return has_any and not load_resolved(run).model.is_network
+        return has_any and not is_network(run)
     except (DyngsError, OSError):
         return False
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.runs.opened import Captured, Opened, cameras_for_paths
@@ -85,7 +86,7 @@ class TrainingView:
     """
 
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
-        if config.model.is_network:
+        if capability(config.model, Predicts) is not None:
             raise DyngsError(
                 "--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts"
             )

@@ -18,7 +18,7 @@ from two_balls import two_balls
 from dyngs.api import choose as module
 from dyngs.api.choose import Choice, as_static, choose, explained_pixels
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig, DynamicModel, RunConfig
+from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -27,6 +27,7 @@ from dyngs.data.synthetic.captures import (
     StillOptions,
     write_still_capture,
 )
+from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.rendering import render
 from dyngs.training.trainer import Trainer
 

@@ -11,19 +11,12 @@ from several_processes import run_in
 from tiny_fields import busy_config
 
 from dyngs.api.train import train
-from dyngs.config import (
-    Config,
-    DataConfig,
-    DefaultStrategy,
-    HumanModel,
-    RandomInit,
-    RunConfig,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, DefaultStrategy, RandomInit, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, load_checkpoint
+from dyngs.static.keys import StaticModel
 from dyngs.training.processes import Processes
 
 BUSY = DefaultStrategy(

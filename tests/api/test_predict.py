@@ -11,11 +11,12 @@ from tiny_people import NET, TINY, people
 
 from dyngs.api.predict import Prediction, network_config, predict
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig, HumanModel
+from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_resolved, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.runs.checkpoint import load_run
 
 

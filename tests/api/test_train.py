@@ -26,7 +26,6 @@ from dyngs.config import (
     OptimConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import (
@@ -38,6 +37,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.static.keys import StaticModel
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
 from dyngs.training.events import Event, StepDone

@@ -17,7 +17,7 @@ from moving_scene import write_moving_run
 from PIL import Image
 from refused import error_line
 from tiny_stereo import stereo_config, stereo_people
-from toy_kind import registered
+from toy_plugin import installed
 
 from dyngs.api.budget import time as budget_time
 from dyngs.api.train import train
@@ -215,11 +215,9 @@ def test_what_is_not_made_of_gaussians_takes_part(
     own = tmp_path / "grid.yaml"
     out = tmp_path / "out"
     own.write_text("model:\n  kind: toy\n")
-    with registered():
+    with installed():
         words = ["compare", str(capture), "--models", str(own), "--out", str(out)]
-        assert "has no Gaussians that could be limited" in error_line(
-            capsys, *words, "--max-mb", "1"
-        )
+        assert "budget.max_mb=1" in error_line(capsys, *words, "--max-mb", "1")
         assert main([*words, "--steps", "20", "--threads", "1"]) == 0
     stored = json.loads((out / "points" / "grid.json").read_text())
     assert stored["steps"] == 20

@@ -10,7 +10,8 @@ import torch
 from tiny_fields import busy_config
 
 from dyngs.compress.cut import Cut, FieldSize, apply_cut, cut_config, field_size
-from dyngs.config import Config, DynamicModel
+from dyngs.config import Config
+from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.restored import restored_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.new_trainer import assemble

@@ -23,16 +23,15 @@ from dyngs.compress.stage import (
 from dyngs.config import (
     Config,
     DataConfig,
-    FreeField,
     McmcStrategy,
     PruneConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
 from dyngs.deform.free import FreePrimitives, FreeStart
+from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.rendering import RenderOptions
@@ -40,6 +39,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import HEADS, cloud, tiny_setup
 from torch import Tensor
 
-from dyngs.config import ControlNodesField
 from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
 
 MEANS_ONLY = dict.fromkeys(HEADS, False)

@@ -9,8 +9,8 @@ import pytest
 import torch
 from tiny_fields import HEADS
 
-from dyngs.config import FieldSection
 from dyngs.deform.field import Decoder, head_sizes, split_heads
+from dyngs.deform.keys import FieldSection
 from dyngs.gaussians.parameters import Parameters
 
 SIZES = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "colors": 3}

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tiny_fields import cloud, stirred_field, tiny_field, tiny_options, tiny_setup
 from torch import Tensor
 
-from dyngs.config import HexplaneField
+from dyngs.deform.keys import HexplaneField
 from dyngs.deform.networks import Hexplane
 
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from tiny_fields import cloud, tiny_setup
 
-from dyngs.config import MlpField
 from dyngs.deform.field import Offsets
+from dyngs.deform.keys import MlpField
 from dyngs.deform.networks import SKIP_LAYER, Mlp, encoded
 
 

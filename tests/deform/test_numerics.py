@@ -23,12 +23,13 @@ from tiny_fields import (
 )
 from torch import Tensor
 
-from dyngs.config import DynamicModel, TrainConfig
+from dyngs.config import TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.networks import Hexplane
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene

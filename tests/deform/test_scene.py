@@ -9,10 +9,10 @@ import torch
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.config import DynamicModel
 from dyngs.core.state import tensors_of
 from dyngs.deform.field import DeformationField, deformed
 from dyngs.deform.fields import field_state
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter

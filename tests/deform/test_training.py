@@ -29,7 +29,8 @@ from moving_training import (
 from static_balls import Ball, filmed
 from tiny_fields import KINDS, stir, tiny_options
 
-from dyngs.config import DynamicModel, FreeField, OptimConfig
+from dyngs.config import OptimConfig
+from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import GaussianOptimizer

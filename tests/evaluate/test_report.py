@@ -14,7 +14,7 @@ from moving_scene import TEST_TIMES, row_of_balls, sliding_nodes, write_moving_r
 
 import dyngs
 from dyngs.cli import main
-from dyngs.config import Config, DataConfig, StaticModel, TrainConfig
+from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
@@ -42,6 +42,7 @@ from dyngs.runs.checkpoint import (
     load_run,
     save_checkpoint,
 )
+from dyngs.static.keys import StaticModel
 
 
 def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:

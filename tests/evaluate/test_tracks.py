@@ -16,7 +16,6 @@ import torch
 from moving_scene import Sliding, camera, moving_scene, row_of_balls, still_scene
 from scipy.spatial.transform import Rotation
 
-from dyngs.config import FreeField
 from dyngs.config.io import load_config
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View, all_views
@@ -26,6 +25,7 @@ from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.free import FreePrimitives, FreeStart
+from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
 from dyngs.gaussians.scene import GaussianScene

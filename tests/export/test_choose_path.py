@@ -14,7 +14,7 @@ from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
 from scaled_files import FACTORS, write_scaled
 
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
@@ -23,6 +23,7 @@ from dyngs.export.choose_path import PathOptions, choose_path, orbit_around, vie
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile

@@ -14,13 +14,14 @@ from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
-from dyngs.config import FixedStrategy, StaticModel
+from dyngs.config import FixedStrategy
 from dyngs.core.state import Role, part_of, tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import assemble
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)

@@ -14,14 +14,12 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
-    HumanModel,
     McmcStrategy,
     OptimConfig,
     SceneModel,
-    StaticModel,
     TrainConfig,
 )
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.schedule import deform_schedule
 from dyngs.gaussians.schedule import (
     GROWTH,
@@ -35,7 +33,9 @@ from dyngs.gaussians.schedule import (
     means_rate,
     rate_factors,
 )
+from dyngs.human.keys import HumanModel
 from dyngs.models.schedule import image_divisor
+from dyngs.static.keys import StaticModel
 
 
 def test_at_30000_steps_it_is_the_published_one() -> None:

@@ -1,51 +1,92 @@
-"""A kind that is not made of Gaussians goes all the way: trained, resumed, evaluated, drawn,
-viewed; not exported."""
+"""A kind of another package goes all the way: its keys, training, resuming, evaluation, images, the
+viewer; and without the package one line names it."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
-from toy_kind import ToyScene, registered
+from toy_plugin import FOLDER, installed
 
 import dyngs
 from dyngs.cli import main
 from dyngs.config.io import load_config
+from dyngs.config.kinds import GROUP, OWN
+from dyngs.config.schema import keys_table
 from dyngs.core.errors import DyngsError
-from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.choose_path import PathOptions, choose_path
-from dyngs.export.images import OutputOptions, write_path_images, write_split_images
-from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.export.images import OutputOptions, write_path_images
+from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
 from dyngs.view.captured_views import viewpoint_of
 from dyngs.view.layers import Shot, draw
 
+ROOT = Path(__file__).parents[2]
+
 
 @pytest.fixture(autouse=True, scope="module")
 def toy() -> Iterator[None]:
-    with registered():
+    with installed():
         yield
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=24, num_train=6, num_test=2, samples=1))
+    write_still_capture(
+        folder, StillOptions(size=24, num_train=6, num_test=2, samples=1, distance=4.0)
+    )
     return folder
 
 
-def options(capture: Path, run: Path) -> list[str]:
-    steps = ["train.steps=40", "train.save_every=20", "train.eval_every=0"]
-    return [f"data.root={capture}", f"run.dir={run}", "run.threads=1", "model.kind=toy", *steps]
+def options(capture: Path, run: Path, steps: int = 40) -> list[str]:
+    keys = [f"train.steps={steps}", "train.save_every=20"]
+    return [f"data.root={capture}", f"run.dir={run}", "run.threads=1", "model.kind=toy", *keys]
 
 
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return dyngs.train(load_config(None, options(capture, tmp_path_factory.mktemp("runs") / "toy")))
+
+
+def test_our_own_kinds_are_entry_points_of_the_package() -> None:
+    tomllib = pytest.importorskip("tomllib")  # Python 3.11
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["entry-points"][GROUP] == OWN
+
+
+def dyngs_command(*words: str, plugin: bool) -> subprocess.CompletedProcess[str]:
+    """Run a command in a new process, with or without the package."""
+    folders = [str(ROOT), *([str(FOLDER)] if plugin else [])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
+    command = [sys.executable, "-m", "dyngs", *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_a_run_needs_the_package_of_its_kind(capture: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    trained = dyngs_command("train", *options(capture, run, steps=2), plugin=True)
+    assert trained.returncode == 0, trained.stderr
+    assert dyngs_command("eval", str(run), plugin=True).returncode == 0
+    without = dyngs_command("eval", str(run), plugin=False)
+    assert without.returncode == 2
+    assert without.stderr.strip().count("\n") == 0
+    assert "model.kind=toy is of the package toy-splats, which is not installed" in without.stderr
+
+
+def test_its_keys_are_listed_and_validated(capture: Path, tmp_path: Path) -> None:
+    assert "| `model.lr` (toy) | a number > 0 | `0.3` | learning rate |" in keys_table()
+    words = options(capture, tmp_path)
+    with pytest.raises(DyngsError, match=r"model\.lr must be a number > 0, not -1"):
+        load_config(None, [*words, "model.lr=-1"])
+    with pytest.raises(DyngsError, match="did you mean 'toy'"):
+        load_config(None, [*words, "model.kind=toi"])
 
 
 def test_it_learns_and_resumes_with_the_same_bytes(
@@ -59,82 +100,31 @@ def test_it_learns_and_resumes_with_the_same_bytes(
     assert checkpoint_paths(again)[-1].read_bytes() == last.read_bytes()
 
 
-def test_it_is_evaluated(run: Path) -> None:
+def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
     report = evaluate_run(run)
     assert report.psnr > 14, "a white image has 10 dB"
     assert (report.num_gaussians, report.num_moving) == (0, 0)
-    assert report.model_mb == pytest.approx(4e-6 * 4 * 12**3)
-
-
-def test_it_is_drawn_to_images_and_a_video(run: Path, tmp_path: Path) -> None:
     opened = open_run(run)
-    output = OutputOptions(depth=True, video=tmp_path / "orbit.mp4")
-    written = write_path_images(
-        opened, choose_path(opened, PathOptions(num_frames=3)), tmp_path, output
-    )
-    assert len(written) == 3 * 3 + 1
-    assert (tmp_path / "orbit.mp4").stat().st_size > 0
-    assert len(write_split_images(opened, "test", tmp_path / "views")) > 0
-
-
-def test_it_is_viewed(run: Path) -> None:
-    opened = open_run(run)
+    path = choose_path(opened, PathOptions(num_frames=3))
+    assert len(write_path_images(opened, path, tmp_path, OutputOptions(depth=True))) == 3 * 3
     start = viewpoint_of(opened).start
     for shot in (Shot(start), Shot(start, layer="depth"), Shot(start, layer="error", view=0)):
         assert draw(opened, shot).std() > 0
-    with pytest.raises(DyngsError, match="not made of Gaussians"):
-        draw(opened, Shot(start, layer="motion"))
-
-
-def test_it_is_loaded(run: Path, capture: Path) -> None:
-    scene = load_run(run).renderable
-    assert isinstance(scene, ToyScene)
-    assert scene.is_static
-    assert torch.equal(scene.to("cpu").grid, scene.grid)
-    assert len(read_capture(capture).splits["train"]) == 6
 
 
 @pytest.mark.parametrize(
-    "command",
+    ("command", "part"),
     [
-        ["export", "RUN", "--out", "OUT/scene.ply"],
-        ["prune", "RUN", "--out", "OUT/pruned"],
-        ["tradeoff", "RUN", "--out", "OUT/trade"],
+        ("export RUN --out OUT/scene.ply", "Gaussians"),
+        ("prune RUN --out OUT/pruned", "Gaussians"),
+        ("train --resume RUN budget.max_mb=1 train.steps=50", "budget.max_mb"),
     ],
 )
 def test_what_needs_gaussians_refuses_it_in_a_line(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str]
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, part: str
 ) -> None:
-    words = [word.replace("RUN", str(run)).replace("OUT", str(tmp_path)) for word in command]
+    words = command.replace("RUN", str(run)).replace("OUT", str(tmp_path)).split()
     assert main(words) == 2
     said = capsys.readouterr().err.strip()
-    assert "Gaussians" in said
+    assert part in said
     assert len(said.splitlines()) == 1
-    assert not [
-        path for path in tmp_path.rglob("*") if path.is_file() and "lock" not in path.name
-    ], "nothing is half written"
-
-
-def test_it_keeps_to_a_time(
-    capture: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("dyngs.api.budget.time.FEWEST_STEPS", 5)  # whatever else the machine does
-    run = tmp_path / "run"
-    assert main(["train", *options(capture, run), "train.steps=100000", "train.minutes=0.04"]) == 0
-    loaded = load_run(run)
-    assert loaded.step == loaded.config.train.steps, "schedules end where the run ends"
-    assert 5 <= loaded.step < 100_000
-    assert 1 < loaded.seconds_train < 3
-    assert "train.minutes: asked 0.04" in capsys.readouterr().out
-
-
-def test_budgets_of_gaussians_are_refused(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for key in ("budget.max_gaussians=100", "budget.max_mb=1"):
-        assert main(["train", *options(capture, tmp_path / "run"), key]) == 2
-        assert key.partition("=")[0] in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()

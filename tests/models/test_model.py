@@ -1,4 +1,4 @@
-"""What every kind of model promises: all of ``KINDS``, and one that is not made of Gaussians."""
+"""What every kind of model promises: all of ours, and one that is not made of Gaussians."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import pytest
 import torch
 from moving_scene import camera
 from tiny_people import NET, people, person
-from toy_kind import registered
+from toy_plugin import installed
 
-from dyngs.config import Config, ModelSection
+from dyngs.config import Config
 from dyngs.config.io import load_config
+from dyngs.config.kinds import kind_names, section_of_kind
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role
 from dyngs.gaussians.restored import restored_model
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.predict.ghg.learner import PersonPredictor, new_network
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
-from dyngs.models.kind import KINDS, Kind, kind_of
+from dyngs.models.kind import HasGaussians, Predicts, capability, kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.training.new_trainer import build
@@ -59,7 +60,7 @@ PREDICTED = {"predicted_field"}
 
 @pytest.fixture(autouse=True, scope="module")
 def toy() -> Iterator[None]:
-    with registered():
+    with installed():
         yield
 
 
@@ -98,11 +99,11 @@ def same(one: Checkpoint, other: Checkpoint) -> bool:
 
 
 def test_every_kind_is_here() -> None:
-    known = TRAINED.keys() | NETWORKS | PREDICTED
-    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == known
-    for kind in KINDS:
-        assert kind_of(kind.section()) is kind
-        assert issubclass(kind.section, ModelSection)
+    assert set(kind_names()) == TRAINED.keys() | NETWORKS | PREDICTED
+    for name in kind_names():
+        kind = kind_of(section_of_kind(name)())
+        assert kind.name == name
+        assert isinstance(kind, Predicts) == (name in NETWORKS)
 
 
 def test_it_is_trained_stored_and_restored(config: Config) -> None:
@@ -168,7 +169,7 @@ def test_its_scene_says_when_and_where_it_is(trainer: Trainer) -> None:
 
 def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer: Trainer) -> None:
     scene = trainer.model.scene
-    if config.model.made_of_gaussians:
+    if capability(config.model, HasGaussians) is not None:
         assert require_gaussians(scene, "it") is scene
         return
     assert not isinstance(scene, GaussianScene)
@@ -176,14 +177,12 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer:
         require_gaussians(scene, "it")
 
 
-@pytest.mark.parametrize(
-    "kind", [kind for kind in KINDS if kind.section.model_fields["kind"].default in NETWORKS]
-)
-def test_a_network_is_no_scene_but_predicts_one(kind: Kind) -> None:
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+def test_a_network_is_no_scene_but_predicts_one(name: str) -> None:
     with pytest.raises(DyngsError, match="a network, not a scene"):
         restored_model(
             Checkpoint(CheckpointInfo(1, 1.0, (0.0, 0.0, 0.0), "white", "classic"), {}),
-            kind.section(),
+            section_of_kind(name)(),
         )
 
 

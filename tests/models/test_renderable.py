@@ -20,7 +20,7 @@ from dyngs.baselines.fields.keys import NerfModel, NgpModel
 from dyngs.baselines.fields.nerf import NerfField
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene
-from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
+from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -28,7 +28,7 @@ from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import Sides, StaticScene
 from dyngs.human.predict.fields.people import Body, Sources
 from dyngs.human.predict.fields.scene import SECTIONS, PredictedField, network_of
-from dyngs.models.renderable import DrawOptions, Renderable
+from dyngs.models.renderable import Renderable
 from dyngs.ops.rays import Space
 
 SPACE = Space((0.0, 0.0, 0.0), 2.0, 1, 8)
@@ -179,12 +179,3 @@ def test_scenes_of_gaussians_have_gradients_by_cameras(kind: str) -> None:
     grad = cameras.cam_from_world.grad
     assert grad is not None
     assert bool(grad[:, :3].any())
-
-
-@pytest.mark.parametrize("options", [DrawOptions, TriangleOptions])
-@pytest.mark.parametrize("near", [float("nan"), -1.0, float("inf")])
-def test_options_out_of_range(options: type[DrawOptions], near: float) -> None:
-    with pytest.raises(DyngsError, match="near must be a number of at least 0"):
-        options(near=near)
-    with pytest.raises(DyngsError, match="depth must be one of none, accumulated, expected"):
-        options(depth="far")  # pyright: ignore[reportArgumentType]

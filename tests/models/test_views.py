@@ -53,12 +53,3 @@ def test_the_share_of_pixels_that_look_like_the_background_is_counted() -> None:
     one_channel_differs = half_opaque(1.0, 40)
     one_channel_differs.rgb_premultiplied[:4, :, 2] = 0.5
     assert share_alike([one_channel_differs], white) == 0.0
-
-
-def test_what_is_masked_or_half_transparent_does_not_count() -> None:
-    white = torch.ones(3)
-    shown = half_opaque(1.0, 20)
-    mask = torch.ones(8, 10)
-    mask[:2] = 0.0
-    assert share_alike([image(shown.rgb_premultiplied, shown.alpha, mask)], white) == 0.0
-    assert share_alike([image(torch.ones(8, 10, 3), torch.full((8, 10), 0.5))], white) is None

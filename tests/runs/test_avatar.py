@@ -15,9 +15,10 @@ from synthetic_bodies import model, write_npz
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig, DefaultStrategy, HumanModel, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, DefaultStrategy, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture

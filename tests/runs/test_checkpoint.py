@@ -15,7 +15,7 @@ import torch
 from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
-from dyngs.config import Config, DataConfig, RunConfig, StaticModel
+from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -35,6 +35,7 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.stored_tensors import drawable
+from dyngs.static.keys import StaticModel
 
 
 def _checkpoint(step: int) -> Checkpoint:

@@ -17,7 +17,7 @@ from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
 from dyngs.cli.demo_run import is_unused
-from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.export.splat_files import write_run_sequence
@@ -29,6 +29,7 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.folder import tidy
 from dyngs.runs.opened import open_run
+from dyngs.static.keys import StaticModel
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

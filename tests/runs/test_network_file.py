@@ -10,8 +10,9 @@ import pytest
 import torch
 from tiny_stereo import STEREO, stereo_config
 
-from dyngs.config import Config, HumanPredictorModel
+from dyngs.config import Config
 from dyngs.core.errors import DyngsError
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.gps.surface import GpsNetwork
 from dyngs.io.tensor_file import FileKind, write_tensors
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo

@@ -15,9 +15,9 @@ from moving_scene import camera
 from scipy.spatial.transform import Rotation
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import part_of
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene

@@ -11,9 +11,9 @@ from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.train import train
-from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
 from dyngs.core.errors import DyngsError
+from dyngs.deform.keys import DynamicModel
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
 from dyngs.study.measure import Measurement, read_measurement

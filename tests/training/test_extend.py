@@ -18,22 +18,22 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
-    HumanModel,
     McmcStrategy,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.deform.keys import DynamicModel
 from dyngs.deform.schedule import deform_schedule
 from dyngs.gaussians.schedule import Rates, active_sh_degree
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import write_human_capture
 from dyngs.models.schedule import image_divisor
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.static.keys import StaticModel
 from dyngs.training.extend import told, with_length
 from dyngs.training.trainer import StepReport, Trainer
 

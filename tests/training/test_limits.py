@@ -13,18 +13,18 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    DynamicModel,
-    HumanPredictorModel,
     McmcStrategy,
     PruneConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.deform.keys import DynamicModel
+from dyngs.human.keys import HumanPredictorModel
+from dyngs.static.keys import StaticModel
 from dyngs.training.limits import require_possible, room, within_cap
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer

@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 from pretend_gpu import GPU, pretend_gpu
 
-from dyngs.config import Config, DataConfig, FixedStrategy, RandomInit, TrainConfig
+from dyngs.config import (
+    Config,
+    DataConfig,
+    FixedStrategy,
+    RandomInit,
+    TrainConfig,
+)
 from dyngs.core.errors import DyngsError
 from dyngs.training import memory
 from dyngs.training.memory import (

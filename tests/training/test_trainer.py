@@ -18,14 +18,7 @@ from hypothesis import strategies as st
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
-from dyngs.config import (
-    Config,
-    DataConfig,
-    RandomInit,
-    RunConfig,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, with_role
 from dyngs.data.images.images import read_image
@@ -38,6 +31,7 @@ from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.io.tensor_file import write_tensors
 from dyngs.io.write import write_image
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 from dyngs.training.trainer import ViewSampler
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from dyngs.core.section import ModelSection, Positive
+from dyngs.core.section import ModelSection, Positive, as_number
 
 
 class FieldModel(ModelSection):
     """Keys that all fields share."""
-
-    draws_whole_images: ClassVar[bool] = False
 
     time: bool = Field(default=False, description="time is an input, too: a moving scene (T-NeRF)")
     half_extent: float | None = Field(
@@ -43,7 +41,9 @@ class NgpModel(FieldModel):
         "16 of 2^19 of 2 and 2^18",
     )
     levels: int | None = Field(default=None, ge=1, le=32, description="levels of the hash grid")
-    features: Literal[1, 2, 4, 8] | None = Field(default=None, description="features per level")
+    features: Annotated[Literal[1, 2, 4, 8] | None, BeforeValidator(as_number)] = Field(
+        default=None, description="features per level"
+    )
     log2_rows: int | None = Field(
         default=None, ge=4, le=24, description="most rows of a level, as a power of two"
     )

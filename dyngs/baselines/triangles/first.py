@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import DefaultStrategy, ShColour, StaticModel
+from dyngs.config import DefaultStrategy, ShColour
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
@@ -23,6 +23,7 @@ from dyngs.gaussians.surface import Mesh, Seen, colours_of, fused, opaque_box, s
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
+from dyngs.static.keys import StaticModel
 
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000

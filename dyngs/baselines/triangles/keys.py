@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -11,8 +11,6 @@ from dyngs.core.section import Fraction, ModelSection, Positive
 
 class BgTriangleModel(ModelSection):
     """BG-Triangle (Wu et al. 2025)."""
-
-    begins_with_points: ClassVar[bool] = True
 
     kind: Literal["bg_triangle"] = Field(
         default="bg_triangle",

@@ -4,23 +4,40 @@ are short."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field, SerializeAsAny
+from pydantic_core import PydanticCustomError
 
 from dyngs.config.keys.colour import AutoColour, NetworkColour, ShColour
 from dyngs.config.keys.data import DataConfig
 from dyngs.config.keys.start import PointsInit, RandomInit, SceneInit
 from dyngs.config.keys.strategy import DefaultStrategy, OptimConfig, Strategy
 from dyngs.config.keys.train import TrainConfig
-from dyngs.core.section import SceneModel, Section
-from dyngs.models.kind import KINDS
-from dyngs.static.keys import StaticModel
+from dyngs.config.kinds import section_of_kind
+from dyngs.core.section import ModelSection, SceneModel, Section
+
+
+def _model_section(value: object) -> object:
+    """Return the section of the kind that ``value`` names; what is a section stays as it is."""
+    if not isinstance(value, dict):
+        return value
+    given = cast("dict[str, Any]", value)
+    try:
+        section = section_of_kind(given.get("kind", "static"))
+    except KeyError:
+        raise PydanticCustomError("union_tag_invalid", "no such kind of model") from None
+    return section.model_validate(given)
+
 
 if TYPE_CHECKING:
     AnyModel = SceneModel
 else:
-    AnyModel = Union[tuple(kind.section for kind in KINDS)]  # noqa: UP007
+    AnyModel = SerializeAsAny[ModelSection]
+
+
+def _still() -> AnyModel:
+    return cast(SceneModel, section_of_kind("static")())
 
 
 class CameraConfig(Section):
@@ -91,9 +108,9 @@ class Config(Section):
 
     data: DataConfig
     camera: CameraConfig = CameraConfig()
-    model: Annotated[AnyModel, Field(discriminator="kind", description="what is trained")] = (
-        StaticModel()
-    )
+    model: Annotated[
+        AnyModel, BeforeValidator(_model_section), Field(description="what is trained")
+    ] = Field(default_factory=_still)
     init: Annotated[
         PointsInit | RandomInit | SceneInit,
         Field(discriminator="kind", description="where the first Gaussians come from"),
@@ -116,9 +133,7 @@ class Config(Section):
 
     @property
     def total_steps(self) -> int:
-        return self.train.steps + (
-            self.prune.steps if self.prune.is_wanted and self.model.made_of_gaussians else 0
-        )
+        return self.train.steps + (self.prune.steps if self.prune.is_wanted else 0)
 
     @property
     def stored_sh_degree(self) -> int:

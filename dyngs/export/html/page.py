@@ -25,6 +25,7 @@ from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.static_scene import StaticScene
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
@@ -129,8 +130,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     if any(opened.world_offset):
         offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
         notes.append(f"the scene is far from the origin: {offset} is subtracted from its positions")
-    if opened.person is not None:
-        notes += opened.person.left_out
+    person = avatar_of(opened.renderable)
+    if person is not None:
+        notes += person.left_out
     curves = header.get("curves", {})
     if curves.get("error"):
         error = opened.frame.scale * curves["error"]

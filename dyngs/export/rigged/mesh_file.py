@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.config import HumanModel
 from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.skeleton import (
     BodyMesh,
@@ -32,6 +31,7 @@ from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
+from dyngs.human.keys import HumanModel
 from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
 from dyngs.runs.checkpoint import LoadedRun

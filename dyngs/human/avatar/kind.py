@@ -1,99 +1,74 @@
-"""The kind of people: what they begin with, and how they are restored."""
+"""The kind ``human``: a person, whose body plays motions."""
 
 from __future__ import annotations
 
-from dyngs.config import Config, HumanModel
-from dyngs.core.errors import DyngsError
-from dyngs.data.capture import Capture
-from dyngs.data.loader import ImageLoader
-from dyngs.data.times import evenly_spaced
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.scene import drawn_as_trained
-from dyngs.gaussians.schedule import rates_of
-from dyngs.gaussians.start import colours_of, densifier_of
-from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
-from dyngs.human.avatar.observations import Subject, in_colours_of
-from dyngs.human.avatar.outlines import outline_loss
-from dyngs.human.avatar.pose_refit import PoseRefit
-from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
-from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.body.body_reader import load_template, rest_shape
-from dyngs.human.motion.motion import captured_motion
-from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.views import evaluation_background, training_cameras
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
+from dyngs.core.conventions import ReportProgress
+from dyngs.human.keys import HumanModel
+from dyngs.models.kind import ExtendsTo, HasBody, HasGaussians, InMotion
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from dyngs.config import DataConfig
+    from dyngs.data.capture import Capture
+    from dyngs.models.checkpoint import CheckpointInfo
+    from dyngs.models.kind import Restore, Start
+    from dyngs.models.renderable import Posable
+    from dyngs.models.schedule import Length
 
 
-def refusal(capture: Capture) -> str | None:
-    """Return why a capture is of no person; None: it has body parameters."""
-    if capture.body is not None:
-        return None
-    return "has no body parameters, which model.kind=human needs; see docs/human.md"
+class HumanKind(HasGaussians, HasBody, ExtendsTo):
+    """See the module. The body says how it moves, and poses are refined instead of cameras."""
 
+    uses = HasGaussians.uses - {"init", "camera.refine", "train.robust", "train.priors"}
 
-def start(run: RunStart) -> GaussianModel:
-    """Return the model of a person before the first step.
+    def refusal(self, capture: Capture) -> str | None:
+        if capture.body is not None:
+            return None
+        return "has no body parameters, which model.kind=human needs; see docs/human.md"
 
-    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
-    """
-    config = run.config
-    model = run.config.model
-    if not isinstance(model, HumanModel):
-        raise TypeError(f"not a person: {model!r}")
-    gaussians, subject = human_start(config, model, run.capture, run.images)
-    colours = colours_of(run, gaussians, sees_time=False)
-    filmed = run.capture.splits["train"]
-    cameras = training_cameras(filmed, config.data)
-    views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
-    outlines = None if colours.network is not None else outline_loss(run)
-    behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
-    refit = (
-        PoseRefit(run.images, behind, config.train.steps)
-        if model.refine and config.train.minutes is None
-        else None
-    )
-    training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines, refit)
-    lit = model.light and model.refine and colours.network is None
-    scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
-    return GaussianModel(run, scene, training, densifier_of(run), colours)
+    def find_body(
+        self,
+        data: DataConfig,
+        section: HumanModel,
+        say: Callable[[str], None],
+        report: ReportProgress,
+    ) -> DataConfig:
+        """Return the options of a capture with a body: found, and fitted to the silhouettes."""
+        from dyngs.capture.unposed import is_unposed
+        from dyngs.human.fit.fitted_capture import with_fitted_body
 
+        if is_unposed(data):
+            from dyngs.human.detect.find_person import with_found_person
 
-def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
-    """Return the scene of a checkpoint."""
-    scene = HumanScene.restored(
-        Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
-    )
-    return drawn_as_trained(scene, model, checkpoint)
-
-
-def human_start(
-    config: Config, model: HumanModel, capture: Capture, images: ImageLoader
-) -> tuple[Gaussians, Subject]:
-    """Return the first Gaussians of a person, and the person.
-
-    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
-    """
-    sh_degree = config.stored_sh_degree
-    problem = refusal(capture)
-    if problem is not None or capture.body is None:
-        raise DyngsError(f"{capture.root}: {problem}")
-    if sh_degree > 1:
-        raise DyngsError(
-            f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1"
+            data = with_found_person(data, say=say, report=report)
+        return with_fitted_body(
+            data, section, only_if_needed=not section.fit, say=say, report=report
         )
-    given = capture.body["train"]
-    body = load_template(model)
-    vertices, joints = rest_shape(body, given)
-    filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
-    cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
-    parts = surface_texels(
-        body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0])
-    )
-    gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
-    subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
-    shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
-    return in_colours_of(gaussians, normals, subject, shown), subject
+
+    def in_motion(
+        self,
+        section: HumanModel,
+        scene: Posable,
+        info: CheckpointInfo,
+        path: Path,
+        *,
+        keep_feet: bool,
+    ) -> InMotion:
+        from dyngs.human.avatar.in_motion import in_motion
+
+        return in_motion(section, scene, info, path, keep_feet=keep_feet)
+
+    def functions(self) -> tuple[Start, Restore]:
+        from dyngs.human.avatar.start import restore, start
+
+        return start, restore
+
+    def extended(self, section: HumanModel, length: Length) -> HumanModel:
+        return section.model_copy(update={"refine_from": length.share(section.refine_from)})
+
+
+HUMAN = HumanKind(HumanModel)

@@ -3,6 +3,7 @@ says."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
@@ -16,6 +17,7 @@ from dyngs.core.tensor_checks import (
     require_positive,
     require_tensor,
 )
+from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.parameters import Parameters
@@ -42,12 +44,12 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
-from dyngs.human.motion.motion import MotionClip
-from dyngs.models.renderable import Renderable, clamped_time
+from dyngs.human.motion.motion import MotionClip, captured_motion, same_bodies
+from dyngs.models.renderable import Posable, Renderable, clamped_time
 
 
 @dataclass(frozen=True, kw_only=True)
-class HumanScene(GaussianScene):
+class HumanScene(GaussianScene, Posable):
     """N Gaussians at rest, m, and a person who moves as a clip says."""
 
     anchors: Anchors  # of the Gaussians, with the template's weights
@@ -246,6 +248,43 @@ class HumanScene(GaussianScene):
         turned.
         """
         return replace(self, played=clip)
+
+    def up_of_body(self) -> Tensor:
+        from dyngs.human.motion.placement import up_direction  # late: scipy
+
+        return up_direction(self.clip)
+
+    def at_rest(self) -> HumanScene:
+        from dyngs.human.motion.placement import rest_clip  # late: scipy
+
+        return self.playing(rest_clip(self.clip, self.skeleton.joints, self.skeleton.parents))
+
+    def placed(self, rotation: Tensor, scale: float, shift: Tensor) -> HumanScene:
+        from dyngs.human.motion.placement import moved  # late: scipy
+
+        pelvis = self.learned_skeleton.joints[0] * math.exp(self.fit.log_scale)
+        rotation = rotation.to(self.clip.trans)
+        shift = shift.to(self.clip.trans)
+
+        def there(clip: MotionClip) -> MotionClip:
+            return moved(clip, rotation, scale, shift, pelvis)
+
+        played = None if self.played is None else there(self.played)
+        return replace(self, clip=there(self.clip), played=played)
+
+    def as_filmed(self, capture: Capture, split: Split) -> HumanScene:
+        """Return the person as the views of a split show them.
+
+        The split pose, and splits with body parameters of their own, have the poses of their files.
+        Others show the clip of training with its refined poses, interpolated at times between.
+        """
+        if capture.body is None:
+            return self
+        own = capture.body[split]
+        if split != "pose" and same_bodies(own, capture.body["train"]):
+            return self
+        views = capture.splits[split]
+        return self.playing(captured_motion(capture.root, own, views, self.skeleton.joints).clip)
 
     def drawing_state(self) -> State:
         """Return what drawing needs; learned corrections of skinning weights are applied to

@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, with_role
@@ -39,6 +38,7 @@ from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.pose_refit import PoseRefit
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.keys import HumanModel
 from dyngs.ops.adam import Count
 
 NEIGHBOURS = 5

@@ -23,7 +23,7 @@ from dyngs.capture.fixed_camera import (
     zoomed,
 )
 from dyngs.capture.photos import digest_of
-from dyngs.config import DataConfig, HumanModel
+from dyngs.config import DataConfig
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted, reading, show
 from dyngs.data.body_frames import numbered, read_body_file
@@ -57,6 +57,7 @@ from dyngs.human.fit.known_person import (
 )
 from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
 from dyngs.human.fit.solve import LensFit
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
 from dyngs.io.lock import make_once
 from dyngs.io.outputs import new_folder

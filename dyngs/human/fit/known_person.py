@@ -10,7 +10,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from dyngs.config import DataConfig, HumanModel
+from dyngs.config import DataConfig
 from dyngs.config.io import load_config
 from dyngs.core.errors import DyngsError, counted, reading
 from dyngs.data.body_frames import read_body_file
@@ -21,6 +21,7 @@ from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body import NUM_FITTED, BodyTemplate
 from dyngs.human.body.body_reader import has_same_shapes, rest_shape
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 
 _BODY, _CONFIG = "body_train.npz", "config.yaml"

@@ -14,16 +14,16 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    HumanModel,
     McmcStrategy,
     PruneConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
+from dyngs.human.keys import HumanModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.static.keys import StaticModel
 from dyngs.training.events import Event, Message
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -18,7 +18,6 @@ from dyngs.config import (
     OptimConfig,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
@@ -32,6 +31,7 @@ from dyngs.runs.checkpoint import (
     load_run,
 )
 from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 

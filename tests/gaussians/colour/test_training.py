@@ -20,7 +20,6 @@ from dyngs.config import (
     NetworkColour,
     RandomInit,
     RunConfig,
-    StaticModel,
     TrainConfig,
 )
 from dyngs.core.state import tensors_of
@@ -33,6 +32,7 @@ from dyngs.gaussians.colour.training import (
     opacity_entropy,
     rate_factor,
 )
+from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -31,6 +30,7 @@ from dyngs.human.avatar.neighbours import (
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template, load_template
 from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.keys import HumanModel
 
 
 @settings(max_examples=40, deadline=None)

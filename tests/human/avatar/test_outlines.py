@@ -12,10 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, TrainConfig
+from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.data.capture import Capture, Silhouette, View
 from dyngs.data.loader import ImageLoader
 from dyngs.human.avatar.outlines import OutlineLoss, outline_loss
+from dyngs.human.keys import HumanModel
 from dyngs.io.write import write_image
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Look

@@ -10,7 +10,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.core.camera import Cameras
 from dyngs.core.state import part_of, tensors_of
 from dyngs.gaussians import Gaussians
@@ -30,6 +29,7 @@ from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 
 

@@ -18,7 +18,6 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    HumanModel,
     NetworkColour,
     OptimConfig,
     RunConfig,
@@ -32,6 +31,7 @@ from dyngs.gaussians.restored import restored_scene
 from dyngs.human.avatar import pose_refit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints
+from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.runs.opened import open_run

@@ -34,7 +34,6 @@ from synthetic_bodies import (
     write_python2_pickle,
 )
 
-from dyngs.config import HumanModel
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import BodyFrames, ShapeSpace
 from dyngs.human.body.body import BodyTemplate, apply_shape, posed_vertices
@@ -45,6 +44,7 @@ from dyngs.human.body.body_reader import (
     read_body,
     rest_shape,
 )
+from dyngs.human.keys import HumanModel
 
 TEMPLATE = Path(inspect.getfile(BodyTemplate)).parent / "files" / "anny_smplx55.npz"
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.config import DataConfig, HumanModel
+from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import moved, read_body_file
 from dyngs.data.images.images import read_image
@@ -31,6 +31,7 @@ from dyngs.human.fit.fitted_capture import (
     write_split,
 )
 from dyngs.human.fit.solve import LensFit
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.write import write_image

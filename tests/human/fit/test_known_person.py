@@ -12,7 +12,7 @@ import torch
 from synthetic_bodies import model, write_npz
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.config import Config, DataConfig, OptimConfig, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.human.avatar import pose_fit
@@ -28,6 +28,7 @@ from dyngs.human.fit.known_person import (
     template_of_run,
     with_shape,
 )
+from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.io.write import write_image, write_text
 from dyngs.training.new_trainer import assemble

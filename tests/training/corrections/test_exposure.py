@@ -9,17 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.config import (
-    Config,
-    DataConfig,
-    DynamicModel,
-    RandomInit,
-    RunConfig,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.loader import Image
+from dyngs.deform.keys import DynamicModel
 from dyngs.models.renderable import Rendering
+from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.exposure import WARM_UP, ViewExposures
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer

@@ -20,16 +20,10 @@ from flat_wall import (
 )
 from torch import Tensor
 
-from dyngs.config import (
-    Config,
-    DataConfig,
-    DynamicModel,
-    RandomInit,
-    RunConfig,
-    StaticModel,
-    TrainConfig,
-)
+from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.loader import Image
+from dyngs.deform.keys import DynamicModel
+from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.robust import WARM_UP, RobustMasks
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer

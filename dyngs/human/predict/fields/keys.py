@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -12,9 +12,6 @@ from dyngs.core.section import ModelSection, Positive
 
 class FieldPredictorModel(ModelSection):
     """Keys that networks share which predict fields of people."""
-
-    is_network: ClassVar[bool] = True
-    draws_whole_images: ClassVar[bool] = False
 
     body: Path | None = Field(
         default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template"
@@ -78,9 +75,6 @@ class EgHumanNerfModel(FieldPredictorModel):
 
 class PredictedFieldModel(ModelSection):
     """What such a network has predicted: not trained, but drawn like any other scene."""
-
-    draws_whole_images: ClassVar[bool] = False
-    is_trained: ClassVar[bool] = False
 
     kind: Literal["predicted_field"] = Field(
         default="predicted_field",

@@ -3,7 +3,7 @@ of one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -139,6 +139,7 @@ class FieldLearner(Learner[FieldNetwork]):
         self.config, self.network, self.device = config, network, device
         self.model = section_of(config)
         self._people = people
+        self.lr = self.model.lr
         self.names = [person.root.name for person in people]
         self._template = template_of(self.model)
         chosen = config.data.background
@@ -213,17 +214,23 @@ def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     return FieldLearner(config, network, captures_in(config.data), device)
 
 
-def predictor(config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any) -> Predictor:
+def predictor(
+    config: Config,
+    checkpoint: Checkpoint,
+    data: DataConfig,
+    say: Callable[[str], None],
+    report: ReportProgress,
+) -> Predictor:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
 
-    ``told``: ``say`` and ``report`` of that fit.
+    ``say`` and ``report`` are told of that fit.
     """
     model = section_of(config)
     network = network_of(model, torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = with_fitted_body(data, only_if_needed=True, **told)
+        data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
     return FieldPredictor(config, network, person_of(data, template_of(model)), data)
 
 

@@ -277,16 +277,6 @@ def _untrained(where: object) -> DyngsError:
     )
 
 
-def start(run: RunStart) -> PredictedModel:
-    """Return the model that takes a prediction."""
-    return PredictedModel(run)
-
-
-def refusal(_: object) -> str:
-    """Return why it cannot be trained on any capture."""
-    return "model.kind=predicted_field is what `dyngs predict` writes, and is not trained"
-
-
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
     """Return the scene of a checkpoint."""
     return stored_field(model.network, checkpoint)

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
+from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, reading
@@ -27,6 +27,7 @@ from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.ghg.network import (
     AtlasNetwork,
     PredictedAvatar,
@@ -181,6 +182,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
             device,
         )
         self.model = _section(config)
+        self.lr = self.model.lr
         self.names = [person.sitter.name for person in people]
         chosen = config.data.background
         self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
@@ -238,16 +240,22 @@ def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     )
 
 
-def predictor(config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any) -> Predictor:
+def predictor(
+    config: Config,
+    checkpoint: Checkpoint,
+    data: DataConfig,
+    say: Callable[[str], None],
+    report: ReportProgress,
+) -> Predictor:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
 
-    ``told``: ``say`` and ``report`` of that fit.
+    ``say`` and ``report`` are told of that fit.
     """
     model = _section(config)
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
-    data = with_fitted_body(data, human_options(model), only_if_needed=True, **told)
+    data = with_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
     person = filmed(data, model, load_template(human_options(model)))
     return PersonPredictor(config, model, network, mean, person, data)
 

@@ -13,7 +13,6 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.config import HumanPredictorModel
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.gaussians import Gaussians
@@ -24,6 +23,7 @@ from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import rest_shape
 from dyngs.human.body.mesh import vertex_normals
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.motion.motion import captured_motion
 
 

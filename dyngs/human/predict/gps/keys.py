@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -11,10 +11,6 @@ from dyngs.core.section import Fraction, Positive, SceneModel
 
 class GpsModel(SceneModel):
     """A network that predicts people from pairs of neighbouring views (docs/people_network.md)."""
-
-    made_of_gaussians: ClassVar[bool] = False
-    is_network: ClassVar[bool] = True
-    source_views: ClassVar[int] = 2
 
     kind: Literal["gps"] = Field(
         default="gps",

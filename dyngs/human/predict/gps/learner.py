@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig, GpsModel
+from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
@@ -24,6 +24,7 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.static_scene import Sides, StaticScene
 from dyngs.gaussians.static_training import StaticTraining
+from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.human.predict.gps.pairs import MAX_ANGLE, Pair, lessons, neighbours, well_spread
 from dyngs.human.predict.gps.rectification import RectifiedPair, cropped, is_inside, rectified
 from dyngs.human.predict.gps.surface import GpsNetwork, gaussians_of, offset_loss
@@ -149,6 +150,7 @@ class GpsLearner(Learner[GpsNetwork]):
         self.config, self.network, self.device = config, network, device
         self.model = _section(config)
         self._people = people
+        self.lr = self.model.lr
         self.names = [person.root.name for person in people]
         chosen = config.data.background
         self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
@@ -230,7 +232,13 @@ def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     return GpsLearner(config, network, captures_in(config.data), device)
 
 
-def predictor(config: Config, checkpoint: Checkpoint, data: DataConfig, **_: Any) -> Predictor:
+def predictor(
+    config: Config,
+    checkpoint: Checkpoint,
+    data: DataConfig,
+    say: Callable[[str], None],
+    report: ReportProgress,
+) -> Predictor:
     """Return the network of ``checkpoint`` with the capture of ``data``."""
     network = GpsNetwork(_section(config), torch.Generator())
     load_weights(network, checkpoint)

@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanPredictorModel
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry import cam_from_opengl
@@ -24,6 +23,7 @@ from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.mesh import interpolate, rasterize
+from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.ghg.person import (
     CapturedPerson,
     captured_person,

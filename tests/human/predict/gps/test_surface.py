@@ -7,7 +7,7 @@ import pytest
 import torch
 from ray_traced_ball import CENTER, RADIUS, ball, exact_depth, pose_at
 
-from dyngs.config import GpsModel
+from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.human.predict.gps.rectification import RectifiedPair, rectified
 from dyngs.human.predict.gps.surface import LARGEST, GpsNetwork, Surface, gaussians_of, offset_loss
 

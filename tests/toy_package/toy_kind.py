@@ -1,29 +1,30 @@
-"""A kind of model that is not made of Gaussians: a grid of colours and densities, ray-marched in
-plain torch."""
+"""A kind of model of another package, not made of Gaussians: a grid of colours and densities,
+ray-marched in plain torch. The folder is what pip would install."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Union
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from dyngs.config import Config, ModelSection
 from dyngs.core.camera import Cameras
+from dyngs.core.section import ModelSection
 from dyngs.core.state import Role, State, StateTensor, prefixed
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
 from dyngs.gaussians.parameters import AdamState
-from dyngs.models import kind as kinds
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Kind, RunStart
+from dyngs.models.kind import ModelKind, RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
 from dyngs.models.views import background_colour
+
+if TYPE_CHECKING:
+    from dyngs.models.kind import Restore, Start
 
 CELLS, SAMPLES, HALF = 12, 24, 1.5
 
@@ -164,18 +165,11 @@ def restore(model: ToyModel, checkpoint: Checkpoint) -> ToyScene:
     )
 
 
-@contextmanager
-def registered() -> Iterator[None]:
-    """Let ``model.kind=toy`` be a kind: one line more in the tuple of kinds, of which ``Config`` is
-    made again."""
-    info = Config.model_fields["model"]
-    before = Config.model_fields["model"].annotation
-    known = kinds.KINDS
-    kinds.KINDS = (*known, Kind(ToyModel, __name__))
-    info.annotation = Union[tuple(kind.section for kind in kinds.KINDS)]  # type: ignore[assignment]  # noqa: UP007
-    Config.model_rebuild(force=True)
-    try:
-        yield
-    finally:
-        info.annotation, kinds.KINDS = before, known
-        Config.model_rebuild(force=True)
+class ToyKind(ModelKind):
+    """See the module."""
+
+    def functions(self) -> tuple[Start, Restore]:
+        return start, restore
+
+
+TOY = ToyKind(ToyModel)

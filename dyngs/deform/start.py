@@ -1,0 +1,114 @@
+"""The kind of moving scenes: what they begin with, and how they are restored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dyngs.core.errors import DyngsError
+from dyngs.data.times import evenly_spaced
+from dyngs.deform.bodies.paths import Shots, one_camera, shots_of
+from dyngs.deform.fixed_cameras.hulls import Footage, footage_of
+from dyngs.deform.keys import DynamicModel
+from dyngs.deform.kind import DYNAMIC
+from dyngs.deform.scene import DynamicScene
+from dyngs.deform.schedule import deform_schedule
+from dyngs.deform.still_error import (
+    StillErrors,
+    cameras_in_place,
+    moving_fractions,
+    still_errors,
+    views_to_compare,
+)
+from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.colour.training import ColourTraining
+from dyngs.gaussians.model import GaussianModel, training_options
+from dyngs.gaussians.rendering import Shader
+from dyngs.gaussians.scene import drawn_as_trained
+from dyngs.gaussians.schedule import rates_of
+from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import RunStart
+from dyngs.models.schedule import image_divisor
+from dyngs.models.views import evaluation_background, training_cameras, training_times
+
+MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
+MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
+# Steps of the run for each: those take ten times as long as the search in one image
+STEPS_PER_SHOT = 50
+SECONDS_PER_SHOT = 3.0  # Of train.minutes for each, where that is given, likewise
+
+
+def start(run: RunStart) -> GaussianModel:
+    """Return the model of a moving scene before its first step. Raises DyngsError: there are no
+    times to move in."""
+    model = run.config.model
+    assert isinstance(model, DynamicModel)
+    problem = DYNAMIC.refusal(run.capture)
+    if problem is not None:
+        raise DyngsError(f"{run.config.data.root}: {problem}")
+    gaussians = first_gaussians(run)
+    colours = colours_of(run, gaussians, sees_time=True)
+    schedule = deform_schedule(model, rates_of(run.config))
+    views = _training_views(run, model, colours)
+    training = DynamicTraining(model, schedule, views, filter_update(run), run.generator)
+    return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
+
+
+def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
+    """Return the scene of a checkpoint."""
+    scene = DynamicScene.restored(
+        model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
+    )
+    return drawn_as_trained(scene, model, checkpoint)
+
+
+def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+    config = run.config
+    capture = run.capture
+    images = run.images
+    views = capture.splits["train"]
+    _, background = evaluation_background(config.data.background, capture.has_alpha)
+    divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
+    looked_at = views_to_compare(views)
+    options = training_options(run)
+
+    def shader(time: float) -> Shader | None:
+        return None if colours.network is None else colours.network.shader(time)
+
+    def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
+        shown = [images.shrunk(i, divisor) for i in looked_at]
+        if any(image.moves is not None for image in shown):
+            return moving_fractions(
+                gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold
+            )
+        return still_errors(gaussians_at, shown, options, background, shader)
+
+    in_place = cameras_in_place(views)
+
+    def standing() -> list[Footage]:
+        used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
+        return [
+            footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used
+        ]
+
+    def shots(still: Gaussians) -> Shots | None:
+        order = one_camera(views)
+        limit = min(MAX_SHOTS, rates_of(config).steps // STEPS_PER_SHOT)
+        if config.train.minutes is not None:
+            limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_SHOT))
+        if order is None or limit == 0 or len(set(images.sizes)) > 1:
+            return None
+        used = (images[order[i]] for i in evenly_spaced(len(order), limit))
+        return shots_of(used, still, options, background, shader)
+
+    return TrainingViews(
+        training_times(capture),
+        training_cameras(views, config.data),
+        run.extent,
+        errors_of,
+        cameras_stay=bool(in_place),
+        standing=standing,
+        shots=shots,
+        options=options,
+    )

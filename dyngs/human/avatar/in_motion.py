@@ -1,0 +1,48 @@
+"""A person in the motion of a file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from dyngs.core.errors import DyngsError
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.body.body_reader import load_template
+from dyngs.human.keys import HumanModel
+from dyngs.human.motion.feet import feet_kept, sole_points
+from dyngs.human.motion.motion import motion_clip
+from dyngs.human.motion.placement import place_like, up_direction
+from dyngs.human.motion.retarget import read_motion
+from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.models.kind import InMotion
+from dyngs.models.renderable import Renderable
+
+
+def in_motion(
+    section: HumanModel, person: Renderable, info: CheckpointInfo, path: Path, *, keep_feet: bool
+) -> InMotion:
+    """See ``dyngs.models.kind.HasBody``."""
+    if not isinstance(person, HumanScene):
+        raise DyngsError(f"{path}: only a person plays a motion")
+    scene = person.to("cpu")
+    motion = read_motion(path, load_template(section))
+    if motion.poses.shape[1] != len(scene.skeleton.joints):
+        motion = motion.for_joints(len(scene.skeleton.joints))
+    is_fit = bool((motion.scale != 1).any())
+    if is_fit:
+        trans = motion.trans - motion.trans.new_tensor(info.world_offset)
+        unit = info.world_scale
+        motion = replace(motion, trans=trans / unit, scale=motion.scale / unit)
+    clip = motion_clip(motion)
+    if not is_fit:
+        clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
+    playing = scene.playing(clip)
+    notes = tuple(motion.notes)
+    if keep_feet:
+        skeleton = playing.learned_skeleton
+        floor = float(scene.anchors.points[:, 1].min())
+        soles = sole_points(playing.moves_as, skeleton.joints, skeleton.parents, floor)
+        clip, before, after = feet_kept(clip, soles, up_direction(scene.clip), motion.fps)
+        playing = scene.playing(clip)
+        notes = (*notes, before.compared(after))
+    return InMotion(playing.to(person.gaussians.means.device), motion.fps, notes)

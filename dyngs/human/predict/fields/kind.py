@@ -1,0 +1,46 @@
+"""The kinds of networks that predict fields of people, and of what they predict."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dyngs.human.predict.fields.keys import (
+    EgHumanNerfModel,
+    FieldPredictorModel,
+    KeypointNerfModel,
+    PredictedFieldModel,
+)
+from dyngs.models.kind import ModelKind, Predicts
+
+if TYPE_CHECKING:
+    from dyngs.data.capture import Capture
+    from dyngs.models.kind import MakeLearner, MakePredictor, Restore, Start
+
+
+class FieldPredictorKind(Predicts):
+    """See the module."""
+
+    def num_views(self, section: FieldPredictorModel) -> int:
+        return section.source_views
+
+    def networks(self) -> tuple[MakeLearner, MakePredictor]:
+        from dyngs.human.predict.fields.learner import learner, predictor
+
+        return learner, predictor
+
+
+class PredictedFieldKind(ModelKind):
+    """What such a network has predicted: it is drawn, and not trained."""
+
+    def refusal(self, capture: Capture) -> str:
+        return "model.kind=predicted_field is what `dyngs predict` writes, and is not trained"
+
+    def functions(self) -> tuple[Start, Restore]:
+        from dyngs.human.predict.fields.scene import PredictedModel, restore
+
+        return PredictedModel, restore
+
+
+KEYPOINT_NERF = FieldPredictorKind(KeypointNerfModel)
+EG_HUMAN_NERF = FieldPredictorKind(EgHumanNerfModel)
+PREDICTED_FIELD = PredictedFieldKind(PredictedFieldModel)

@@ -1,0 +1,26 @@
+"""The kind ``static``: still scenes of Gaussians."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dyngs.models.kind import LimitsSize
+from dyngs.static.keys import StaticModel
+
+if TYPE_CHECKING:
+    from dyngs.models.kind import Restore, Start
+
+
+class StaticKind(LimitsSize):
+    """See the module."""
+
+    uses = LimitsSize.uses | {"init.scene"}
+    speeds_up_short_runs = True
+
+    def functions(self) -> tuple[Start, Restore]:
+        from dyngs.gaussians.static_training import restore, start
+
+        return start, restore
+
+
+STATIC = StaticKind(StaticModel)
