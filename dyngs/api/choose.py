@@ -30,6 +30,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
+from dyngs.static.keys import StaticModel
 from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
