@@ -30,7 +30,6 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.smaller_images import view_size
 from dyngs.data.times import evenly_spaced
-from dyngs.static.keys import StaticModel
 from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
@@ -40,6 +39,7 @@ from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
+from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.camera_refinement import fitted_to_image
 from dyngs.training.loop import Interrupts
 from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points

@@ -12,7 +12,7 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -38,11 +38,6 @@ as (n - 1) / n."""
 SCATTERED = 0.5
 """Distance between cameras that follow each other in time, in medians of the distance of any two,
 from which time and viewpoint have nothing to do with each other."""
-MOST_STEPS, MOST_IMAGES, FEWEST_STEPS = 300, 4000, 2
-"""Time steps of several videos (those of the usual clips of ten seconds) and images of all
-together, at most, unless a number is given; and time steps at least."""
-# frames within this fraction of a frame's duration of a time step count as taken at it
-SAME_STEP = 0.2
 _MAX_NAMED = 5
 # longest over shortest gap of evenly spaced times, with allowance for rounding in the files
 _EVEN = 1.1
@@ -498,58 +493,3 @@ def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
         else f"camera {camera}"
         for camera in cameras
     }
-
-
-@dataclass(frozen=True)
-class Taken:
-    """Frames taken of one video: their ``numbers`` (K,), ascending, and ``seconds`` (K,) in the
-    clock of all videos."""
-
-    numbers: np.ndarray
-    seconds: np.ndarray
-
-
-def taken_frames(
-    where: Path, clocks: Sequence[np.ndarray], rates: Sequence[float], most: int | None = None
-) -> tuple[list[Taken], str]:
-    """Return the frames of each video at the time steps that all of them show, and a line on how
-    many.
-
-    Time steps are frames of the video with the fewest per second. Of the others the nearest frame
-    is taken, at its own time if that differs. Raises DyngsError: no two time steps that all videos
-    show.
-
-    Args:
-        clocks: of each video the seconds (F,) of its frames, in one clock; ``rates``: frames per
-            second.
-        most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many
-            cameras.
-    """
-    first = max(clock[0] for clock in clocks)
-    last = min(clock[-1] for clock in clocks)
-    slowest = min(range(len(clocks)), key=lambda i: (rates[i], i))
-    slack = 0.5 / rates[slowest]
-    steps = clocks[slowest][(clocks[slowest] >= first - slack) & (clocks[slowest] <= last + slack)]
-    if len(steps) < FEWEST_STEPS:
-        raise DyngsError(
-            f"{where}: the videos share no two time steps: the last one begins at {first:.2f} s of one clock, the "
-            f"first one ends at {last:.2f} s; are all of them of one event?"
-        )
-    limit = max(min(MOST_STEPS, MOST_IMAGES // len(clocks)), FEWEST_STEPS) if most is None else most
-    chosen = steps[evenly_spaced(len(steps), limit)]
-    taken = [
-        _nearest(clock, chosen, SAME_STEP / rate) for clock, rate in zip(clocks, rates, strict=True)
-    ]
-    line = f"{len(chosen)} time steps of {chosen[-1] - chosen[0]:.2f} s that all {len(clocks)} cameras show"
-    if len(chosen) < len(steps):
-        line += f", of {len(steps)} (--frames of `dyngs data sfm` chooses)"
-    return taken, line
-
-
-def _nearest(clock: np.ndarray, steps: np.ndarray, same: float) -> Taken:
-    after = np.clip(np.searchsorted(clock, steps), 1, max(len(clock) - 1, 1))
-    numbers = np.where(steps - clock[after - 1] <= clock[after] - steps, after - 1, after)
-    seconds = clock[numbers]
-    seconds = np.where(np.abs(seconds - steps) <= same, steps, seconds)
-    numbers, kept = np.unique(numbers, return_index=True)
-    return Taken(numbers, seconds[kept])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.capture.first_points import AROUND_ORIGIN
+from dyngs.capture.initial_points import AROUND_ORIGIN
 from dyngs.config import (
     AutoColour,
     DefaultStrategy,

@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from dyngs.api.budget.size import has_file
-from dyngs.capture.unposed import is_unposed
+from dyngs.capture.sfm.unposed import is_unposed
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import find_preset, load_config, load_resolved
 from dyngs.core.errors import DyngsError, as_word, printable, show

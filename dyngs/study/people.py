@@ -27,7 +27,7 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
-from dyngs.human.predict.gps.pairs import angle, around
+from dyngs.human.predict.gps.rectification import angle, around
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
 from dyngs.models.prediction import Predictor

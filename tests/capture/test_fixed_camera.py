@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 
-from dyngs.capture.fixed_camera import FOCAL, is_plain_clip, read_fixed_camera, zoomed
+from dyngs.capture.fixed_camera import FOCAL, read_fixed_camera, zoomed
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_image
@@ -64,23 +64,6 @@ def test_masks_are_named_as_images(tmp_path: Path) -> None:
     assert shown.path.name == "f1.png"
     with pytest.raises(DyngsError, match="no such folder of masks"):
         read_fixed_camera(DataConfig(root=root), tmp_path / "none")
-
-
-def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
-    root = frames(tmp_path / "c", 2)
-    write_image(root / "g.png", np.zeros((5, 6, 3), np.uint8))
-    with pytest.raises(DyngsError, match="has another size than f0"):
-        read_fixed_camera(DataConfig(root=root))
-
-
-def test_what_is_a_clip(tmp_path: Path) -> None:
-    assert is_plain_clip(frames(tmp_path / "c", 1))
-    assert not is_plain_clip(tmp_path)
-    assert not is_plain_clip(tmp_path / "missing.mp4")
-    (tmp_path / "a.mp4").touch()
-    assert is_plain_clip(tmp_path / "a.mp4")
-    with pytest.raises(DyngsError):
-        read_fixed_camera(DataConfig(root=tmp_path / "a.mp4"))
 
 
 def test_a_zoomed_camera_stands_back(tmp_path: Path) -> None:

@@ -5,24 +5,21 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dyngs.capture.first_points import checked_points
 from dyngs.capture.inspection.problems import (
-    described_masks,
     listed,
+    masks_of,
     problems_of,
     tallied,
-    transforms_file_problems,
 )
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, counted, printable, reading
 from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.geometry import camera_center, inverse_rigid, pose_fault
+from dyngs.data.geometry import camera_center, inverse_rigid
 from dyngs.data.images.lens import is_pinhole, kept_fraction
 from dyngs.data.times import distinct_times
 from dyngs.io.containment import images_up_to, leaving_links
@@ -63,7 +60,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("lens", tallied(lenses) + _kept(views)),
         *_exposures(views),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
-        ("masks", described_masks(capture) or "none"),
+        ("masks", masks_of(capture)[0] or "none"),
         *_prior_facts(capture),
         *_time_facts(capture),
         ("points", "none" if capture.points is None else f"{len(capture.points.xyz)}{file}"),
@@ -221,18 +218,13 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
         ):
             report = report_on(capture, deep)
     except DyngsError as error:
-        more = (*listed(links), *transforms_file_problems(options.root, str(error)))
-        return InspectReport(options.root, None, (), (str(error), *more))
+        return InspectReport(options.root, None, (), (str(error), *listed(links)))
     return replace(report, problems=(*listed(links), *report.problems))
 
 
 def report_on(capture: Capture, deep: bool = False) -> InspectReport:
     """Return the report on a capture that has been read; see ``inspect_capture``."""
-    checked, line = capture, None
-    with suppress(DyngsError):  # images that cannot be read, which is a problem of its own
-        checked, line = checked_points(capture, DataConfig(root=capture.root))
-    noise = [line] if line is not None and checked.points is None else []
-    problems = dict.fromkeys([*capture.warnings, *noise, *problems_of(checked, deep)])
+    problems = dict.fromkeys([*capture.warnings, *problems_of(capture, deep)])
     return InspectReport(capture.root, capture, facts_of(capture), tuple(problems))
 
 
@@ -263,15 +255,12 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     orthographic.
 
     Frusta of training cameras are orange, of validation green, of test and new poses blue; points
-    have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras, and
-    views without a rigid pose, are left out.
+    have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras are
+    left out.
     """
     Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
-    usable = [(split, view) for split, view in views if pose_fault(view) is None]
-    if not usable:
-        raise DyngsError(f"cannot draw the cameras of {capture.root}: no view has a usable pose")
-    poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in usable])
+    poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in views])
     axes = _drawing_axes(poses)
     xyz, rgb = _near_points(capture, poses[:, :3, 3])
     core = np.quantile(xyz @ axes.T, [0.03, 0.97], axis=0) if len(xyz) else xyz
@@ -286,7 +275,7 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
         middle = 0.5 * (low + high)[shown]
         panel = _Panel(size, axes[shown], middle, extent)
         panel.draw_points(xyz, rgb)
-        for (split, view), pose in zip(usable, poses, strict=True):
+        for (split, view), pose in zip(views, poses, strict=True):
             panel.draw_frustum(view, pose, depth, SPLIT_COLORS[split])
         panels.append(panel.finished(title))
     write_image(out, np.concatenate(panels, axis=1))
@@ -353,13 +342,10 @@ def _near_points(capture: Capture, centers: np.ndarray) -> tuple[np.ndarray, np.
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     xyz = capture.points.xyz
     rgb = capture.points.rgb
-    finite = np.isfinite(xyz).all(axis=1)
-    xyz = xyz[finite]
-    rgb = rgb[finite]
     middle = centers.mean(axis=0)
     distance = np.linalg.norm(xyz - middle, axis=1)
     spread = np.linalg.norm(centers - middle, axis=1).max()
-    limit = max(4.0 * spread, float(np.median(distance)) if len(distance) else 0.0)
+    limit = max(4.0 * spread, float(np.median(distance)))
     near = np.flatnonzero(distance <= limit)
     near = near[:: max(len(near) // 20_000, 1)]
     return xyz[near], rgb[near]

@@ -67,9 +67,7 @@ def read_usd(path: Path) -> SplatFile:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
     found = [_gaussians(path, {name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
     up = _UP.get(str(read["up"]), "y")
-    return described(
-        SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())), path
-    )
+    return described(SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())))
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
