@@ -179,6 +179,7 @@ def test_a_clear_gain_is_taken_and_noise_is_not(
         return Choice(text, 8, 20.0, gains[text], 0.1, 1000, 1.0, taken)
 
     monkeypatch.setattr(module, "_compared", compare)
+    monkeypatch.setattr(module, "FEWEST_VIEWS", 2)
     keys = (
         "train.steps=200_000",
         "camera.refine=auto",

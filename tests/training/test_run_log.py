@@ -29,7 +29,7 @@ def _steps(path: Path) -> list[int]:
 
 
 def test_each_line_is_on_disk_at_once(tmp_path: Path) -> None:
-    with RunLog(tmp_path, 0) as log:
+    with RunLog(tmp_path / "log.jsonl", 0) as log:
         log.write(_record(10))
         assert json.loads(log.path.read_text()) == {
             "step": 10, "loss": 0.5, "psnr": 20.0, "num_gaussians": 1234, "num_moving": 56,
@@ -40,23 +40,23 @@ def test_each_line_is_on_disk_at_once(tmp_path: Path) -> None:
 
 
 def test_a_resumed_log_forgets_what_came_after_the_checkpoint(tmp_path: Path) -> None:
-    with RunLog(tmp_path, 0) as log:
+    with RunLog(tmp_path / "log.jsonl", 0) as log:
         for step in (10, 20, 30):
             log.write(_record(step))
     with log.path.open("a") as file:
         file.write("[" * 5000 + "]" * 5000 + "\n")
         file.write('{"step": 4')  # killed while writing
-    with RunLog(tmp_path, 20) as log:
+    with RunLog(tmp_path / "log.jsonl", 20) as log:
         log.write(_record(30))
     assert _steps(log.path) == [10, 20, 30]
-    with RunLog(tmp_path, 0):
+    with RunLog(tmp_path / "log.jsonl", 0):
         pass
     assert _steps(log.path) == []
 
 
 def test_it_listens_to_steps_and_scores(tmp_path: Path) -> None:
     """Each fifth step and the last have a line, and so does each evaluation."""
-    with RunLog(tmp_path, 0, every=5) as log:
+    with RunLog(tmp_path / "log.jsonl", 0, every=5) as log:
         for step in range(1, 13):
             log(step_done(step, 12))
             log(Message("nothing for the log"))

@@ -152,6 +152,10 @@ def test_common_motions_change_no_image(seed: int) -> None:
     )
 
 
+def image_of(camera: Cameras) -> Image:
+    return Image("", camera, torch.zeros(1, 1, 3), None, None, None)
+
+
 def points_seen(camera: Cameras, points: Tensor) -> Tensor:
     """Return where points (N, 3) are seen, px."""
     local = points @ camera.cam_from_world[0, :3, :3].T + camera.cam_from_world[0, :3, 3]
@@ -182,7 +186,7 @@ def test_disturbed_cameras_are_found() -> None:
         camera = watched(refinement.corrections.applied(index, camera_of(views[index])))
         error = (points_seen(camera, points.double()) - truth[index]).norm(dim=-1).mean()
         error.backward()
-        refinement.optimize(step, index, camera)
+        refinement.after_backward(index, step, image_of(camera))
         errors.append(float(error.detach()))
     first, last = (
         np.mean(errors[part]) for part in (slice(0, int(STARTS * steps)), slice(-8, None))
@@ -200,7 +204,7 @@ def test_state_goes_on_and_that_of_others_is_refused() -> None:
                 refinement.corrections.applied(step % MIN_POSES, camera_of(views[step % MIN_POSES]))
             )
             (camera.cam_from_world[0, :3].sin().sum() + camera.intrinsics.sum() / 300).backward()
-            refinement.optimize(step, step % MIN_POSES, camera)
+            refinement.after_backward(step % MIN_POSES, step, image_of(camera))
 
     steps(one, 1, 60)
     other.load_state({name: x.clone() for name, x in one.state().items()})

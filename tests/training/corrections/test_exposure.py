@@ -12,6 +12,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.loader import Image
 from dyngs.deform.keys import DynamicModel
+from dyngs.models.correction import RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.exposure import WARM_UP, ViewExposures
@@ -23,8 +24,13 @@ STEPS = 200
 GAINS = (0.7, 1.0, 1.3, 1.5)
 
 
-def shown(rgb: Tensor) -> Rendering:
-    return Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None)
+def corrected(exposures: ViewExposures, index: int, step: int, image: Image, rgb: Tensor) -> Tensor:
+    """Return the rendering ``rgb`` of a view as the loss compares it."""
+    rendering = Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None)
+    view = RenderedView(
+        index, step, image, rendering, rgb, BLACK, lambda *_: rendering, lambda _: True
+    )
+    return exposures.after_render(view).rendered
 
 
 def trained_on(
@@ -47,10 +53,10 @@ def trained_on(
         index = step % len(gains)
         mask = torch.full((12, 12), float(index != hidden))
         image = Image(f"{index}", None, (gains[index] * given).clamp_max(1), None, mask, None)  # type: ignore[arg-type]
-        rendered = exposures.applied((index, step), image, shown(scene), BLACK)
+        rendered = corrected(exposures, index, step, image, scene)
         loss = ((rendered - image.rgb_premultiplied).abs() * mask[..., None]).mean()
         sum(exposures.penalties(index).values(), loss).backward()
-        exposures.optimize(index, step)
+        exposures.after_backward(index, step, image)
         optimizer.step()
         optimizer.zero_grad()
     return exposures
@@ -81,7 +87,7 @@ def test_saturated_pixels_are_not_blamed() -> None:
     step = round(WARM_UP * STEPS) + 1
     white = Image("", None, torch.ones(4, 4, 3), None, None, None)  # type: ignore[arg-type]
     rgb = torch.full((4, 4, 3), 1.4, requires_grad=True)
-    out = exposures.applied((0, step), white, shown(rgb), BLACK)
+    out = corrected(exposures, 0, step, white, rgb)
     assert float(out.detach().max()) <= 1.0 + 1e-6
 
 

@@ -23,6 +23,8 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.loader import Image
 from dyngs.deform.keys import DynamicModel
+from dyngs.models.correction import RenderedView
+from dyngs.models.renderable import Rendering
 from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.robust import WARM_UP, RobustMasks
 from dyngs.training.new_trainer import assemble
@@ -43,10 +45,17 @@ def masked_images(
 ) -> list[Image]:
     """Return all images after a round of training on them."""
     masks = masks or masks_of(images)
-    return [
-        masks.masked(i, AFTER, image, rgb, BLACK, with_depth)
-        for i, (image, rgb) in enumerate(zip(images, drawn, strict=True))
-    ]
+    pairs = zip(images, drawn, strict=True)
+    return [masked(masks, i, AFTER, image, rgb) for i, (image, rgb) in enumerate(pairs)]
+
+
+def masked(masks: RobustMasks, index: int, step: int, image: Image, rgb: Tensor) -> Image:
+    """Return an image with the mask of its view in a step."""
+    rendering = Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None)
+    view = RenderedView(
+        index, step, image, rendering, rgb, BLACK, lambda c, _: with_depth(c), lambda _: True
+    )
+    return masks.after_render(view).image
 
 
 def busy_wall(which: tuple[int, ...] = (1, 4)) -> list[Image]:
@@ -92,7 +101,7 @@ def test_all_counts_while_the_run_warms_up() -> None:
     images = busy_wall()
     masks = masks_of(images)
     drawn = learned(images[1].cameras)
-    assert masks.masked(1, AFTER - 1, images[1], drawn, BLACK, with_depth) is images[1]
+    assert masked(masks, 1, AFTER - 1, images[1], drawn) is images[1]
 
 
 def test_the_images_own_mask_stays() -> None:
