@@ -20,18 +20,21 @@ from dyngs.training.trainer import Edit
 IMAGE = Image("view", camera(2, 2), torch.zeros(2, 2, 3), None, None, None)
 
 
+CONFIG = Config(data=DataConfig(root=Path("x")), train=TrainConfig(log_every=1))
+
+
 @dataclass
 class Counting:
     """Counts its steps; ``findings`` and ``failures`` say what happens in which."""
 
     done: int = 0
-    config: Config = Config(data=DataConfig(root=Path("x")), train=TrainConfig(log_every=1))
     bad_gradients: int = 0
     num_gaussians: int = 1234
     num_moving: int = 56
     has_test_views: bool = False
     findings: dict[int, str] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
+    config: Config = field(default_factory=lambda: CONFIG)
 
     def step(self) -> StepReport:
         step = self.done + 1

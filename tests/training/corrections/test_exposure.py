@@ -68,15 +68,6 @@ def brightness(exposures: ViewExposures, count: int) -> Tensor:
     return torch.stack([(exposures.affine(i).detach() @ grey).mean() / 0.4 for i in range(count)])
 
 
-def test_gains_are_learned_and_their_mean_is_the_identity() -> None:
-    exposures = trained_on(GAINS)
-    found = brightness(exposures, len(GAINS))
-    given = torch.tensor(GAINS)
-    torch.testing.assert_close(found, given / given.mean(), atol=0.06, rtol=0)
-    mean = torch.stack([exposures.affine(i).detach() for i in range(len(GAINS))]).mean(0)
-    torch.testing.assert_close(mean, torch.eye(3, 4), atol=1e-5, rtol=0)
-
-
 def test_images_that_agree_keep_the_identity() -> None:
     found = brightness(trained_on((1.0, 1.0, 1.0, 1.0)), 4)
     torch.testing.assert_close(found, torch.ones(4), atol=0.02, rtol=0)
