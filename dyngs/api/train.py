@@ -31,7 +31,7 @@ from dyngs.compress.stage import prune_stage
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.conventions import ReportProgress, report_nothing
-from dyngs.core.errors import as_word, counted, show, warn
+from dyngs.core.errors import DyngsError, as_word, counted, show, warn
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.lock import writing
