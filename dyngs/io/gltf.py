@@ -28,7 +28,7 @@ from pydantic import (
 )
 
 from dyngs.core.errors import DyngsError, reading, require_regular
-from dyngs.io.limits import require_at_most
+from dyngs.io.fields import require_at_most
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -21,7 +21,7 @@ from dyngs.gaussians.rendering import render, splat_options
 from dyngs.io.formats.formats import read_splats
 from dyngs.io.formats.similarity import Similarity
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import Opened, open_run
+from dyngs.runs.opened import open_run
 from dyngs.view.session import Keyframe, Recording
 
 EDITS = Edits(frame=Frame(up=(0.0, 0.6, 0.8), origin=(0.5, 0.25, 0.0), scale=3.0))
@@ -118,22 +118,3 @@ def test_edits_add_up_and_are_undone_to_the_bytes(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="the frame of this run was not edited"):
         edited(back, Edits(undo=True), "more")
     assert not (tmp_path / "more").exists()
-
-
-def test_what_is_no_run(tmp_path: Path) -> None:
-    run = write_moving_run(tmp_path)
-    file = write_run_splats(open_run(run), tmp_path / "a.ply").path
-    for source, edits, said in (
-        (file, EDITS, "a name without a suffix is a run of its own"),
-        (run, Edits(merge=(file,)), "without --merge and --time"),
-        (run, Edits(time=0.5), "without --merge and --time"),
-    ):
-        with pytest.raises(DyngsError, match=said):
-            edit_scene(source, tmp_path / "new", edits, tell=silent)
-        assert not (tmp_path / "new").exists()
-    taken = edited(run)
-    with pytest.raises(DyngsError, match="exists already"):
-        edited(run)
-    with pytest.raises(DyngsError, match="exists already"):
-        edit_scene(run, run, EDITS, tell=silent)
-    assert isinstance(open_run(taken), Opened)

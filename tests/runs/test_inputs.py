@@ -56,7 +56,6 @@ UNCHECKED = {
     "capture/sfm/photos.py:copied": OWN,
     "capture/sfm/photos.py:lay_out": OWN,
     "capture/sfm/colmap.py:match_listed": OWN,
-    "capture/sfm/colmap.py:working": OWN,
     "data/times.py:write_seconds": OWN,
     "demo.py:run_demo": "in a folder that is empty, and locked",
     "data/synthetic/captures.py:write_split": OWN,

@@ -29,8 +29,7 @@ from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 from dyngs.io.lock import make_once
 from dyngs.io.outputs import note_sources, require_new_folder
-from dyngs.io.temporary import cache_folder, temporary_folder_beside
-from dyngs.io.write import write_image, write_text
+from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 REACH = 0.6  # distance between following detections of one person, at most, in heights an image
 PATIENCE = 10  # images after which anybody may be the person again

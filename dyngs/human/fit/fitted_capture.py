@@ -58,8 +58,7 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.io.lock import make_once
 from dyngs.io.outputs import new_folder
-from dyngs.io.temporary import cache_folder
-from dyngs.io.write import atomic_file, write_image, write_text
+from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY, _CONFIG = "body_train.npz", "config.yaml"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,10 +17,16 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats import gltf, ply
 from dyngs.io.formats.antimatter import read_antimatter, write_antimatter
 from dyngs.io.formats.checkpoint import read_checkpoint
-from dyngs.io.formats.edit_note import note_path, read_note, write_note
 from dyngs.io.formats.gltf import read_gltf, write_gltf
 from dyngs.io.formats.ply import read_ply, write_ply
-from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, axis_of, turn_between
+from dyngs.io.formats.similarity import (
+    AXES,
+    UNMOVED,
+    Similarity,
+    axis_of,
+    similarity_of,
+    turn_between,
+)
 from dyngs.io.formats.sog import SOG_META, read_sog, write_sog
 from dyngs.io.formats.splat_file import (
     GEO_OFFSET,
@@ -33,7 +41,47 @@ from dyngs.io.formats.splat_file import (
 )
 from dyngs.io.formats.spz import SYSTEM_OF_UP, read_spz, write_spz, write_spz_4
 from dyngs.io.formats.usd import read_usd, write_usd
-from dyngs.io.write import atomic_file
+from dyngs.io.write import atomic_file, write_text
+
+_MOST_BYTES = 4096
+
+
+def note_path(path: Path) -> Path:
+    """Return where the note of a file lies."""
+    return path.with_name(f"{path.name}.edit.json")
+
+
+def write_note(path: Path, edited: Similarity) -> None:
+    """Write the note of the file ``path``, which it knows by its digest, atomically."""
+    write_text(
+        note_path(path), json.dumps({"edited": edited.numbers, "sha256": _digest(path)}) + "\n"
+    )
+
+
+def read_note(path: Path) -> Similarity:
+    """Return what the note of the file ``path`` says; no change without one, or where it is about
+    another file.
+
+    Raises DyngsError: it is damaged.
+    """
+    note = note_path(path)
+    if not note.is_file():
+        return UNMOVED
+    try:
+        if note.stat().st_size > _MOST_BYTES:
+            raise ValueError("too large")
+        told = json.loads(note.read_bytes())
+        edited = similarity_of([float(x) for x in told["edited"]])
+        digest = str(told["sha256"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise DyngsError(
+            f"{note}: is no note of `dyngs edit`; remove it, or write {path.name} again"
+        ) from None
+    return edited if digest == _digest(path) else UNMOVED
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import numpy as np
 
 from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms, srgb_decoded
 from dyngs.core.gaussians import Gaussians
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
 from dyngs.io.formats.splat_file import (
     MOST_GAUSSIANS,
@@ -30,7 +31,6 @@ from dyngs.io.formats.splat_file import (
 )
 from dyngs.io.formats.spz import packed_spz, unpacked_spz
 from dyngs.io.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
-from dyngs.io.limits import require_at_most
 
 EXTENSION = "KHR_gaussian_splatting"
 # the draft has both names

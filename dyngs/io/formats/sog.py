@@ -21,6 +21,7 @@ import torch
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians, morton_order
+from dyngs.io.fields import read_limited, require_at_most
 from dyngs.io.formats.packing import (
     codebook,
     largest_and_others,
@@ -36,7 +37,6 @@ from dyngs.io.formats.splat_file import (
     header_comments,
     stored_comments,
 )
-from dyngs.io.limits import read_limited, require_at_most
 
 SOG_META = "meta.json"  # of a .sog, which may lie in a folder
 _PER_ROW = 64

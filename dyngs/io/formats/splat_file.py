@@ -16,9 +16,9 @@ from torch import Tensor
 from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import logit
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, far_offset, similarity_of
-from dyngs.io.limits import require_at_most
 from dyngs.ops.checks import finite_rows
 
 Nonfinite = Literal["error", "skip"]

@@ -21,10 +21,10 @@ import torch
 from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import largest_and_others, logit, with_largest
 from dyngs.io.formats.similarity import Similarity, mirrored, turn_of
 from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
-from dyngs.io.limits import require_at_most
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")

@@ -20,7 +20,7 @@ from dyngs.data.capture import VideoFrame
 from dyngs.data.images import frame_cache
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import read_image
-from dyngs.io.temporary import cache_folder
+from dyngs.io.write import cache_folder
 
 
 @pytest.fixture
@@ -102,17 +102,6 @@ def test_another_video_under_the_same_name(root: Path) -> None:
     assert (frames.info.width, frames.info.num_frames) == (32, 4)
     decode_frames(root, some(plan(video), 0, 1), 10)
     assert read_image(frames.paths[0]).shape == (16, 32, 3)
-
-
-def test_huge_videos_are_told_apart_by_samples_and_time(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(frame_cache, "WHOLE_BYTES", 10)
-    video = root / "cam00.mp4"
-    first = planned_frames(video).paths
-    assert planned_frames(video).paths == first
-    os.utime(video, ns=(0, 10**18))
-    assert not set(planned_frames(video).paths) & set(first)
 
 
 def test_the_limit_is_refused_at_once(root: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,9 +21,7 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.runs.stored_file import packed, unpacked
-from dyngs.runs.stored_tensors import (
+from dyngs.runs.stored_file import (
     FIXED_STEPS,
     LARGEST_HALF,
     LIMIT,
@@ -42,7 +39,7 @@ from dyngs.runs.stored_tensors import (
     is_step,
     opacities_from_grid,
     opacities_to_grid,
-    restored,
+    packed,
     rotations_from_grid,
     rotations_to_grid,
     sorted_axes,
@@ -50,15 +47,8 @@ from dyngs.runs.stored_tensors import (
     stored_edit,
     to_grid,
     to_whole,
+    unpacked,
 )
-
-
-def test_what_hardly_shows_is_stored_more_coarsely() -> None:
-    x = torch.full((3, 2), 0.7)
-    back = restored(x, Coding(TensorKind.GRID, 0.125, by_coarseness=True), np.array([0, 1, 3]))
-    torch.testing.assert_close(back[:, 0], torch.tensor([0.75, 0.75, 1.0]))
-    with pytest.raises(ValueError, match="lacks"):
-        restored(x, Coding(TensorKind.GRID, 0.125, by_coarseness=True))
 
 
 def read_again(
@@ -162,26 +152,6 @@ def test_what_is_not_finite_is_refused() -> None:
     gaussians.means[1, 1] = torch.nan
     with pytest.raises(DyngsError, match="means is not finite"):
         drawable(StaticScene(gaussians=gaussians))
-
-
-def masked() -> tuple[DynamicScene, DynamicModel]:
-    """As ``moving``; each Gaussian is seen at one of three key times."""
-    scene, model = moving("control_nodes")
-    masks = VisibilityMasks.pack(
-        (0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None]
-    )
-    return replace(scene, masks=masks), model
-
-
-def test_masks_follow_their_gaussians() -> None:
-    scene, model = masked()
-    kept = stored(scene)
-    assert not torch.equal(kept["gaussians.means"], scene.gaussians.means)
-    again = read(kept, model)
-    for time in (0.1, 0.8):
-        expected = scene.render(camera(), time).rgb
-        torch.testing.assert_close(again.render(camera(), time).rgb, expected, atol=1e-5, rtol=0)
-        assert not torch.allclose(scene.unmasked().render(camera(), time).rgb, expected, atol=1e-3)
 
 
 FLOATS = st.floats(-(2.0**100), 2.0**100, width=32)
