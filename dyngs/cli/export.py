@@ -587,8 +587,8 @@ def _export_page(arguments: argparse.Namespace) -> int:
 def _export_cameras(arguments: argparse.Namespace) -> int:
     """Write the cameras of a run as a transforms.json, refined where training refined them."""
     from dyngs.data.capture import all_views
+    from dyngs.evaluate.refined_cameras import found_corrections
     from dyngs.export.cameras import NAME, write_cameras
-    from dyngs.runs.checkpoint import found_corrections
     from dyngs.runs.opened import open_run
 
     source: Path = arguments.run_dir

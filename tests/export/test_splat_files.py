@@ -156,8 +156,7 @@ def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
     assert how.turn == turn_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
     assert "the axes of the capture are kept" in writing_of(near, name)[1]
-    data = near.config.data.model_copy(update={"root": Path("no")})
-    lost = replace(near, captured=Captured(data, near.info))
+    lost = replace(near, captured=Captured(near.config.data, DyngsError("gone")))
     assert up_of(lost) is None
     how, line = writing_of(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
