@@ -61,11 +61,11 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.static_training import StaticTraining
+from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"

@@ -29,10 +29,10 @@ from dyngs.human.motion.amass import write_amass
 from dyngs.io.formats import formats
 from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.io.tensor_file import write_tensors
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.runs.stored_file import encoded
-from dyngs.static.keys import StaticModel
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 

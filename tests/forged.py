@@ -22,6 +22,7 @@ from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.stored_file import (
     _DTYPES,
     MAGIC,
@@ -33,7 +34,6 @@ from dyngs.runs.stored_file import (
     _stored,
     compressed,
 )
-from dyngs.static.keys import StaticModel
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]

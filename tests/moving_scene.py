@@ -23,8 +23,8 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.static_scene import StaticScene
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.static.keys import StaticModel
 
 MOVING_ROWS = (1, 3)
 TRAIN_TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -33,8 +33,8 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.training import DynamicTraining
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
+from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_times
-from dyngs.static.keys import StaticModel
 from dyngs.training.losses import SilhouetteLoss
 from dyngs.training.new_trainer import assemble, with_points
 

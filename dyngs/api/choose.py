@@ -37,9 +37,9 @@ from dyngs.io.write import write_text
 from dyngs.models.kind import HasGaussians, capability, kind_of
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
+from dyngs.models.static_section import StaticModel
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.camera_refinement import fitted_to_image
 from dyngs.training.loop import Interrupts
 from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points

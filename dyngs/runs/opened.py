@@ -27,12 +27,12 @@ from dyngs.io.wrong_place import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.kind import HasBody, capability
 from dyngs.models.renderable import Posable, Renderable
+from dyngs.models.static_section import StaticModel
 from dyngs.models.views import background_colour, training_cameras
 from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
-from dyngs.static.keys import StaticModel
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""

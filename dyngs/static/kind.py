@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dyngs.models.kind import LimitsSize
-from dyngs.static.keys import StaticModel
+from dyngs.models.static_section import StaticModel
 
 if TYPE_CHECKING:
     from dyngs.models.kind import Restore, Start

@@ -15,8 +15,8 @@ from dyngs.config import Config, DataConfig, DefaultStrategy, RandomInit, RunCon
 from dyngs.core.errors import DyngsError
 from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, load_checkpoint
-from dyngs.static.keys import StaticModel
 from dyngs.training.processes import Processes
 
 BUSY = DefaultStrategy(

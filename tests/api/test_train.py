@@ -36,8 +36,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.static.keys import StaticModel
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
 from dyngs.training.events import Event, StepDone

@@ -32,8 +32,8 @@ from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 

@@ -25,7 +25,7 @@ from dyngs.config.yaml_reader import MAX_BYTES
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import ControlNodesField, DynamicModel, HexplaneField, MlpField
-from dyngs.static.keys import StaticModel
+from dyngs.models.static_section import StaticModel
 
 PRESETS = ("static", "blender", "colmap", "static_mcmc", "mip")
 ROOT = "data.root=capture"

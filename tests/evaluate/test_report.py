@@ -35,6 +35,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import (
     Checkpoint,
     CheckpointInfo,
@@ -42,7 +43,6 @@ from dyngs.runs.checkpoint import (
     load_run,
     save_checkpoint,
 )
-from dyngs.static.keys import StaticModel
 
 
 def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:

@@ -35,7 +35,7 @@ from dyngs.gaussians.schedule import (
 )
 from dyngs.human.keys import HumanModel
 from dyngs.models.schedule import image_divisor
-from dyngs.static.keys import StaticModel
+from dyngs.models.static_section import StaticModel
 
 
 def test_at_30000_steps_it_is_the_published_one() -> None:

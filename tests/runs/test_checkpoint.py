@@ -23,6 +23,7 @@ from dyngs.gaussians.filters import fuse_filter
 from dyngs.gaussians.restored import restored_scene
 from dyngs.io import tensor_file
 from dyngs.io.tensor_file import write_tensors
+from dyngs.models.static_section import StaticModel
 from dyngs.runs import checkpoint
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -35,7 +36,6 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.stored_file import drawable
-from dyngs.static.keys import StaticModel
 
 
 def _checkpoint(step: int) -> Checkpoint:

@@ -23,13 +23,13 @@ from dyngs.core.errors import DyngsError
 from dyngs.export.splat_files import write_run_sequence
 from dyngs.io.lock import LOCK_NAME, InUseError, writing
 from dyngs.io.outputs import require_new_folder
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import (
     KEEP_CHECKPOINTS,
     checkpoint_paths,
 )
 from dyngs.runs.folder import tidy
 from dyngs.runs.opened import open_run
-from dyngs.static.keys import StaticModel
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

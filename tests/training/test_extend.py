@@ -32,8 +32,8 @@ from dyngs.gaussians.schedule import Rates, active_sh_degree
 from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import write_human_capture
 from dyngs.models.schedule import image_divisor
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.static.keys import StaticModel
 from dyngs.training.extend import told, with_length
 from dyngs.training.trainer import StepReport, Trainer
 

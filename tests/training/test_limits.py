@@ -23,7 +23,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.static.keys import StaticModel
+from dyngs.models.static_section import StaticModel
 from dyngs.training.limits import most_gaussians, require_possible, within_cap
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer

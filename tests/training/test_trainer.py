@@ -30,8 +30,8 @@ from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.io.tensor_file import write_tensors
 from dyngs.io.write import write_image
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
-from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 from dyngs.training.trainer import ViewSampler
 

@@ -29,9 +29,9 @@ from dyngs.gaussians.surface import (
     simplified,
 )
 from dyngs.models.kind import RunStart
+from dyngs.models.static_section import StaticModel
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.static.keys import StaticModel
 
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000

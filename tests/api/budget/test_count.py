@@ -22,8 +22,8 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.human.keys import HumanModel
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.static.keys import StaticModel
 from dyngs.training.events import Event, Message
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -23,6 +23,7 @@ from dyngs.config import (
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     checkpoint_paths,
@@ -31,7 +32,6 @@ from dyngs.runs.checkpoint import (
     load_run,
 )
 from dyngs.runs.folder import EXPORT_FOLDER
-from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 

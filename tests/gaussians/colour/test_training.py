@@ -32,7 +32,7 @@ from dyngs.gaussians.colour.training import (
     opacity_entropy,
     rate_factor,
 )
-from dyngs.static.keys import StaticModel
+from dyngs.models.static_section import StaticModel
 from dyngs.training.new_trainer import GaussianTrainer, assemble
 
 

@@ -25,7 +25,7 @@ from dyngs.data.loader import Image
 from dyngs.deform.keys import DynamicModel
 from dyngs.models.correction import RenderedView
 from dyngs.models.renderable import Rendering
-from dyngs.static.keys import StaticModel
+from dyngs.models.static_section import StaticModel
 from dyngs.training.corrections.robust import WARM_UP, RobustMasks
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
