@@ -137,31 +137,6 @@ def test_where_nothing_can_go_the_run_stays_as_it_is(
     assert promise.before - promise.after <= 0.2
 
 
-def _spoil(trainer: object, cut: object, scores: object) -> None:
-    from dyngs.compress.search import Cut, apply_cut
-
-    apply_cut(trainer, cut, scores)  # pyright: ignore[reportArgumentType]
-    if cut != Cut():
-        trainer.model.scene.gaussians.sh.data[:, 0] += 0.8  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_an_interruption_leaves_nothing(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("dyngs.api.prune.write_config", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            prune_run(run_dir, tmp_path / "small", ASKED)
-        patch.setattr("dyngs.compress.search.apply_cut", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            prune_within(run_dir, tmp_path / "small", 50.0, BRIEFLY, silent)
-    assert not list(tmp_path.iterdir())
-    assert checkpoint_paths(prune_run(run_dir, tmp_path / "small", ASKED))
-
-
 def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
     taken = tmp_path / "taken"
