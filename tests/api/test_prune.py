@@ -119,24 +119,6 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     assert str(first).count("limit:") == len(first.limits) >= 4
 
 
-@pytest.mark.usefixtures("few_candidates")
-def test_where_nothing_can_go_the_run_stays_as_it_is(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every candidate is worse by 5 dB than what was there."""
-    monkeypatch.setattr("dyngs.compress.search.apply_cut", _spoil)
-    promise = prune_within(run_dir, tmp_path / "same", 0.2, BRIEFLY, silent)
-    assert (
-        checkpoint_paths(tmp_path / "same")[-1].read_bytes()
-        == checkpoint_paths(run_dir)[-1].read_bytes()
-    )
-    assert str(promise).startswith("nothing can be taken away for 0.2 dB: the run is as it was")
-    assert all(
-        limit.refused is not None and limit.refused[1] > 0.2 for limit in promise.limits[:-1]
-    )
-    assert promise.before - promise.after <= 0.2
-
-
 def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
     taken = tmp_path / "taken"
