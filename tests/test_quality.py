@@ -7,6 +7,8 @@ to 0.15 dB.
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,6 +17,7 @@ import pytest
 
 import dyngs
 from dyngs.cli import main
+from dyngs.config.io import load_resolved
 from dyngs.data.images.images import read_image
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.human.fit import fitted_capture
@@ -144,3 +147,26 @@ def test_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     floors = {"test": 23.0, "pose": 21.8}  # 23.32, 22.18; after 40 steps 21.58, 21.02
     found = {split: evaluate_run(run, split).psnr_person or 0.0 for split in floors}
     assert {split: psnr for split, psnr in found.items() if psnr <= floors[split]} == {}
+
+
+def test_what_stays_before_fixed_cameras_is_trained_as_static(
+    still_life: Captured, tmp_path: Path
+) -> None:
+    """The same bytes as by the static preset, though the dynamic one was requested."""
+    source = still_life.root / "capture"
+    target = tmp_path / "capture"
+    shutil.copytree(source, target)
+    described = json.loads((source / "transforms_train.json").read_text())
+    frames = []
+    for frame in described["frames"][:3]:
+        for k in range(6):
+            name = f"{frame['file_path']}_{k}"
+            shutil.copy(source / f"{frame['file_path']}.png", target / f"{name}.png")
+            frames.append(frame | {"file_path": name, "time": k / 5})
+    (target / "transforms_train.json").write_text(json.dumps(described | {"frames": frames}))
+    (target / "transforms_test.json").unlink()
+    captured = Captured(tmp_path)
+    runs = [captured.trained(preset, "train.steps=20") for preset in ("dynamic", "static")]
+    assert load_resolved(runs[0]).model.kind == "static"
+    first, second = (next((run / "checkpoints").iterdir()) for run in runs)
+    assert first.read_bytes() == second.read_bytes()

@@ -90,18 +90,6 @@ def test_two_processes_end_with_the_bytes_of_one(
     assert len(counts) > 3, "the set of Gaussians changes"
 
 
-def test_four_do_so_too_and_write_one_run(still: Path, tmp_path: Path) -> None:
-    codes, said = run_in(4, do.trained, tmp_path, [_still(still, tmp_path / "four")])
-    assert codes == [0] * 4, said
-    assert said[1:] == ["", "", ""]
-    # one view for each process is what four take
-    train(_still(still, tmp_path / "one", batch_size=4))
-    _require_same_bytes(tmp_path / "one", tmp_path / "four")
-    assert sorted(path.name for path in (tmp_path / "four").iterdir()) == sorted(
-        path.name for path in (tmp_path / "one").iterdir()
-    )
-
-
 def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Path) -> None:
     whole, parted = (
         _still(still, tmp_path / name, batch_size=2, save_every=5) for name in ("whole", "parted")

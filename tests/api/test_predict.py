@@ -11,12 +11,11 @@ from tiny_people import NET, TINY, people
 
 from dyngs.api.predict import Prediction, network_config, predict
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig
+from dyngs.config import Config
 from dyngs.config.io import load_resolved, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.keys import HumanModel
 from dyngs.runs.checkpoint import load_run
 
 
@@ -102,28 +101,3 @@ def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
     with pytest.raises(DyngsError, match="a network, not a scene; `dyngs predict"):
         load_run(made.network)
-
-
-def test_a_body_is_fitted_where_none_is_given(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By what `dyngs train human` does, too; without one nothing is written."""
-    asked: list[tuple[Path, bool]] = []
-
-    def fit(
-        data: DataConfig, model: HumanModel, *, only_if_needed: bool, say: object, report: object
-    ) -> DataConfig:
-        assert model.body is None, "the template of the network"
-        asked.append((data.root, only_if_needed))
-        return data
-
-    monkeypatch.setattr("dyngs.human.predict.ghg.learner.with_fitted_body", fit)
-    kept = [path.rename(tmp_path / path.name) for path in sorted(made.capture.glob("body_*.npz"))]
-    try:
-        with pytest.raises(DyngsError, match="no body parameters"):
-            predict(made.network, made.capture, tmp_path / "out", 3)
-    finally:
-        for path in kept:
-            path.rename(made.capture / path.name)
-    assert asked == [(made.capture, True)]
-    assert not (tmp_path / "out").exists()

@@ -119,49 +119,6 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     assert str(first).count("limit:") == len(first.limits) >= 4
 
 
-@pytest.mark.usefixtures("few_candidates")
-def test_where_nothing_can_go_the_run_stays_as_it_is(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every candidate is worse by 5 dB than what was there."""
-    monkeypatch.setattr("dyngs.compress.search.apply_cut", _spoil)
-    promise = prune_within(run_dir, tmp_path / "same", 0.2, BRIEFLY, silent)
-    assert (
-        checkpoint_paths(tmp_path / "same")[-1].read_bytes()
-        == checkpoint_paths(run_dir)[-1].read_bytes()
-    )
-    assert str(promise).startswith("nothing can be taken away for 0.2 dB: the run is as it was")
-    assert all(
-        limit.refused is not None and limit.refused[1] > 0.2 for limit in promise.limits[:-1]
-    )
-    assert promise.before - promise.after <= 0.2
-
-
-def _spoil(trainer: object, cut: object, scores: object) -> None:
-    from dyngs.compress.search import Cut, apply_cut
-
-    apply_cut(trainer, cut, scores)  # pyright: ignore[reportArgumentType]
-    if cut != Cut():
-        trainer.model.scene.gaussians.sh.data[:, 0] += 0.8  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_an_interruption_leaves_nothing(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("dyngs.api.prune.write_config", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            prune_run(run_dir, tmp_path / "small", ASKED)
-        patch.setattr("dyngs.compress.search.apply_cut", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            prune_within(run_dir, tmp_path / "small", 50.0, BRIEFLY, silent)
-    assert not list(tmp_path.iterdir())
-    assert checkpoint_paths(prune_run(run_dir, tmp_path / "small", ASKED))
-
-
 def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
     taken = tmp_path / "taken"

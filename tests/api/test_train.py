@@ -4,14 +4,12 @@ nothing had happened."""
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import signal
 from pathlib import Path
 
 import pytest
 import torch
-from moving_scene import write_timed_capture
 from tiny_fields import ALL_KINDS, busy_config, write_tiny_capture
 from torch import Tensor
 
@@ -23,7 +21,6 @@ from dyngs.config import (
     DataConfig,
     DefaultStrategy,
     McmcStrategy,
-    OptimConfig,
     RandomInit,
     RunConfig,
     TrainConfig,
@@ -37,7 +34,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.static_section import StaticModel
-from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
 from dyngs.training.events import Event, StepDone
@@ -383,65 +380,6 @@ def test_a_resumed_moving_run_equals_an_uninterrupted_one(
     assert [[r[k] for k in same] for r in _log(resumed)] == [
         [r[k] for k in same] for r in _log(whole_run)
     ]
-
-
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_where_nothing_moves_no_field_is_kept(tmp_path: Path, kind: str) -> None:
-    """A capture with times of a scene that stands still: after the split it is static, in the run
-    and on disk."""
-    capture = write_timed_capture(tmp_path / "capture")
-    run = train(busy_config(capture, tmp_path / "run", kind, freeze_below_px=1e6))
-    assert [record["num_moving"] > 0 for record in _log(run)] == [
-        8 <= step <= 14 for step in range(1, 25)
-    ]
-    assert load_run(run).scene.is_static
-    tensors = load_checkpoint(checkpoint_paths(run)[-1]).part("model")
-    assert tensors.keys() == {"times"}
-
-
-@pytest.mark.parametrize("stop_at", [8, 12])
-def test_where_a_still_model_explains_all_the_run_stays_static(
-    moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
-) -> None:
-    """No random Gaussians, no field, resumed or not, as if no error were large enough."""
-    changes = {"motion_threshold": 10.0, "time_window": 1.0}
-    whole = train(busy_config(moving_capture, tmp_path / "whole", "control_nodes", **changes))
-    assert {record["num_moving"] for record in _log(whole)} == {0}
-    assert load_checkpoint(checkpoint_paths(whole)[-1]).part("model").keys() == {"times"}
-    config = busy_config(moving_capture, tmp_path / "parts", "control_nodes", **changes)
-    with monkeypatch.context() as patch:
-        _interrupt_after(stop_at, patch)
-        with pytest.raises(KeyboardInterrupt):
-            train(config)
-    resumed = train(config, resume_from=tmp_path / "parts")
-    assert _final_bytes(resumed) == _final_bytes(whole)
-    changed = {"model": StaticModel(sh_degree=1), "optim": OptimConfig(rate_factor=1)}
-    still = config.model_copy(update=changed | {"run": RunConfig(dir=tmp_path / "s", threads=1)})
-    assert [record["loss"] for record in _log(train(still))] == [
-        record["loss"] for record in _log(whole)
-    ]
-
-
-def test_a_field_that_is_no_number_stops_the_run(
-    whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With or without penalties that would notice. One line; the last good checkpoint is kept."""
-    _spoil_in_step(11, monkeypatch, float("nan"))
-    for sparsity in (0.01, 0.0):
-        run_dir = tmp_path / str(sparsity)
-        config = busy_config(moving_capture, run_dir, _kind_of(whole_run), motion_sparsity=sparsity)
-        with pytest.raises(DyngsError) as caught:
-            train(config.model_copy(update={"train": TrainConfig(steps=24, save_every=4)}))
-        message = str(caught.value)
-        assert "\n" not in message
-        pattern = (
-            r"step 11, view 'train/r_0\d\d': the field makes means, "
-            r".* at [0-9.]+ not finite; lower .*model\.deform"
-        )
-        assert re.match(pattern, message)
-        assert message.endswith("step_0000008.safetensors")
-        assert load_run(run_dir).step == 8
-        assert load_run(run_dir).scene.at(0.5).means.isfinite().all()
 
 
 def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> None:

@@ -97,23 +97,6 @@ def test_a_link_to_nothing_is_an_error(tmp_path: Path) -> None:
         latest_checkpoint(tmp_path)
 
 
-def test_a_run_can_be_loaded_while_it_trains(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two checkpoints are saved, and the one that was found removed, before it is opened."""
-    save_checkpoint(tmp_path, _checkpoint(1), 1.0)
-    real = checkpoint.load_checkpoint
-
-    def saved_meanwhile(path: Path) -> Checkpoint:
-        if path.stem == "step_0000001":
-            for step in (2, 3):
-                save_checkpoint(tmp_path, _checkpoint(step), 1.0)
-        return real(path)
-
-    monkeypatch.setattr(checkpoint, "load_checkpoint", saved_meanwhile)
-    assert latest_checkpoint(tmp_path).info.step == 3
-
-
 def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
     saved = _checkpoint(7)
     loaded = load_checkpoint(save_checkpoint(tmp_path, saved, 1.5))
@@ -310,35 +293,6 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("step", "7"),
-        ("step", 7.5),
-        ("step", -1),
-        ("step", True),
-        ("step", 2**70),
-        ("extent", None),
-        ("extent", math.nan),
-        ("extent", -1.0),
-        ("world_offset", [0, 0]),
-        ("world_offset", [0, 0, math.inf]),
-        ("world_offset", 3),
-        ("background", "pink"),
-        ("background", ["white"]),
-        ("rasterize_mode", "x" * 1000),
-        ("rasterize_mode", {}),
-    ],
-)
-def test_headers_of_other_types_are_refused(tmp_path: Path, key: str, value: object) -> None:
-    path = tmp_path / "checkpoints" / "step_0000007.safetensors"
-    path.parent.mkdir()
-    write_tensors(path, checkpoint._KIND, contents("static")[0], _header(**{key: value}))
-    with pytest.raises(DyngsError, match=r"step_0000007\.safetensors: cannot be read") as caught:
-        load_checkpoint(path)
-    one_line(caught.value, path)
-
-
-@pytest.mark.parametrize(
     ("name", "change", "said"),
     [
         ("model.rows", lambda x: x.flip(0), "'rows' does not ascend"),
@@ -376,14 +330,3 @@ def test_what_does_not_fit_is_named(
         DyngsError, match=rf"step_0000007\.safetensors: cannot be read \(ValueError: .*{said}"
     ):
         load_run(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["[" * 5000, "[1]", '{"seconds_train": {"4": NaN, "x": 1}}', '{"seconds_train": {"4": 1e999}}'],
-)
-def test_times_that_are_damaged_are_forgotten(tmp_path: Path, text: str) -> None:
-    (tmp_path / "timing.json").write_text(text)
-    assert seconds_at(tmp_path, 4) == 0
-    save_checkpoint(tmp_path, _checkpoint(5), 1.0)
-    assert json.loads((tmp_path / "timing.json").read_text()) == {"seconds_train": {"5": 1.0}}

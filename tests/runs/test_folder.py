@@ -116,43 +116,6 @@ def test_what_a_run_would_replace_is_never_replaced(
     assert _contents(out) == before
 
 
-@pytest.mark.parametrize("command", ["train", "compact", "export", "resume", "sequence"])
-def test_a_folder_that_cannot_be_written_is_told(
-    still: Path, run_dir: Path, tmp_path: Path, command: str
-) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    out.chmod(0o500)
-    if os.access(out, os.W_OK):
-        pytest.skip("may write anywhere, as root does")
-    try:
-        with pytest.raises(DyngsError) as caught:
-            COMMANDS[command](still, run_dir, out)
-        assert "\n" not in str(caught.value)
-    finally:
-        out.chmod(0o700)
-
-
-def test_a_run_that_is_only_stored_stays(still: Path, run_dir: Path, tmp_path: Path) -> None:
-    """Its folder holds config.yaml and scene.dyngs, and no checkpoints."""
-    out = tmp_path / "out"
-    write_scene_file(run_dir, out)
-    before = _contents(out)
-    assert before.keys() == {"config.yaml", "scene.dyngs"}
-    for resume in (None, out):
-        with pytest.raises(DyngsError, match=r"scene\.dyngs|no checkpoints"):
-            train(config_of(still, out), resume_from=resume)
-    assert _contents(out) == before
-    write_scene_file(run_dir, out)  # the same run may be exported again
-    assert _contents(out) == before
-    other = train(config_of(still, tmp_path / "other", seed=7))
-    with pytest.raises(DyngsError, match="another run"):
-        write_scene_file(other, out)
-    with pytest.raises(DyngsError, match="another run"):
-        write_scene_file(other, run_dir)
-    assert _contents(out) == before
-
-
 def test_a_run_stopped_before_its_first_checkpoint_is_taken_up(
     still: Path, run_dir: Path, tmp_path: Path
 ) -> None:

@@ -15,7 +15,7 @@ import dyngs
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
 from dyngs.capture.inspection.report import draw_cameras
-from dyngs.config import DataConfig, RunConfig
+from dyngs.config import RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
@@ -115,16 +115,6 @@ def test_no_function_replaces_a_file_of_the_capture(tmp_path: Path) -> None:
                 write()
             assert "\n" not in str(caught.value), name
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-
-
-def test_points_beside_exported_cameras_replace_nothing(tmp_path: Path, colmap_root: Path) -> None:
-    capture = read_capture(DataConfig(root=colmap_root))
-    assert capture.points is not None
-    (tmp_path / "points.ply").unlink(missing_ok=True)
-    (colmap_root / "points.ply").write_text("mine")
-    with pytest.raises(DyngsError, match="exists and lies in"):
-        write_cameras(colmap_root / "new.json", capture, capture.splits)
-    assert (colmap_root / "points.ply").read_text() == "mine"
 
 
 def test_what_a_run_reads(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from dyngs.config import CameraConfig, Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
@@ -192,28 +191,6 @@ def test_disturbed_cameras_are_found() -> None:
         np.mean(errors[part]) for part in (slice(0, int(STARTS * steps)), slice(-8, None))
     )
     assert last < 0.2 * first
-
-
-def test_state_goes_on_and_that_of_others_is_refused() -> None:
-    views = random_views(MIN_POSES)
-    one, other = (CameraRefinement(views, SIZE, 100) for _ in range(2))
-
-    def steps(refinement: CameraRefinement, first: int, last: int) -> None:
-        for step in range(first, last):
-            camera = watched(
-                refinement.corrections.applied(step % MIN_POSES, camera_of(views[step % MIN_POSES]))
-            )
-            (camera.cam_from_world[0, :3].sin().sum() + camera.intrinsics.sum() / 300).backward()
-            refinement.after_backward(step % MIN_POSES, step, image_of(camera))
-
-    steps(one, 1, 60)
-    other.load_state({name: x.clone() for name, x in one.state().items()})
-    steps(one, 60, 100)
-    steps(other, 60, 100)
-    assert all(torch.equal(x, other.state()[name]) for name, x in one.state().items())
-    assert float(one.corrections.poses.abs().max()) > 0
-    with pytest.raises((KeyError, ValueError, DyngsError)):
-        CameraRefinement(views[1:], SIZE, 100).load_state(one.state())
 
 
 def trainer_of(root: Path, refine: str) -> Trainer:
