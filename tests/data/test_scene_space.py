@@ -16,6 +16,8 @@ from dyngs.data.geometry import (
     camera_center,
     checked_pose,
     pinhole_matrix,
+    projected,
+    times_seen,
 )
 from dyngs.data.scene_space import (
     FAR_PER_BASELINE,
@@ -23,6 +25,7 @@ from dyngs.data.scene_space import (
     depth_bounds,
     normalise_capture,
     outside_of_cube,
+    points_in_frusta,
 )
 
 
@@ -135,3 +138,17 @@ def test_checked_pose_reports_how_far_off_it_was() -> None:
     repaired, error = checked_pose(pose[:3], "here")
     assert error == pytest.approx(2e-4, rel=1e-3)
     np.testing.assert_allclose(repaired, opengl_pose(1.1), atol=1e-12)
+
+
+def test_candidates_lie_in_their_view_between_the_bounds() -> None:
+    views = circle((5.0, 0.0, 0.0))
+    near, far = depth_bounds(views)
+    xyz, seen = points_in_frusta(views, np.random.default_rng(0).random((500, 4)))
+    assert seen.min() >= 1
+    np.testing.assert_array_equal(seen, times_seen(xyz, views))
+    depths = np.stack(
+        [xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3] for view in views]
+    )
+    shown = np.stack([projected(xyz, view)[1] for view in views])
+    fits = shown & (depths > near * 0.999) & (depths < far * 1.001)
+    assert fits.any(axis=0).all()

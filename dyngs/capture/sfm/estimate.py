@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -31,7 +31,6 @@ from dyngs.capture.sfm.matches import (
     angles_deg,
     matched_pairs,
     parallax_of,
-    without_movers,
 )
 from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
 from dyngs.core.conventions import ReportProgress, report_nothing
@@ -56,7 +55,6 @@ if TYPE_CHECKING:
 
 _NUM_FRAMES = 100
 _SMALL_ANGLE_DEG = 1.0
-_MOVING_FRACTION = 0.02
 # parallax, as a fraction of the longest side and in pixels, below which the camera did not move,
 # and below which it hardly moved
 _NO_PARALLAX = (0.0015, 1.0)
@@ -159,11 +157,16 @@ def _posed_in(
         find_features(task)
         match_pairs(task, pairs_to_match(task))
         notes += _parallax_seen(task)
-        model, more = _mapped(task)
+        model = mapped(task)
+    if model is None:
+        raise DyngsError(
+            f"no poses could be found for {len(task.names)} images: take sharper ones that overlap by two thirds, move "
+            "the camera sideways, do not only rotate it, avoid bare or moving surfaces, or try matching=exhaustive"
+        )
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
     missing = _write_model(model, capture, own)
-    notes += [*more, *_advice(missing, images.blurred, task.is_video)]
+    notes += _advice(missing, images.blurred, task.is_video)
     count = len(photos)
     points = model.reconstruction.num_points3D()
     result = SfmResult(
@@ -195,35 +198,6 @@ def _laid_out(
     return SfmTask(
         work / "database.db", work / "images", names, photos, options, report, is_video, used
     )
-
-
-def _mapped(task: SfmTask) -> tuple[SfmModel, list[str]]:
-    """Return the model, and lines about what was done for it.
-
-    Where it is not good, features that disagree with most of their images are left out, and the
-    better one is kept.
-    """
-    model = mapped(task)
-    notes = []
-    if model is None or needs_more(model, task):
-        still = task.database.with_name("still.db")
-        shutil.copyfile(task.database, still)
-        fraction = without_movers(still, task.side)
-        if fraction >= _MOVING_FRACTION:
-            second = mapped(replace(task, database=still))
-            best = better(model, second)
-            if best is second and second is not None:
-                notes.append(
-                    f"{fraction:.0%} of the features move with something else than the scene and were left out: "
-                    f"{counted(second.registered, 'image')}, {second.error_px:.2f} px"
-                )
-            model = best
-    if model is None:
-        raise DyngsError(
-            f"no poses could be found for {len(task.names)} images: take sharper ones that overlap by two thirds, move "
-            "the camera sideways, do not only rotate it, avoid bare or moving surfaces, or try matching=exhaustive"
-        )
-    return model, notes
 
 
 def _parallax_seen(task: SfmTask) -> list[str]:
@@ -526,12 +500,12 @@ def mapped(task: SfmTask) -> SfmModel | None:
     first = _found(task, order[0])
     return (
         first
-        if first is not None and not needs_more(first, task)
+        if first is not None and not _needs_more(first, task)
         else better(first, _found(task, order[1]))
     )
 
 
-def needs_more(model: SfmModel, task: SfmTask) -> bool:
+def _needs_more(model: SfmModel, task: SfmTask) -> bool:
     """Whether images are left out, poses do not fit the matches, a lens is none, or the error is
     large."""
     bad = (

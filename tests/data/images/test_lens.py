@@ -126,3 +126,14 @@ def test_undistorted_points_go_back(lens: Lens, ratio: float) -> None:
     center = torch.tensor([31.0, 23.5]).double()
     straight = (undistorted_points(lens, INTRINSICS, points) - center) / focal
     torch.testing.assert_close(distort(lens, straight) * focal + center, points, rtol=0, atol=0.05)
+
+
+def test_where_a_lens_folds_back_nothing_is_valid() -> None:
+    """r (1 - r^6 / 2) falls from r = 3.5^(-1/6) = 0.81 on: beyond, the image would appear a second
+    time."""
+    intrinsics = np.array([[100.0, 0.0, 100.0], [0.0, 100.0, 100.0], [0.0, 0.0, 1.0]])
+    found = undistort_map(Lens("opencv", (0.0, 0.0, 0.0, 0.0, -0.5)), intrinsics, 200, 200)
+    place = (torch.arange(200) + 0.5 - 100) / 100
+    radius = torch.hypot(place[:, None], place[None])
+    assert not found.valid[radius > 0.82].any()
+    assert found.valid[radius < 0.8].all()
