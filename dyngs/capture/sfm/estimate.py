@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 
 _NUM_FRAMES = 100
 _SMALL_ANGLE_DEG = 1.0
-_FEWEST_MATCHED = 3
 _MOVING_FRACTION = 0.02
 # parallax, as a fraction of the longest side and in pixels, below which the camera did not move,
 # and below which it hardly moved
@@ -163,10 +162,8 @@ def _posed_in(
         model, more = _mapped(task)
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
-    counts = matched_images(task.database)
-    lonely = {own[name] for name, count in counts.items() if count < _FEWEST_MATCHED}
     missing = _write_model(model, capture, own)
-    notes += [*more, *_advice(missing, lonely, images.blurred, task.is_video)]
+    notes += [*more, *_advice(missing, images.blurred, task.is_video)]
     count = len(photos)
     points = model.reconstruction.num_points3D()
     result = SfmResult(
@@ -287,19 +284,13 @@ def _write_model(model: SfmModel, capture: Path, names: dict[str, str]) -> tuple
     return tuple(name for name in names.values() if name not in registered)
 
 
-def _advice(
-    unregistered: Sequence[str], lonely: set[str], blurred: Sequence[str], is_video: bool
-) -> Iterator[str]:
-    """Yield lines about what to film better: images without a pose, that match few others, that are
-    less sharp."""
-    apart = sum(name in lonely for name in unregistered)
-    if apart:
+def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool) -> Iterator[str]:
+    """Yield lines about what to film better: images without a pose, or less sharp than others."""
+    if unregistered:
         more = "move slower there" if is_video else "take more photos around them"
-        yield f"{apart} images without a pose match fewer than three others: {more}"
-    if apart < len(unregistered):
         yield (
-            f"{len(unregistered) - apart} images without a pose match others, but fit no common scene: things that "
-            "move fill them, or the camera only rotated there"
+            f"{len(unregistered)} images without a pose: {more}, unless things that move fill them, or the camera only "
+            "rotated there"
         )
     if blurred:
         more = "more light or a slower hand" if is_video else "take them again"
@@ -385,21 +376,6 @@ def match_pairs(task: SfmTask, pairs: Sequence[tuple[int, int]]) -> None:
         part = ordered[first : first + step]
         match_listed(task.database, task.names, part, task.options.num_threads)
         task.report("matching, pairs", first + len(part), len(ordered))
-
-
-def matched_images(database: Path) -> dict[str, int]:
-    """Return how many other images each one was matched with, by name."""
-    import pycolmap
-
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        ids, geometries = opened.read_two_view_geometries()
-    counts = dict.fromkeys(names, 0)
-    for key, geometry in zip(ids, geometries, strict=True):
-        if len(geometry.inlier_matches):
-            for image in pycolmap.pair_id_to_image_pair(key):
-                counts[image] += 1
-    return {names[image]: count for image, count in counts.items()}
 
 
 def _enter_focal_lengths(task: SfmTask) -> None:
