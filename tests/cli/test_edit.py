@@ -117,12 +117,12 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
         (["--max-loss", "1"], "--max-loss goes with --clean"),
         (["--clean", "--max-loss", "-1"], "--max-loss -1"),
         (["--up", "auto"], "--up auto needs the cameras of a run"),
-        (["--merge", "half.ply"], "half.ply: is truncated"),
+        (["--merge", "half.ply"], "half.ply: cannot be read (ValueError: it is truncated"),
     ]
     for words, said in refused:
         out = [] if "--out" in words else ["--out", "a.ply"]
         assert said in error_line(capsys, "edit", "plain.ply", *words, *out), words
-    assert "is truncated" in error_line(capsys, "edit", "half.ply", "--out", "a.ply")
+    assert "it is truncated" in error_line(capsys, "edit", "half.ply", "--out", "a.ply")
     assert "holds no Gaussians" in error_line(capsys, "edit", "none.ply", "--out", "a.ply")
     assert "no such file or folder" in error_line(capsys, "edit", "nothing", "--out", "a.ply")
     assert {path: path.read_bytes() for path in Path().iterdir()} == before
