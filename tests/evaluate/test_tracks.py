@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.config.io import load_config
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View, all_views
-from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.data.synthetic.scenes import SceneName
+from dyngs.data.synthetic.captures import DynamicOptions, SceneName, write_dynamic_capture
 from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.field import FieldSetup
