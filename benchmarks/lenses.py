@@ -26,8 +26,7 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Lens
 from dyngs.data.geometry import pinhole_matrix
 from dyngs.data.images.lens import undistorted_points
-from dyngs.data.synthetic.raytrace import f32, trace
-from dyngs.data.synthetic.scenes import scene_at
+from dyngs.data.synthetic.captures import f32, scene_at, trace
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.write import write_image, write_text
 from dyngs.ops.native import kernel_threads

@@ -39,12 +39,14 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import (
     CaptureStyle,
     DynamicOptions,
+    Primitive,
+    SceneName,
     is_in_image,
+    is_seen,
+    scene_at,
     write_dynamic_capture,
 )
-from dyngs.data.synthetic.raytrace import Primitive, is_seen
-from dyngs.data.synthetic.raytrace import Scene as TrueScene
-from dyngs.data.synthetic.scenes import SceneName, scene_at
+from dyngs.data.synthetic.captures import Scene as TrueScene
 from dyngs.data.times import evenly_spaced
 from dyngs.data.tracks import read_true_tracks
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen

@@ -15,21 +15,19 @@ import numpy as np
 
 from dyngs.data.synthetic.captures import (
     DISTANCE,
-    Shot,
-    StillOptions,
-    hemisphere_cameras,
-    orbit_cameras,
-    write_split,
-)
-from dyngs.data.synthetic.raytrace import (
     Box,
     Paint,
     Primitive,
     Scene,
+    Shot,
     Sphere,
+    StillOptions,
     f32,
+    hemisphere_cameras,
     nearest_things,
+    orbit_cameras,
     sampled_rays,
+    write_split,
 )
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image

@@ -21,7 +21,7 @@ from polyhedra import polyhedra
 from scipy.spatial import cKDTree
 
 from dyngs.data.geometry import inverse_rigid
-from dyngs.data.synthetic.raytrace import nearest_things, sampled_rays
+from dyngs.data.synthetic.captures import nearest_things, sampled_rays
 from dyngs.export.surface_file import write_surface
 from dyngs.runs.opened import Opened, open_run
 

@@ -10,9 +10,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.data.synthetic.captures import hemisphere_cameras
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, Sphere, render_scene
-from dyngs.data.synthetic.scenes import scene_at
+from dyngs.data.synthetic.captures import (
+    CAMERA_ANGLE_X,
+    Scene,
+    Sphere,
+    hemisphere_cameras,
+    render_scene,
+    scene_at,
+)
 from dyngs.deform.bodies.paths import NEVER, FrameStack
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dyngs.config import Config
 from dyngs.human.predict.gps.keys import GpsModel
-from dyngs.human.synthetic.people import PeopleOptions, write_people
+from dyngs.human.synthetic.capture import PeopleOptions, write_people
 
 STEREO = GpsModel(person_px=32)
 PEOPLE = PeopleOptions(people=2, size=40, cameras=24)

@@ -394,8 +394,12 @@ def _summary(motion: Motion) -> str:
 def run_synth(arguments: argparse.Namespace) -> int:
     """Write the capture and print the command that trains on it."""
     from dyngs.data.synthetic import captures as synthetic
-    from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-    from dyngs.human.synthetic.people import PeopleOptions, write_people
+    from dyngs.human.synthetic.capture import (
+        HumanOptions,
+        PeopleOptions,
+        write_human_capture,
+        write_people,
+    )
     from dyngs.io.outputs import require_new_folder
 
     scene = arguments.scene

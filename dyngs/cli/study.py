@@ -287,8 +287,7 @@ def _tradeoff(arguments: argparse.Namespace) -> int:
         sweep,
         table_rows,
     )
-    from dyngs.study.variant_runs import VariantRuns, write_chosen
-    from dyngs.study.variants import parse_variations
+    from dyngs.study.variants import VariantRuns, parse_variations, write_chosen
 
     is_run = Path(arguments.target).is_dir()
     variations = parse_variations(arguments.vary, trains=arguments.train or not is_run)

@@ -17,8 +17,15 @@ from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.inputs import inputs_of
 from dyngs.study.measure import Bench, Measurement, Subject
 from dyngs.study.runs import done_in_turn, require_same_study
-from dyngs.study.variant_runs import VariantRuns, run_settings
-from dyngs.study.variants import SEVERAL, Variant, Varied, is_change, single_changes
+from dyngs.study.variants import (
+    SEVERAL,
+    Variant,
+    VariantRuns,
+    Varied,
+    is_change,
+    run_settings,
+    single_changes,
+)
 
 MIN_DOUBLINGS = 0.05
 """Smaller gains (3.5 %) count as none."""

@@ -10,7 +10,6 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from motion_files import Clip, as_local, glb_of, pelvis_path, random_motion, skeleton, tiny_body
 from refused import error_line
 from tiny_captures import write_colmap
 
@@ -19,16 +18,12 @@ from dyngs.config import DataConfig
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.human.avatar import pose_fit
-from dyngs.human.body import body as body_module
-from dyngs.human.body.body_reader import read_body
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import read_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 PrintedOutput = pytest.CaptureFixture[str]
-
-TEMPLATE = Path(body_module.__file__).parent / "files" / "anny_smplx55.npz"
 
 
 def known_motion() -> Motion:
@@ -57,13 +52,6 @@ def test_a_motion_is_converted_and_summed_up(tmp_path: Path, capsys: PrintedOutp
     assert out.read_bytes() == (tmp_path / "in.npz").read_bytes(), (
         "what is of the template already stays as it is"
     )
-
-
-def test_one_frame_has_no_speed(tmp_path: Path, capsys: PrintedOutput) -> None:
-    write_amass(random_motion(1), tmp_path / "in.npz")
-    assert main(["data", "motion", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 0
-    text = "1 frame, 0.00 s at 30 frames per second; 0 of 55 joints turn, the root moves at up to 0.00 m/s"
-    assert text in capsys.readouterr().out
 
 
 def test_frames_per_second_and_the_up_axis_are_passed_on(
@@ -108,41 +96,6 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
     assert float(found.poses.abs().max()) < 1e-6, "upright, in the axes of the template"
 
 
-def test_the_clip_and_the_body_are_passed_on(tmp_path: Path) -> None:
-    """A body of half the size, and one of two animations."""
-    own = skeleton()
-    motion = random_motion(3, angle=0.2)
-    glb = glb_of(own, Clip(as_local(motion, own), pelvis_path(tiny_body(), motion)))
-    first = glb.json["animations"][0]
-    glb.json["animations"] = [
-        first | {"name": "walk"},
-        first | {"name": "still", "channels": first["channels"][:1]},
-    ]
-    clip = glb.write(tmp_path / "x.glb")
-    with np.load(TEMPLATE) as arrays:
-        small = {
-            key: arrays[key] * (0.5 if key in ("v_template", "J") else 1) for key in arrays.files
-        }
-    np.savez(tmp_path / "small.npz", **small)
-    for words, body, name in (
-        (["--clip", "walk"], None, "walk"),
-        (["--clip", "still"], None, "still"),
-        (
-            ["--clip", "walk", "--body", str(tmp_path / "small.npz")],
-            read_body(tmp_path / "small.npz"),
-            "walk",
-        ),
-    ):
-        out = tmp_path / f"{name}_{len(words)}.npz"
-        assert main(["data", "motion", str(clip), str(out), *words]) == 0
-        found = read_motion(out)
-        expected = read_motion(clip, body, clip=name)
-        assert torch.equal(found.poses, expected.poses)
-        assert torch.equal(found.trans, expected.trans)
-    written = {path.read_bytes() for path in tmp_path.glob("*_*.npz")}
-    assert len(written) == 3, "no two of them alike"
-
-
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -171,11 +124,6 @@ def test_motion_is_refused_in_one_line(
     assert part in lines[0]
     assert Path("used.npz").read_text() == "keep"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.npz", "used.npz"]
-
-
-def test_motion_explains_itself(capsys: PrintedOutput) -> None:
-    assert main(["data", "motion", "--help"]) == 0
-    assert "usage: dyngs data motion" in capsys.readouterr().out
 
 
 def test_an_unknown_format_is_answered_with_every_format(capsys: PrintedOutput) -> None:
@@ -228,27 +176,6 @@ def test_a_person_is_refused_in_one_line(
     assert len(lines) == 1
     assert part in lines[0]
     assert not (tmp_path / "new").exists()
-
-
-def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> None:
-    root = tmp_path / "capture"
-    assert main(["data", "synth", "still", str(root), "--size", "8", "--views", "4"]) == 0
-    image = next((root / "train").iterdir())
-    image.rename(tmp_path / "own.png")
-    image.symlink_to(tmp_path / "own.png")
-    capsys.readouterr()
-    assert "set data.follow_links=true" in error_line(
-        capsys, "data", "inspect", str(root), begun=True
-    )
-    assert main(["data", "inspect", str(root), "--deep", "data.follow_links=true"]) == 0
-    assert "a link that leads out of the capture" in capsys.readouterr().out
-    assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "train.steps=3")
-    assert "give keys of data" in error_line(
-        capsys, "data", "inspect", str(root), "data.root=elsewhere"
-    )
-    assert "did you mean" in error_line(
-        capsys, "data", "inspect", str(root), "data.follow_link=true"
-    )
 
 
 @pytest.mark.parametrize("words", [["--matching", "sequential"], ["--masks", "masks"]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dyngs.data.capture import View
-from dyngs.data.synthetic.scenes import scene_at
+from dyngs.data.synthetic.captures import scene_at
 
 
 def distances_to_surface(points: np.ndarray, views: list[View], time: float) -> np.ndarray:

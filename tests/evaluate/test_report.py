@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ import dyngs
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
@@ -26,16 +24,11 @@ from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.evaluate.report import (
     evaluate_run,
     images_of_split,
-    parameter_megabytes,
     report_path,
     split_views,
 )
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import render_options
-from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.write import write_image
-from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import (
     Checkpoint,
     CheckpointInfo,
@@ -55,10 +48,6 @@ def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:
     return Gaussians(
         uniform(count, 3), uniform(count, 4), uniform(count, 3) * 0.3 - 1.5, uniform(count) + 1, sh
     )
-
-
-def as_scene(gaussians: Gaussians) -> StaticScene:
-    return StaticScene(gaussians=gaussians)
 
 
 def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> Path:
@@ -177,47 +166,6 @@ def test_other_splits_and_backgrounds(tmp_path) -> None:
     ):
         evaluate_run(run_dir, "val")
     assert not (run_dir / "metrics_val.json").exists()
-
-
-def test_no_run() -> None:
-    with pytest.raises(DyngsError, match="nowhere"):
-        evaluate_run(Path("nowhere"))
-
-
-def test_report_is_strict_json(tmp_path) -> None:
-    report = evaluate_run(write_run(tmp_path, some_gaussians()))
-    with pytest.raises(ValueError, match="JSON"):
-        replace(report, psnr=math.inf).to_json()
-
-
-def test_options_are_those_of_training() -> None:
-    model = StaticModel(rasterize_mode=RasterizeMode.ANTIALIASED, eps2d=0.1, near=0.05)
-    options = render_options(model)
-    assert (options.mode, options.eps2d, options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.05)
-    assert options.depth == "none"
-    assert render_options(StaticModel(), extent=5.0) == RenderOptions(near=0.05)
-    assert render_options(model, extent=5.0, world_scale=0.5).near == 0.1, (
-        "a number is in the unit of the capture"
-    )
-    cut = render_options(StaticModel(alpha_min=0.02, transmittance_min=0.01))
-    assert (cut.alpha_min, cut.transmittance_min) == (0.02, 0.01)
-
-
-def test_cut_offs_are_the_runs_own_and_runs_from_before_have_the_usual(tmp_path) -> None:
-    run_dir = write_run(tmp_path, some_gaussians())
-    file = run_dir / RESOLVED_NAME
-    config = load_resolved(run_dir)
-    usual = evaluate_run(run_dir).psnr
-    file.write_text(
-        "\n".join(line for line in file.read_text().splitlines() if "_min:" not in line)
-    )
-    assert load_resolved(run_dir) == config
-    save_config(load_resolved(run_dir, ["model.alpha_min=0.5"]), file)
-    assert evaluate_run(run_dir).psnr != usual
-
-
-def test_size_is_that_of_the_papers() -> None:
-    assert parameter_megabytes(as_scene(some_gaussians(1000, degree=3))) == pytest.approx(0.236)
 
 
 def test_capture_without_any_views(tmp_path) -> None:

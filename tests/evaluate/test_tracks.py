@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.config.io import load_config
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View, all_views
-from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.data.synthetic.scenes import SceneName
+from dyngs.data.synthetic.captures import DynamicOptions, SceneName, write_dynamic_capture
 from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.field import FieldSetup
@@ -87,20 +86,6 @@ def test_true_motion_has_no_error_and_a_still_model_all_of_it() -> None:
     assert still.error_px == pytest.approx(PX_PER_UNIT * (0.5 + 0.25 + 0.25 + 0.5) / 4, rel=1e-5)
 
 
-def test_motion_that_is_too_slow_is_off_by_the_rest() -> None:
-    slow = track_scores(
-        only_movers(moving_scene(Sliding(speed=0.2))), sliding_truth(), split(), views()
-    )
-    assert slow.error_px == pytest.approx(0.8 * (slow.motion_px or 0), rel=1e-4)
-    fast = track_scores(
-        only_movers(moving_scene(Sliding(speed=1000.0))), sliding_truth(), split(), views()
-    )
-    assert fast.error_px == pytest.approx(np.hypot(20, 14)), (
-        "no more than the diagonal of the image"
-    )
-    assert fast.within_5px == 0.0
-
-
 def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
     """Half a turn about y: the Gaussians alone, 0.5 from each point, would leave them up to 1
     away."""
@@ -123,14 +108,6 @@ def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
     assert found.motion_px is not None
     assert found.motion_px > 0.8
     assert found.error_px == pytest.approx(0.0, abs=1e-4)
-
-
-def test_points_are_bound_when_they_are_seen() -> None:
-    """Those that appear at 0.75 only are bound then, where the balls are at that time."""
-    found = track_scores(
-        only_movers(moving_scene(Sliding(speed=0.0))), sliding_truth(3), split(), views()
-    )
-    assert found.error_px == pytest.approx(0.25 * PX_PER_UNIT, rel=1e-4)
 
 
 def test_masked_gaussians_carry_points_too() -> None:

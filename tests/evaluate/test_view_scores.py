@@ -25,7 +25,6 @@ from dyngs.evaluate.report import scene_of_split
 from dyngs.evaluate.view_scores import (
     Drawing,
     background_scores,
-    mean_of,
     person_scores,
     right_half_scores,
     score_views,
@@ -162,11 +161,6 @@ def test_views_are_drawn_at_their_own_times() -> None:
     assert all(s.deform_seconds <= s.render_seconds for s in scores)
 
 
-def test_a_mean_is_known_where_all_values_are() -> None:
-    assert mean_of([1.0, 3.0]) == 2.0
-    assert mean_of([1.0, None]) is None
-
-
 def image_and_rendering() -> tuple[Image, Rendering]:
     image = seen_from(cameras_before_wall(1))[0]
     rgb = 0.6 * torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(0))
@@ -191,16 +185,6 @@ def test_errors_in_the_right_half_count_though_the_left_half_is_perfect() -> Non
     found = right_half_scores(replace(image, rgb_premultiplied=wrong), rendering, BLACK)
     assert found["psnr_right_fitted"] is not None
     assert found["psnr_right_fitted"] < 25
-
-
-def test_only_the_right_half_is_scored() -> None:
-    image, rendering = image_and_rendering()
-    noisy = image.rgb_premultiplied.clone()
-    noisy[:, :40] += 0.1 * torch.randn(60, 40, 3, generator=torch.Generator().manual_seed(1))
-    found = right_half_scores(replace(image, rgb_premultiplied=noisy), rendering, BLACK)
-    assert found["psnr_right"] == 100
-    assert found["psnr_right_fitted"] is not None
-    assert found["psnr_right_fitted"] > 35
 
 
 def test_a_half_without_pixels_has_no_score() -> None:
@@ -238,20 +222,6 @@ def test_scores_in_the_box_and_on_black() -> None:
     )
     assert scores["ssim_black"] == pytest.approx(ssim(black, image.rgb_premultiplied), abs=1e-6)
     assert scores["lpips_black"] is None
-
-
-def test_masked_pixels_do_not_count() -> None:
-    mask = torch.zeros(12, 20)
-    mask[:, 8:] = 1
-    scores = background_scores(*of_a_square(mask), torch.ones(3))
-    assert scores["psnr_black"] == pytest.approx(20 + 10 * math.log10(12 * 12 / 20), abs=1e-4)
-
-
-def test_nobody_is_to_be_seen() -> None:
-    image, rendering = of_a_square()
-    for alpha in (None, torch.zeros(12, 20)):
-        empty = Image("a", CAMERA, image.rgb_premultiplied, alpha, None, None)
-        assert person_scores(empty, rendering, torch.ones(3), NO_LPIPS) == {}
 
 
 @pytest.fixture(scope="module")
@@ -334,19 +304,6 @@ def test_poses_that_were_trained_on_are_not_refined(
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def test_a_shrunk_camera_sees_the_same() -> None:
-    small = one_camera(20, 14).scaled(0.5)
-    assert (small.width, small.height) == (10, 7)
-    corner = torch.tensor([20.0, 14.0, 1.0])
-    ray, same = (
-        torch.linalg.inv(c.intrinsics[0]) @ p
-        for c, p in ((one_camera(20, 14), corner), (small, corner / 2))
-    )
-    assert torch.allclose(ray[:2], (ray / same * same)[:2])
-    assert torch.allclose(small.intrinsics[0] @ ray / ray[2], torch.tensor([10.0, 7.0, 1.0]))
-    assert one_camera().scaled(1.0).width == 20
 
 
 def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:

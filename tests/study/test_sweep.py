@@ -18,8 +18,14 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
 from dyngs.study.measure import Measurement, read_measurement
 from dyngs.study.sweep import Plan, sweep
-from dyngs.study.variant_runs import VariantRuns, field_changes, run_settings, write_chosen
-from dyngs.study.variants import Variant, parse_variations
+from dyngs.study.variants import (
+    Variant,
+    VariantRuns,
+    field_changes,
+    parse_variations,
+    run_settings,
+    write_chosen,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SETTINGS = (

@@ -11,9 +11,7 @@ from hypothesis import strategies as st
 
 from dyngs.core.errors import DyngsError
 from dyngs.study.variants import (
-    SETTINGS,
     Variant,
-    Varied,
     parse_variations,
     single_changes,
 )
@@ -127,11 +125,6 @@ def test_fine_tuning_comes_in_addition() -> None:
     assert found == [Variant(prune=0.5), Variant(prune=0.5, finetune=7), Variant(scale=0.5)]
 
 
-def test_variations_keep_the_order_of_their_values() -> None:
-    (variation,) = parse_variations(["storage=auto, 2,0.5,2"], trains=False)
-    assert variation.values == ("auto", 2.0, 0.5)
-
-
 @pytest.mark.parametrize(
     ("word", "message"),
     [
@@ -153,8 +146,3 @@ def test_what_cannot_be_varied_is_refused(word: str, message: str) -> None:
 def test_a_setting_twice_is_refused() -> None:
     with pytest.raises(DyngsError, match="twice"):
         parse_variations(["scale=0.5", "scale=0.7"], trains=False)
-
-
-@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.name)
-def test_defaults_of_settings_are_allowed(setting: Varied) -> None:
-    assert [setting.parsed(str(value)) for value in setting.values] == list(setting.values)

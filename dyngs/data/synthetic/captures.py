@@ -1,28 +1,649 @@
-"""Captures of the embedded scenes, ray traced into the layout of NeRF-synthetic and D-NeRF, with
-true tracks."""
+"""Captures of synthetic scenes in the layout of NeRF-synthetic and D-NeRF, with true tracks: a small
+ray tracer in NumPy, the scenes, and the captures.
+
+The ray tracer shares no formula with the rasterizer, so that its images are an independent ground
+truth. A scene is a tuple of primitives; a scene that moves is a function from time to such a tuple.
+Its still primitives come first, and everything that moves is textured, so that its motion is
+visible. Units: world units, radians. Local letters: R rays (or points on surfaces).
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from dyngs.core.conventions import srgb_encoded
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.raytrace import (
-    CAMERA_ANGLE_X,
-    Scene,
-    is_seen,
-    render_scene,
-    render_things,
-)
-from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
+
+CAMERA_ANGLE_X = 0.6911112070083618
+"""Horizontal field of view of the NeRF-synthetic scenes, radians."""
+
+Paint = Callable[[np.ndarray], np.ndarray]
+"""Local surface points (R, 3), scaled so that the primitive spans [-1, 1], to linear albedo (R,
+3)."""
+
+_RAYS = 1 << 14  # that are traced at once
+_LAMP_SIZE = 0.9
+_SKY = (0.46, 0.50, 0.56)
+_GROUND = (0.20, 0.17, 0.15)
+_LAMPLIGHT = (0.80, 0.74, 0.66)
+_SURFACE = 3e-3  # world units by which a surface may seem to lie before one of its own points
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball; ``gloss`` is the strength of its highlight, ``turn`` (3, 3) rotates the paint's axes
+    to the world's."""
+
+    center: tuple[float, float, float]
+    radius: float
+    paint: Paint
+    gloss: float = 0.25
+    turn: np.ndarray = field(
+        default_factory=lambda: np.eye(3, dtype=np.float32), repr=False, compare=False
+    )
+
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray
+        misses."""
+        offset = origins - f32(self.center)
+        half_b = _dot(offset, directions)
+        discriminant = half_b**2 - _dot(offset, offset) + self.radius**2
+        distance = -half_b - np.sqrt(np.maximum(discriminant, 0.0))
+        return np.where((discriminant > 0) & (distance > 1e-4), distance, np.float32(np.inf))
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points in the paint's axes."""
+        return self.normals(points) @ f32(self.turn)
+
+    def placed(self, local: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points, of those in the paint's axes: the inverse of ``local``."""
+        return np.float32(self.radius) * local @ f32(self.turn).T + f32(self.center)
+
+    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+        """(R, 3) points spread evenly over the surface, in the paint's axes."""
+        return _unit(random.normal(size=(count, 3))).astype(np.float32)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) unit normals at surface points."""
+        return (points - f32(self.center)) / np.float32(self.radius)
+
+    def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(R,) fraction of the cosine-weighted sky that the ball hides: the form factor of a
+        sphere."""
+        offset = f32(self.center) - points
+        distance = np.sqrt(np.maximum(_dot(offset, offset), 1e-12))
+        cosine = np.maximum(_dot(normals, offset) / distance, 0.0)
+        return cosine * np.minimum(self.radius / distance, 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box rotated by ``yaw`` radians about the vertical; its methods are as those of
+    ``Sphere``."""
+
+    center: tuple[float, float, float]
+    half_extents: tuple[float, float, float]
+    paint: Paint
+    yaw: float = 0.0
+    gloss: float = 0.1
+
+    def _axes(self) -> np.ndarray:
+        c = np.cos(self.yaw)
+        s = np.sin(self.yaw)
+        return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
+
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        start = (origins - f32(self.center)) @ self._axes().T
+        towards = directions @ self._axes().T
+        enter, leave = _through_box(start, towards, f32(self.half_extents))
+        return np.where((enter < leave) & (enter > 1e-4), enter, np.float32(np.inf))
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points in the box's axes, each divided by the half extent."""
+        turned = (points - f32(self.center)) @ self._axes().T
+        return turned / f32(self.half_extents)
+
+    def placed(self, local: np.ndarray) -> np.ndarray:
+        return (local * f32(self.half_extents)) @ self._axes() + f32(self.center)
+
+    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+        half = np.asarray(self.half_extents)
+        areas = half.prod() / half
+        local = random.uniform(-1.0, 1.0, (count, 3))
+        rows = np.arange(count)
+        face = random.choice(3, count, p=areas / areas.sum())
+        local[rows, face] = np.where(local[rows, face] < 0, -1.0, 1.0)
+        return local.astype(np.float32)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        local = self.local(points)
+        face = np.abs(local).argmax(axis=1)
+        side = np.sign(np.take_along_axis(local, face[:, None], axis=1)).astype(np.float32)
+        return side * self._axes()[face]
+
+    def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(R,) fraction of the sky hidden, as by a ball that fills the box."""
+        return Sphere(self.center, min(self.half_extents), self.paint).occlusion(points, normals)
+
+
+Primitive = Sphere | Box
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Primitives, z up, lit by a sky and one square lamp, whose size softens the shadows.
+
+    Attributes:
+        faint: a neighbour that hides no more than this fraction of a point's sky hides nothing,
+            which leaves what is far from a moving thing exactly as it is.
+        num_static: the first so many primitives stand still; None: all do.
+    """
+
+    primitives: tuple[Primitive, ...]
+    lamp: tuple[float, float, float] = (2.2, -2.6, 4.4)
+    faint: float = 0.0
+    num_static: int | None = None
+
+    @property
+    def movers(self) -> range:
+        """Indices of the primitives that move."""
+        return range(
+            len(self.primitives) if self.num_static is None else self.num_static,
+            len(self.primitives),
+        )
+
+
+def render_scene(
+    scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
+) -> np.ndarray:
+    """(size, size, 4) uint8 image: sRGB with straight alpha, transparent background.
+
+    Sample (a, b) of every pixel sees the lamp at place (a, b) of its grid, so shadows are soft and
+    agree between views. The field of view is ``CAMERA_ANGLE_X``; ``world_from_cam`` is a (4, 4)
+    OpenGL pose.
+    """
+    color = np.zeros((size * size, 3), np.float32)
+    hits = np.zeros(size * size, np.float32)
+    origin = world_from_cam[:3, 3].astype(np.float32)
+    for places, directions in sampled_rays(world_from_cam, size, samples):
+        moved = np.array(
+            [[_LAMP_SIZE * (x - 0.5), _LAMP_SIZE * (y - 0.5), 0.0] for x, y in places], np.float32
+        )
+        lamps = f32(scene.lamp) + moved
+        hit, rgb = trace(scene, origin, directions, np.repeat(lamps, size * size, axis=0))
+        for own in range(len(places)):
+            here = hit // (size * size) == own
+            pixels = hit[here] - own * size * size
+            color[pixels] += rgb[here]
+            hits[pixels] += 1.0
+    straight = color / np.maximum(hits, 1.0)[:, None]
+    rgba = np.concatenate([straight, hits[:, None] / samples**2], axis=1)
+    return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
+
+
+def render_things(
+    scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
+) -> np.ndarray:
+    """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0
+    none.
+
+    Of several in one pixel the one that most samples see; light does not count.
+    """
+    counts = np.zeros((1 + len(scene.movers), size * size), np.int64)  # the first row stays 0: none
+    origin = world_from_cam[:3, 3].astype(np.float32)
+    for places, directions in sampled_rays(world_from_cam, size, samples):
+        nearest, distance = nearest_things(scene, origin, directions)
+        shown = (nearest == np.array(scene.movers)[:, None]) & np.isfinite(distance)
+        counts[1:] += shown.reshape(len(shown), len(places), size * size).sum(axis=1)
+    return counts.argmax(axis=0).astype(np.uint8).reshape(size, size)
+
+
+def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
+    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not; NaN
+    is never seen."""
+    origin = world_from_cam[:3, 3]
+    offset = np.nan_to_num(points - origin)
+    distance = np.maximum(np.sqrt(_dot(offset, offset)), 1e-6)
+    _, nearest = nearest_things(scene, f32(origin), (offset / distance[:, None]).astype(np.float32))
+    return np.isfinite(points).all(axis=1) & (nearest > distance - _SURFACE)
+
+
+def nearest_things(
+    scene: Scene, origin: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return, per ray, the primitive that it hits first and the distance to it, inf where it hits
+    none."""
+    distances = np.stack([p.intersect(origin[None], directions) for p in scene.primitives])
+    return distances.argmin(axis=0), distances.min(axis=0)
+
+
+def trace(
+    scene: Scene, origin: np.ndarray, directions: np.ndarray, lamps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices of the rays that hit something (R_hit,), and the colours there: sRGB (R_hit,
+    3).
+
+    The lamp is at a place (R, 3) of its own for each ray.
+    """
+    nearest, distance = nearest_things(scene, origin, directions)
+    hit = np.flatnonzero(np.isfinite(distance))
+    nearest = nearest[hit]
+    directions = directions[hit]
+    points = origin + distance[hit, None] * directions
+    rgb = np.zeros((len(hit), 3), np.float32)
+    for index, primitive in enumerate(scene.primitives):
+        here = np.flatnonzero(nearest == index)
+        if len(here):
+            rgb[here] = _shade(scene, primitive, points[here], directions[here], lamps[hit[here]])
+    return hit, _srgb(rgb)
+
+
+def _shade(
+    scene: Scene,
+    primitive: Primitive,
+    points: np.ndarray,
+    directions: np.ndarray,
+    lamps: np.ndarray,
+) -> np.ndarray:
+    """(R, 3) linear radiance: sky light less what neighbours occlude, Lambert and Blinn-Phong light
+    of the lamp."""
+    normals = primitive.normals(points)
+    to_lamp = _unit(lamps - points)
+    facing = np.maximum(_dot(normals, to_lamp), 0.0)
+    lit = facing > 0
+    above = points + 2e-3 * normals
+    open_sky = np.ones(len(points), np.float32)
+    for other in scene.primitives:
+        if other is primitive:
+            continue
+        hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0) / (
+            1.0 - scene.faint
+        )
+        open_sky *= 1.0 - hidden
+        seen = np.flatnonzero(lit)
+        lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
+    upward = (0.5 + 0.5 * normals[:, 2:]).astype(np.float32)
+    ambient = upward * f32(_SKY) + (1 - upward) * f32(_GROUND)
+    direct = np.where(lit, 1.0, 0.0)[:, None] * f32(_LAMPLIGHT)
+    rgb = primitive.paint(primitive.local(points)) * (
+        ambient * open_sky[:, None] + direct * facing[:, None]
+    )
+    if primitive.gloss == 0:
+        return rgb
+    shine = np.maximum(_dot(normals, _unit(to_lamp - directions)), 0.0) ** 60 * primitive.gloss
+    return rgb + direct * shine[:, None]
+
+
+def sampled_rays(
+    world_from_cam: np.ndarray, size: int, samples: int
+) -> Iterator[tuple[list[tuple[float, float]], np.ndarray]]:
+    """Yield P positions in a pixel, and (P * size * size, 3) float32 unit directions in the world
+    through them.
+
+    By rows. Of small images many positions at once: numpy takes as long for one ray as for a
+    thousand.
+    """
+    focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
+    places = [((a + 0.5) / samples, (b + 0.5) / samples) for a, b in np.ndindex(samples, samples)]
+    count = max(1, _RAYS // size**2)
+    for some in (places[i : i + count] for i in range(0, len(places), count)):
+        found = []
+        for place in some:
+            x, y = ((np.arange(size) + sub - 0.5 * size) / focal for sub in place)
+            grid_x, grid_y = np.meshgrid(x, y)
+            local = np.stack([grid_x, -grid_y, -np.ones_like(grid_x)], axis=-1).reshape(-1, 3)
+            found.append(_unit(local @ world_from_cam[:3, :3].T).astype(np.float32))
+        yield some, np.concatenate(found)
+
+
+def _through_box(
+    start: np.ndarray, directions: np.ndarray, bound: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (R,) at which rays enter and leave the box of half extents ``bound`` (3,); enter >
+    leave: a miss."""
+    inverse = 1.0 / np.where(np.abs(directions) < 1e-9, np.float32(1e-9), directions)
+    reach = np.abs(inverse) * bound
+    middle = -start * inverse
+    x, y, z = (middle - reach).T
+    enter = np.maximum(np.maximum(x, y), z)
+    x, y, z = (middle + reach).T
+    return enter, np.minimum(np.minimum(x, y), z)
+
+
+def f32(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    return np.asarray(values, np.float32)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...i,...i->...", a, b)
+
+
+def _unit(a: np.ndarray) -> np.ndarray:
+    return a / np.sqrt(_dot(a, a))[..., None]
+
+
+def _srgb(linear: np.ndarray) -> np.ndarray:
+    """Convert linear light to sRGB in [0, 1] (IEC 61966-2-1)."""
+    return srgb_encoded(np.clip(linear, 0.0, 1.0))
+
+
+SceneName = Literal["spin", "room", "roll"]
+"""The scenes that move."""
+
+Rgb = tuple[float, float, float]
+
+_FAINT = 0.05
+"""``Scene.faint`` of the moving scenes: a ball occludes the sky for what is nearer than about four
+radii."""
+
+_PLATE_TOP = -0.34
+_ROOM_FLOOR = -0.50
+_CREAM = (0.95, 0.92, 0.84)
+_GREEN = (0.10, 0.42, 0.30)
+
+
+def still_life() -> Scene:
+    """The demo scene: three painted balls and a box on a checkered plate, inside |x|, |y|, |z| <=
+    1.1."""
+    return Scene(
+        (
+            _plate((0.80, 0.77, 0.70), (0.10, 0.16, 0.22)),
+            Sphere(
+                (-0.34, 0.40, 0.13), 0.47, _swirl((0.85, 0.20, 0.12), (0.95, 0.80, 0.55)), gloss=0.4
+            ),
+            Sphere(
+                (0.52, -0.40, -0.02), 0.32, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.6
+            ),
+            Sphere(
+                (-0.40, -0.52, -0.10),
+                0.24,
+                _sectors(8, (0.95, 0.68, 0.10), (0.10, 0.42, 0.30)),
+                gloss=0.6,
+            ),
+            Box(
+                (0.48, 0.43, -0.04),
+                (0.26, 0.26, 0.30),
+                _framed((0.30, 0.12, 0.42), (0.86, 0.62, 0.30)),
+                yaw=0.5,
+            ),
+        )
+    )
+
+
+def scene_at(name: SceneName, time: float) -> Scene:
+    """Return the scene ``name`` at ``time`` in [0, 1].
+
+    - ``spin``: a die turns by 100 degrees on a plate and a ball rolls about it along 130 degrees of
+      a circle.
+    - ``room``: a furnished corner, opaque in all directions, where one ball hops across the floor.
+    - ``roll``: a striped ball alone rolls along a circle on a plate, turning 2.5 times.
+
+    Raises:
+        DyngsError: no such scene.
+    """
+    moving = {"spin": _spin, "room": _room, "roll": _roll}
+    if name in moving:
+        return moving[name](time)
+    raise DyngsError(
+        f"there is no moving scene '{name}'; choose one of {', '.join(get_args(SceneName))}"
+    )
+
+
+def _spin(time: float) -> Scene:
+    azimuth = np.radians(-130.0 + 130.0 * time)
+    radius, path_radius = 0.24, 0.70
+    return Scene(
+        (
+            _plate((0.76, 0.70, 0.60), (0.30, 0.13, 0.12)),
+            Sphere(
+                (-0.60, 0.60, -0.16), 0.18, _dots((0.90, 0.72, 0.16), (0.98, 0.96, 0.88)), gloss=0.5
+            ),
+            Box(
+                (0.0, 0.0, 0.04),
+                (0.34, 0.34, 0.38),
+                _die(),
+                yaw=float(np.radians(100.0 * time - 20.0)),
+                gloss=0.3,
+            ),
+            Sphere(
+                (path_radius * np.cos(azimuth), path_radius * np.sin(azimuth), _PLATE_TOP + radius),
+                radius,
+                _sectors(8, (0.10, 0.42, 0.62), (0.96, 0.90, 0.78)),
+                gloss=0.6,
+                turn=_rotation("z", azimuth) @ _rotation("x", -path_radius * azimuth / radius),
+            ),
+        ),
+        faint=_FAINT,
+        num_static=2,
+    )
+
+
+def _room(time: float) -> Scene:
+    radius, hops = 0.24, 3
+    start = np.array([0.72, -0.86])
+    end = np.array([-0.45, -0.06])
+    x, y = start + time * (end - start)
+    height = _ROOM_FLOOR + radius + 0.55 * abs(np.sin(np.pi * hops * time))
+    heading = _rotation("z", np.arctan2(*(end - start)[::-1]))
+    turn = heading @ _rotation("y", 2 * np.pi * time) @ heading.T
+    ball = Sphere(
+        (x, y, height),
+        radius,
+        _sectors(8, (0.95, 0.68, 0.10), (0.10, 0.42, 0.30)),
+        gloss=0.6,
+        turn=turn,
+    )
+    floor = _tiles(26, (0.72, 0.56, 0.40), (0.46, 0.32, 0.21))
+    left = _wallpaper(1, 2, (15, 9), (0.62, 0.68, 0.60), (0.36, 0.50, 0.46))
+    right = _wallpaper(0, 2, (15, 9), (0.80, 0.72, 0.58), (0.66, 0.42, 0.30))
+    return Scene(
+        (
+            Box((3.5, -3.5, _ROOM_FLOOR - 0.1), (5.2, 5.2, 0.1), floor, gloss=0.0),
+            Box((-1.6, -3.5, 2.5), (0.1, 5.2, 3.2), left, gloss=0.0),
+            Box((3.5, 1.6, 2.5), (5.2, 0.1, 3.2), right, gloss=0.0),
+            Box(
+                (-0.85, 0.80, -0.08),
+                (0.42, 0.42, 0.42),
+                _framed((0.30, 0.12, 0.42), (0.86, 0.62, 0.30)),
+                yaw=0.5,
+            ),
+            Box(
+                (0.36, 0.98, -0.02),
+                (0.28, 0.28, 0.48),
+                _tiles(4, (0.88, 0.84, 0.74), (0.10, 0.22, 0.34)),
+                yaw=0.25,
+            ),
+            Sphere(
+                (-0.85, 0.80, 0.60), 0.26, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.6
+            ),
+            Sphere(
+                (-0.95, -0.55, -0.16),
+                0.34,
+                _swirl((0.72, 0.16, 0.20), (0.95, 0.86, 0.66)),
+                gloss=0.4,
+            ),
+            ball,
+        ),
+        faint=_FAINT,
+        num_static=7,
+    )
+
+
+def _roll(time: float) -> Scene:
+    radius, path_radius, turns = 0.28, 0.60, 2.5
+    angle = 2 * np.pi * turns * time
+    azimuth = angle * radius / path_radius - 2.0
+    ball = Sphere(
+        (path_radius * np.cos(azimuth), path_radius * np.sin(azimuth), _PLATE_TOP + radius),
+        radius,
+        _sectors(
+            8,
+            _CREAM,
+            (0.80, 0.12, 0.10),
+            _CREAM,
+            (0.08, 0.30, 0.62),
+            _CREAM,
+            (0.92, 0.66, 0.08),
+            _CREAM,
+            _GREEN,
+        ),
+        gloss=0.4,
+        turn=_rotation("z", azimuth) @ _rotation("x", -angle),
+    )
+    return Scene((_plate((0.74, 0.74, 0.72), (0.22, 0.20, 0.26)), ball), faint=_FAINT, num_static=1)
+
+
+def _plate(light: Rgb, dark: Rgb) -> Box:
+    """The checkered plate under the other things, its top at ``_PLATE_TOP``."""
+    return Box((0.0, 0.0, -0.40), (0.98, 0.98, 0.06), _checkers(6, light, dark), gloss=0.05)
+
+
+def _rotation(axis: Literal["x", "y", "z"], angle: float) -> np.ndarray:
+    """(3, 3) right-handed rotation about one axis of the world."""
+    c = np.cos(angle)
+    s = np.sin(angle)
+    first = "xyz".index(axis) + 1
+    turn = np.eye(3)
+    i = first % 3
+    j = (first + 1) % 3
+    turn[i, i] = c
+    turn[i, j] = -s
+    turn[j, i] = s
+    turn[j, j] = c
+    return turn
+
+
+def _checkers(count: int, light: Rgb, dark: Rgb) -> Paint:
+    """``count`` x ``count`` squares seen from above, a plain dark rim."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        cells = np.floor((local[:, :2] * 0.94 + 1.0) * 0.5 * count).astype(np.int64).sum(axis=1)
+        is_light = (
+            (cells % 2 == 0) & (np.abs(local[:, :2]).max(axis=1) < 0.94) & (local[:, 2] > 0.99)
+        )
+        return np.where(is_light[:, None], f32(light), f32(dark))
+
+    return paint
+
+
+def _swirl(first: Rgb, second: Rgb) -> Paint:
+    """Bands that wind around the pole, with soft edges."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        wave = np.sin(
+            9.0 * local[:, 2]
+            + 2.0 * np.arctan2(local[:, 1], local[:, 0])
+            + 1.5 * np.sin(4.0 * local[:, 0])
+        )
+        fraction = (0.5 + 0.5 * np.clip(4.0 * wave, -1.0, 1.0))[:, None].astype(np.float32)
+        return fraction * f32(first) + (1 - fraction) * f32(second)
+
+    return paint
+
+
+def _dots(ground: Rgb, dot: Rgb) -> Paint:
+    """24 round dots spread over the sphere."""
+    i = np.arange(24) + 0.5
+    z = 1 - 2 * i / 24
+    azimuth = i * np.pi * (3.0 - np.sqrt(5.0))
+    centers = np.stack(
+        [np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z]
+    ).astype(np.float32)
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        is_dot = (local @ centers).max(axis=1) > np.cos(0.22)
+        return np.where(is_dot[:, None], f32(dot), f32(ground))
+
+    return paint
+
+
+def _sectors(count: int, *colours: Rgb) -> Paint:
+    """A beach ball with ``count`` sectors of ``colours`` in turn about a tilted axis and white
+    caps."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        tilted_z = 0.8 * local[:, 2] + 0.6 * local[:, 1]
+        tilted_y = 0.8 * local[:, 1] - 0.6 * local[:, 2]
+        sector = np.floor(np.arctan2(tilted_y, local[:, 0]) * count / (2 * np.pi)).astype(np.int64)
+        rgb = np.array(colours, np.float32)[sector % len(colours)]
+        return np.where((np.abs(tilted_z) > 0.93)[:, None], f32([0.9, 0.9, 0.88]), rgb)
+
+    return paint
+
+
+def _framed(frame: Rgb, panel: Rgb) -> Paint:
+    """A frame around every face and fine rings, as of wood, on its panel."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        in_frame = np.sort(np.abs(local), axis=1)[:, 1] > 0.78
+        ring = 0.80 + 0.20 * np.sin(
+            11.0 * local[:, 2] + 4.0 * np.sin(2.0 * local[:, 0] + local[:, 1])
+        )
+        return np.where(
+            in_frame[:, None], f32(frame), ring[:, None].astype(np.float32) * f32(panel)
+        )
+
+    return paint
+
+
+def _tiles(count: int, light: Rgb, dark: Rgb) -> Paint:
+    """Checkers of ``count`` cubes a side, on all faces."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        cells = np.floor((local * 0.999 + 1.0) * 0.5 * count).astype(np.int64).sum(axis=1)
+        return np.where((cells % 2 == 0)[:, None], f32(light), f32(dark))
+
+    return paint
+
+
+def _wallpaper(across: int, up: int, counts: tuple[int, int], ground: Rgb, spot: Rgb) -> Paint:
+    """Rows of soft spots, every other row shifted, over the two given axes of a box."""
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        row = (local[:, up] + 1.0) * counts[1]
+        column = (local[:, across] + 1.0) * counts[0] + 0.5 * (np.floor(row) % 2)
+        distance = np.hypot(row % 1.0 - 0.5, column % 1.0 - 0.5)
+        fraction = np.clip((0.34 - distance) / 0.08, 0.0, 1.0)[:, None].astype(np.float32)
+        return fraction * f32(spot) + (1 - fraction) * f32(ground)
+
+    return paint
+
+
+def _die() -> Paint:
+    """A die: opposite faces in one colour, with 1 to 6 pips of which opposite ones add up to
+    seven."""
+    colors = np.array([[0.66, 0.12, 0.10], [0.10, 0.30, 0.50], [0.90, 0.78, 0.52]], np.float32)
+    d = 0.48
+    corners = [(-d, -d), (d, d), (-d, d), (d, -d)]
+    pips = {n: corners[: n - n % 2] + [(0.0, 0.0)] * (n % 2) for n in range(1, 6)}
+    pips[6] = [*corners, (-d, 0.0), (d, 0.0)]
+
+    def paint(local: np.ndarray) -> np.ndarray:
+        axis = np.abs(local).argmax(axis=1)
+        side = np.take_along_axis(local, axis[:, None], axis=1)[:, 0] > 0
+        number = np.where(side, axis + 1, 6 - axis)
+        rows = np.arange(len(local))
+        x = local[rows, (axis + 1) % 3]
+        y = local[rows, (axis + 2) % 3]
+        is_pip = np.zeros(len(local), bool)
+        for n, centers in pips.items():
+            for a, b in centers:
+                is_pip |= (number == n) & (np.hypot(x - a, y - b) < 0.19)
+        is_edge = np.maximum(np.abs(x), np.abs(y)) > 0.93
+        rgb = np.where(is_edge[:, None], np.float32(0.6) * colors[axis], colors[axis])
+        return np.where(is_pip[:, None], f32((0.96, 0.94, 0.88)), rgb)
+
+    return paint
+
 
 CaptureStyle = Literal["teleport", "moving", "fixed"]
 """One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all

@@ -1,48 +1,496 @@
-"""A synthetic capture of a person: the dressed template in motion, from many cameras, with exact
-body parameters.
+"""Synthetic captures of dressed people: key points, clips, clothes, and the captures themselves,
+with exact body parameters.
 
-Rasterized in numpy, independently of the rasterizer of Gaussians. T triangles, U vertices of the
-atlas, H fragments, S texels per side.
+Rasterized in numpy, independently of the rasterizer of Gaussians. J key points, M vertices, T
+triangles, U vertices of the atlas, P points, H fragments, S texels per side.
 """
 
 from __future__ import annotations
 
+import colorsys
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import asdict, dataclass, replace
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.maps import MILLIMETRE
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
+from dyngs.data.people_set import PEOPLE_FILE
+from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.human.body.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.body.body_reader import default_template
+from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS
 from dyngs.human.body.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
+from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
-from dyngs.human.synthetic.clips import random_clip, squat, walk
-from dyngs.human.synthetic.clothes import (
-    Outfit,
-    dress_body,
-    paint_texture,
-    random_outfit,
-    texel_coordinates,
-    texture_coordinates,
-)
-from dyngs.human.synthetic.keypoints import (
-    KEYPOINTS_FILE,
-    is_seen,
-    joint_positions,
-    joints_of_triangles,
-)
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_image, write_text
+
+KEYPOINTS_FILE = "true_keypoints.npz"
+"""In a capture of a synthetic person: ``TrueTracks`` of joints in the frames of training."""
+NUM_KEYPOINTS = 25
+"""Joints that are key points, the first of ``JOINT_NAMES``: body, jaw and eyes."""
+_FACE = 22  # The first of those in the face, which are not seen through the back of the head
+# How deep below its own surface a joint may lie to count as seen, m
+_THICK, _THICK_FACE = 0.25, 0.09
+
+
+def joint_positions(body: BodyTemplate, motion: Motion) -> np.ndarray:
+    """Return the joints (F, J, 3) of ``body`` in the frames of ``motion`` that are key points, m,
+    float64."""
+    joints = body.joints.double()
+    poses = motion.poses.double()
+    posed = apply_transforms(
+        joint_transforms(joints, body.parents, axis_angle_to_matrix(poses)), joints
+    )
+    placed = motion.scale.double()[:, None, None] * posed + motion.trans.double()[:, None]
+    return placed[:, :NUM_KEYPOINTS].cpu().numpy()
+
+
+def joints_of_triangles(body: BodyTemplate) -> np.ndarray:
+    """Return the joint (T,) that moves each triangle most."""
+    return body.weights[body.faces].sum(1).argmax(1).cpu().numpy()
+
+
+def is_seen(depth: np.ndarray, near: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """Return (J,) bool: key points that a camera sees.
+
+    What the camera sees at a key point must be moved by its joint, or by the joint's parent or
+    child, and lie at most as far before it as limbs are thick.
+
+    Args:
+        depth: (J,) of the key points along the view axis, m.
+        near: (J,) of the surface in their pixels.
+        owner: (J,) joint that moves that surface, -1 where there is none or the key point is not in
+            the image.
+    """
+    thick = np.where(np.arange(NUM_KEYPOINTS) < _FACE, _THICK, _THICK_FACE)
+    return (owner >= 0) & _related()[np.arange(NUM_KEYPOINTS), owner] & (depth - near < thick)
+
+
+@cache
+def _related() -> np.ndarray:
+    """Return (J, 55) bool: which joints are a key point's own, its parent's or its children's."""
+    count = len(JOINT_NAMES)
+    related = np.eye(count, dtype=bool)
+    for child, parent in enumerate(JOINT_PARENTS):
+        if parent >= 0:
+            related[child, parent] = related[parent, child] = True
+    return related[:NUM_KEYPOINTS]
+
+
+FPS = 12.0
+_Rotations = dict[str, np.ndarray]  # axis-angle vectors (F, 3) or (1, 3) by joint, rad
+_SIDES = (("left", 1.0), ("right", -1.0))
+_KEY_POSES = 4  # poses that a random clip passes through
+
+
+def walk(body: BodyTemplate, num_frames: int) -> Motion:
+    """Return three swings of legs and arms in place while the body turns by 50 degrees; soles at y
+    = 0."""
+    return _grounded_motion(body, _walk(np.linspace(0.0, 1.0, num_frames), 1.0, 0.0), num_frames)
+
+
+def squat(body: BodyTemplate, num_frames: int) -> Motion:
+    """Return a motion from standing into a squat while the arms rise sideways; soles at y = 0."""
+    return _grounded_motion(body, _squat(np.linspace(0.0, 1.0, num_frames), 1.0, 0.0), num_frames)
+
+
+def random_clip(body: BodyTemplate, num_frames: int, seed: int) -> Motion:
+    """Return the clip of ``seed``: a walk, a squat or a dance, of random extent and heading; soles
+    at y = 0.
+
+    A dance passes smoothly through random poses: arms from hanging to above the shoulders, legs in
+    steps.
+    """
+    make = np.random.default_rng([seed, 2])
+    time = np.linspace(0.0, 1.0, num_frames)
+    heading = float(make.uniform(-np.pi, np.pi))
+    match int(make.integers(4)):
+        case 0:
+            rotations = _walk(time, float(make.uniform(0.5, 1.2)), heading)
+        case 1:
+            rotations = _squat(time, float(make.uniform(0.4, 1.0)), heading)
+        case _:
+            rotations = _dance(time, make, heading)
+    return _grounded_motion(body, rotations, num_frames)
+
+
+def _walk(time: np.ndarray, extent: float, heading: float) -> _Rotations:
+    """Return the rotations of a walk at ``time`` (F,) in [0, 1]; ``heading`` in rad."""
+    swing = extent * np.sin(3 * np.pi * time)
+    lift = 0.3 - 0.3 * np.cos(3 * np.pi * time)
+    rotations = {
+        "pelvis": _axis_angle(y=np.radians(50.0) * (time - 0.5) + heading),
+        "spine2": _axis_angle(y=0.2 * swing),
+        "head": _axis_angle(y=0.5 * np.sin(2 * np.pi * time)),
+    }
+    for side, sign in _SIDES:
+        rotations |= {
+            f"{side}_hip": _axis_angle(x=-0.5 * sign * swing),
+            f"{side}_knee": _axis_angle(x=0.2 + 0.6 * np.maximum(-sign * swing, 0.0) + 0.3 * lift),
+            f"{side}_shoulder": _axis_angle(x=0.6 * sign * swing, z=-sign * 1.15),
+            f"{side}_elbow": _axis_angle(y=-sign * (0.3 + lift)),
+        }
+    return rotations
+
+
+def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
+    depth = extent * (0.5 - 0.5 * np.cos(np.pi * time))
+    rotations = {
+        "spine1": _axis_angle(x=0.35 * depth),
+        "head": _axis_angle(x=-0.3 * depth, z=0.2 * depth),
+    }
+    if heading:
+        rotations["pelvis"] = _axis_angle(y=heading)
+    for side, sign in _SIDES:
+        rotations |= {
+            f"{side}_hip": _axis_angle(x=-1.3 * depth, z=0.15 * sign * depth),
+            f"{side}_knee": _axis_angle(x=1.9 * depth),
+            f"{side}_ankle": _axis_angle(x=-0.6 * depth),
+            f"{side}_shoulder": _axis_angle(z=sign * (-1.2 + 2.1 * depth)),
+            f"{side}_elbow": _axis_angle(y=-0.4 * sign * depth),
+        }
+    return rotations
+
+
+def _dance(time: np.ndarray, make: np.random.Generator, heading: float) -> _Rotations:
+
+    def between(low: float, high: float) -> np.ndarray:
+        knots = make.uniform(low, high, _KEY_POSES)
+        return PchipInterpolator(np.linspace(0.0, 1.0, _KEY_POSES), knots)(time)
+
+    rotations = {
+        "pelvis": _axis_angle(y=heading + between(-0.5, 0.5)),
+        "spine1": _axis_angle(x=between(-0.05, 0.3), y=between(-0.2, 0.2), z=between(-0.12, 0.12)),
+        "spine2": _axis_angle(y=between(-0.2, 0.2), z=between(-0.12, 0.12)),
+        "head": _axis_angle(x=between(-0.25, 0.25), y=between(-0.6, 0.6), z=between(-0.15, 0.15)),
+    }
+    for side, sign in _SIDES:
+        bent = between(0.0, 1.0)
+        rotations |= {
+            f"{side}_hip": _axis_angle(
+                x=-0.9 * bent + 0.2, y=sign * between(0.0, 0.3), z=sign * between(0.02, 0.35)
+            ),
+            f"{side}_knee": _axis_angle(x=between(0.0, 0.3) + 0.9 * bent),
+            f"{side}_shoulder": _axis_angle(
+                x=between(-0.4, 0.4), y=-sign * between(-0.2, 0.7), z=sign * between(-1.2, 0.5)
+            ),
+            f"{side}_elbow": _axis_angle(x=between(-0.3, 0.3), y=-sign * between(0.05, 1.5)),
+        }
+    return rotations
+
+
+def _grounded_motion(body: BodyTemplate, rotations: _Rotations, num_frames: int) -> Motion:
+    """Return the motion of joints rotated by axis-angle (F, 3) or (3,), the lowest vertex always at
+    y = 0."""
+    device = body.vertices.device
+    poses = torch.zeros(num_frames, len(JOINT_NAMES), 3, device=device)
+    for name, rotation in rotations.items():
+        poses[:, JOINT_NAMES.index(name)] = torch.from_numpy(rotation).to(poses)
+    trans = torch.zeros(num_frames, 3, device=device)
+    exact = body.to(dtype=torch.float64)
+    for frame, pose in enumerate(poses.double()):
+        trans[frame, 1] = (
+            -posed_vertices(
+                exact, pose[None], torch.zeros(1, 3, dtype=torch.float64, device=device)
+            )[0, :, 1]
+            .min()
+            .float()
+        )
+    return Motion(
+        poses, trans, torch.zeros(10, device=device), FPS, torch.ones(num_frames, device=device)
+    )
+
+
+def _axis_angle(
+    x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Return axis-angle vectors (F, 3) of rotations about the fixed axes z, then y, then x by
+    angles (F,), rad."""
+    angles = np.stack(np.broadcast_arrays(np.atleast_1d(z), y, x), axis=-1)
+    return Rotation.from_euler("zyx", angles).as_rotvec()
+
+
+_PARTS = {
+    "eye": ("eye",),
+    "head": ("neck", "head", "jaw"),
+    "torso": ("pelvis", "spine", "collar"),
+    "arm": ("shoulder",),
+    "forearm": ("elbow",),
+    "hand": ("wrist", "index", "middle", "pinky", "ring", "thumb"),
+    "leg": ("hip", "knee"),
+    "shoe": ("ankle", "foot"),
+}
+"""The joints of each part of the body, without side and number."""
+_BELOW_KNEE = -0.36  # height at which shorts end in T-pose, m
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """Clothes and hair of a person in T-pose, and the person's size."""
+
+    palette: dict[str, np.ndarray]  # sRGB values (3,) by name of cloth or part of the body
+    pitch: float = 1.0  # width of stripes and checks, relative to 0.05 m
+    upright: bool = False  # whether the stripes on the front are vertical
+    long_sleeves: bool = False  # whether sleeves and legs reach the hands and shoes
+    long_legs: bool = True
+    shirt: float = 0.0  # of these the largest offset from the skin, m
+    trousers: float = 0.0
+    hair: float = 0.0
+    folds: float = 20.0  # spatial frequency, radians per metre
+    size: float = 1.0  # of the person, relative to the template
+
+
+def random_outfit(seed: int, is_usual: bool = False) -> Outfit:
+    """Return the outfit of ``seed``. 0 is the bare template, painted; others have clothes with
+    offsets of up to 4 cm, differ in cut and pattern, and are 0.88 to 1.04 times as tall.
+
+    ``is_usual``: left mostly as right, back as front, bare hands; else all of these differ, to show
+    what is mixed up.
+    """
+    palette = _palette(seed)
+    if is_usual:
+        palette = _usual(palette, np.random.default_rng([seed, 4]))
+    if seed == 0:
+        return Outfit(palette)
+    make = np.random.default_rng([seed, 1])
+    return Outfit(
+        palette,
+        pitch=float(make.uniform(0.7, 2.5)),
+        upright=bool(make.uniform() < 0.5),
+        long_sleeves=bool(make.uniform() < 0.5),
+        long_legs=bool(make.uniform() < 0.7),
+        shirt=float(make.uniform(0.005, 0.04)),
+        trousers=float(make.uniform(0.005, 0.04)),
+        hair=float(make.uniform(0.005, 0.04)),
+        folds=float(make.uniform(10.0, 30.0)),
+        size=float(make.uniform(0.88, 1.04)),
+    )
+
+
+def dress_body(body: BodyTemplate, outfit: Outfit) -> BodyTemplate:
+    """Return ``body`` with the clothes as part of its surface; joints, weights and atlas stay the
+    same."""
+    vertices = body.vertices.double().cpu().numpy()
+    away = _cloth_offsets(vertices, _part_weights(body), _left_eye(body), outfit)
+    moved = vertices + away[:, None] * vertex_normals(vertices, body.faces.cpu().numpy())
+    return replace(body, vertices=torch.from_numpy(moved).to(body.vertices))
+
+
+def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
+    """Return the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64; left and right, front
+    and back differ.
+
+    Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is
+    correct. The template is in T-pose, with texture coordinates and the 55 joints of SMPL-X;
+    ``resolution`` is S. Raises DyngsError: the template has no texture coordinates.
+    """
+    texture_coordinates(body)  # raises where there are none
+    fragments, nearest = _covered(body.uv, body.uv_faces, resolution)
+    around = body.faces.cpu().numpy()[fragments.faces]
+    points = interpolate(fragments.barycentric, body.vertices.double().cpu().numpy()[around])
+    parts = interpolate(fragments.barycentric, _part_weights(body)[around]).argmax(axis=1)
+    texture = np.zeros((resolution * resolution, 3))
+    texture[fragments.index] = _painted(
+        points, np.array(list(_PARTS))[parts], _left_eye(body), outfit
+    )
+    return texture[nearest]
+
+
+@lru_cache(maxsize=1)  # people of a set share one atlas
+def _covered(uv: Tensor, uv_faces: Tensor, resolution: int) -> tuple[Fragments, np.ndarray]:
+    """Return the texels that the atlas covers, and of every texel the number (S, S) of the nearest
+    one covered."""
+    columns, rows = texel_coordinates(uv.double().cpu().numpy(), resolution)
+    corners = np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces.cpu().numpy()]
+    fragments = rasterize(corners, resolution, resolution)
+    is_bare = np.ones(resolution * resolution, dtype=bool)
+    is_bare[fragments.index] = False
+    near = distance_transform_edt(
+        is_bare.reshape(resolution, -1), return_distances=False, return_indices=True
+    )
+    row, column = np.asarray(near)
+    return fragments, row * resolution + column
+
+
+def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
+    """Return texture coordinates (U, 2), float64, and the triangles (T, 3) that index them.
+
+    Raises DyngsError: the template has none.
+    """
+    if body.uv is None or body.uv_faces is None:
+        raise DyngsError(
+            f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas"
+        )
+    return body.uv.double().cpu().numpy(), body.uv_faces.cpu().numpy()
+
+
+def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return column and row (U,) of ``uv`` (U, 2) in a texture, whole numbers at texel centres."""
+    return uv[:, 0] * resolution - 0.5, (1.0 - uv[:, 1]) * resolution - 0.5
+
+
+def _left_eye(body: BodyTemplate) -> np.ndarray:
+    return body.joints[JOINT_NAMES.index("left_eye")].double().cpu().numpy()
+
+
+def _part_weights(body: BodyTemplate) -> np.ndarray:
+    """Return the weights (M, 8) of each vertex for the parts of ``_PARTS``; rows sum to 1."""
+    bases = [
+        name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINT_NAMES
+    ]
+    member = np.array(
+        [[base in names for names in _PARTS.values()] for base in bases], dtype=np.float64
+    )
+    return body.weights.double().cpu().numpy() @ member
+
+
+def _cloth_offsets(
+    vertices: np.ndarray, part_weights: np.ndarray, eye: np.ndarray, outfit: Outfit
+) -> np.ndarray:
+    """Return the offsets (M,) of clothes and hair from the skin along the normal, m."""
+    x, y, z = vertices.T
+    of = dict(zip(_PARTS, part_weights.T, strict=True))
+    waist = _smoothstep((y - 0.1) / 0.08)
+    below = _smoothstep((_BELOW_KNEE - y) / 0.06)
+    sleeves = of["arm"] + (of["forearm"] if outfit.long_sleeves else 0.0)
+    legs = of["leg"] * (1.0 if outfit.long_legs else 1.0 - below) + of["torso"] * (1.0 - waist)
+    legs = legs * _smoothstep(np.abs(x) / 0.05) * (0.5 + 0.5 * _smoothstep(-y / 0.6))
+    scalp = of["head"] * np.maximum(
+        _smoothstep((y - eye[1] - 0.03) / 0.04), _smoothstep((-0.02 - z) / 0.04)
+    )
+    scalp = scalp * _smoothstep((y - eye[1] + 0.1) / 0.06)
+    folds = 0.8 + 0.2 * np.sin(outfit.folds * (y + 0.5 * x) + 4.0 * np.arctan2(z, np.abs(x) - 0.1))
+    return (
+        folds * (outfit.shirt * (of["torso"] * waist + sleeves) + outfit.trousers * legs)
+        + outfit.hair * scalp
+    )
+
+
+def _smoothstep(x: np.ndarray) -> np.ndarray:
+    x = x.clip(0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def _palette(seed: int) -> dict[str, np.ndarray]:
+    """Return sRGB values (3,) by name of cloth or part: well separated hues in an order that
+    ``seed`` chooses."""
+    make = np.random.default_rng(seed)
+    names = (
+        "shirt",
+        "stripe",
+        "back",
+        "left_leg",
+        "right_leg",
+        "left_hand",
+        "right_hand",
+        "left_shoe",
+        "right_shoe",
+    )
+    hues = (make.permutation(len(names)) + make.uniform()) / len(names)
+    values = {"shirt": 0.85, "stripe": 0.95, "back": 0.6, "left_leg": 0.6, "right_leg": 0.75}
+    colors = {
+        name: np.array(colorsys.hsv_to_rgb(hue, make.uniform(0.55, 0.85), values.get(name, 0.9)))
+        for name, hue in zip(names, hues, strict=True)
+    }
+    skin = make.uniform(0.35, 0.9)
+    hair = make.uniform(0.1, 0.5)
+    return colors | {
+        "skin": skin * np.array([1.0, 0.8, 0.68]),
+        "hair": hair * np.array([1.0, 0.75, 0.5]),
+    }
+
+
+def _usual(palette: dict[str, np.ndarray], make: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return the palette of clothes that a person would wear: half of the shirts are of one colour,
+    colours are less saturated and of any lightness, and one shirt in five has another back."""
+    names = ("shirt", "stripe", "back", "left_leg", "left_shoe")
+    muted = {
+        name: make.uniform(0.25, 1.1) * (palette[name] + make.uniform(0.0, 1.5) * 0.5) / 1.5
+        for name in names
+    }
+    muted = {name: color.clip(0.03, 0.97) for name, color in muted.items()}
+    if make.uniform() < 0.5:
+        muted["stripe"] = muted["shirt"]
+    if make.uniform() < 0.8:
+        muted["back"] = muted["shirt"]
+    sides = {f"right_{part}": muted[f"left_{part}"] for part in ("leg", "shoe")}
+    muted["cuff"] = muted["stripe"]
+    return palette | muted | sides | {f"{side}_hand": palette["skin"] for side in ("left", "right")}
+
+
+def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outfit) -> np.ndarray:
+    """Return the colours (P, 3) of ``points`` (P, 3) in T-pose, m, by ``part`` (P,); ``eye`` (3,)
+    is the left eye."""
+    x, y, z = points.T
+    is_left = x > 0
+    is_front = z > -0.02
+    side = np.abs(x)
+    palette = outfit.palette
+    pitch = outfit.pitch
+
+    def either(name: str) -> np.ndarray:
+        return np.where(is_left[:, None], palette[f"left_{name}"], palette[f"right_{name}"])
+
+    def striped(
+        along: np.ndarray, width: float, first: np.ndarray, second: np.ndarray
+    ) -> np.ndarray:
+        return np.where((np.floor(along / (width * pitch)) % 2 == 0)[:, None], first, second)
+
+    def disc(center_x: float, center_y: float, radius: float) -> np.ndarray:
+        return is_front & (np.hypot(x - center_x, y - center_y) < radius)
+
+    rgb = np.broadcast_to(palette["skin"], points.shape).copy()
+    is_head, is_torso, is_leg = (part == name for name in ("head", "torso", "leg"))
+    white = np.full(3, 0.95)
+    black = np.full(3, 0.08)
+    red = np.array([0.75, 0.1, 0.1])
+    shirt = palette["shirt"]
+    stripe = palette["stripe"]
+    back = palette["back"]
+    checks = 0.65 + 0.35 * ((np.floor(y / (0.06 * pitch)) + np.floor(z / (0.06 * pitch))) % 2)
+    trousers = checks[:, None] * either("leg")
+    ahead, behind = (x, y) if outfit.upright else (y, x)
+    torso = np.where(
+        is_front[:, None], striped(ahead, 0.05, shirt, stripe), striped(behind, 0.06, back, stripe)
+    )
+    sleeves = np.where(
+        is_left[:, None],
+        striped(side, 0.05, shirt, stripe),
+        striped(side, 0.08, back, palette.get("cuff", white)),
+    )
+    is_sleeve = (part == "arm") | ((part == "forearm") & outfit.long_sleeves)
+    is_leg = is_leg & (outfit.long_legs | (y > _BELOW_KNEE))
+    for where, colors in (
+        (is_torso, torso),
+        (is_torso & disc(0.09, 0.47, 0.05), white),
+        (is_torso & (y < 0.18), black),
+        (is_leg | (is_torso & (y < 0.14)), trousers),
+        (is_sleeve, sleeves),
+        ((part == "forearm") & is_left & (np.abs(side - 0.62) < 0.03), black),
+        (part == "hand", either("hand")),
+        (part == "shoe", either("shoe")),
+        (is_head & ((y > eye[1] + 0.05) | (~is_front & (y > eye[1] - 0.06))), palette["hair"]),
+        (is_head & (disc(eye[0], eye[1], 0.02) | disc(-eye[0], eye[1], 0.02)), black),
+        (part == "eye", white),
+        (is_head & (np.hypot(x / 2.5, y - eye[1] + 0.075) < 0.011) & (z > 0.05), red),
+        (is_head & disc(eye[0] + 0.012, eye[1] - 0.042, 0.014), palette["left_hand"]),
+    ):
+        rgb[where] = colors[where] if colors.ndim == 2 else colors
+    return rgb
+
 
 _RADIUS = 3.5  # radius of the ring of cameras, m
 # of a ring that a seed chooses: cameras lie up to so far above or below its height, m
@@ -71,14 +519,14 @@ class HumanOptions:
     num_cameras: int = 8  # training cameras, on a ring around the person
     # test cameras, each midway between two training cameras; 0: neither test nor ``pose``
     num_test: int = 2
-    # of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the
+    # of the outfit, see ``dyngs.human.synthetic.capture.random_outfit``; the same seed gives the
     # same bytes
     seed: int = 0
     samples: int = 2  # per side of a pixel
     body_seed: int | None = None  # of the person's body shape; None: the template's own
     # of the direction, strength and tint of the light; None: always the same
     light_seed: int | None = None
-    # of the clips, see ``dyngs.human.synthetic.clips.random_clip``; None: a walk, then a squat
+    # of the clips, see ``dyngs.human.synthetic.capture.random_clip``; None: a walk, then a squat
     clip_seed: int | None = None
     # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
     usual_clothes: bool = False
@@ -418,3 +866,77 @@ def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     upper = (1 - x) * texture[top, left] + x * texture[top, right]
     lower = (1 - x) * texture[below, left] + x * texture[below, right]
     return (1 - y) * upper + y * lower
+
+
+SHARD = 100
+"""People in a folder."""
+_MOST = 10**6  # People of one seed, so that those of two seeds share nothing
+
+
+@dataclass(frozen=True)
+class PeopleOptions:
+    """Options of a set of synthetic people."""
+
+    people: int = 100
+    size: int = 256  # width and height of the images, px
+    cameras: int = 24  # on a ring around each person
+    frames: int = 1  # of a clip of each person
+    seed: int = 0  # people of different seeds have no body, outfit, clip, light or ring in common
+
+
+def write_people(
+    out: Path, options: PeopleOptions = PeopleOptions(), report: ReportProgress = report_nothing
+) -> Path:
+    """Write people as ``out/SHARD/PERSON``, captures of ``write_human_capture`` with depth maps and
+    key points.
+
+    Every person has a body, an outfit, a clip, a light and a ring of cameras of their own; every
+    other one wears usual clothes. The same options give the same bytes. One person is in memory at
+    a time. Where ``out`` holds people of the same options already, the missing ones are added: a
+    set may be written in parts, and trained on meanwhile. Raises DyngsError: options out of range,
+    or a folder that holds something else.
+    """
+    if not (
+        1 <= options.people <= _MOST and min(options.size, options.cameras, options.frames) >= 1
+    ):
+        raise DyngsError(
+            f"people need size, cameras and frames of at least 1, and be 1 to {_MOST:,}"
+        )
+    if options.seed < 0:
+        raise DyngsError("people need a seed of at least 0")
+    _begin(out, {name: value for name, value in asdict(options).items() if name != "people"})
+    for number in range(options.people):
+        person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
+        if not person.is_dir():
+            write_human_capture(person, person_options(options, number))
+        report("people", number + 1, options.people)
+    return out
+
+
+def _begin(out: Path, made_with: dict[str, int]) -> None:
+    """Write that people in ``out`` are made with these options, or check that they were."""
+    mark = out / PEOPLE_FILE
+    text = json.dumps(made_with) + "\n"
+    if not mark.is_file():
+        require_new_folder(out)
+        write_text(mark, text)
+    elif mark.read_text(encoding="utf-8", errors="replace") != text:
+        raise DyngsError(
+            f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same"
+        )
+
+
+def person_options(options: PeopleOptions, number: int) -> HumanOptions:
+    """Return the options of the person ``number``, from 0."""
+    seed = options.seed * _MOST + number + 1  # 0 would be the bare template
+    person = HumanOptions(
+        size=options.size,
+        num_frames=options.frames,
+        num_new=0,
+        num_cameras=options.cameras,
+        num_test=0,
+        usual_clothes=number % 2 == 1,
+        ring_seed=seed,
+        with_truth=True,
+    )
+    return varied(person, seed)

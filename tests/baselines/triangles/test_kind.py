@@ -25,8 +25,7 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.models.views import training_cameras
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
-from dyngs.study.variant_runs import VariantRuns
-from dyngs.study.variants import Variant
+from dyngs.study.variants import Variant, VariantRuns
 from dyngs.training.new_trainer import build
 
 STEPS = ["train.steps=120", "train.save_every=60"]

@@ -11,14 +11,16 @@ import pytest
 
 from dyngs.capture.inspection.report import inspect_capture
 from dyngs.data.synthetic.captures import (
+    CAMERA_ANGLE_X,
     POINTS_PER_THING,
     DynamicOptions,
+    SceneName,
     orbit_cameras,
+    render_things,
+    scene_at,
     true_tracks,
     write_dynamic_capture,
 )
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, render_things
-from dyngs.data.synthetic.scenes import SceneName, scene_at
 
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
 TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_val=2, num_cameras=3, samples=1)

@@ -14,8 +14,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.tracks import read_true_tracks
-from dyngs.human.synthetic.keypoints import KEYPOINTS_FILE, NUM_KEYPOINTS
-from dyngs.human.synthetic.people import PeopleOptions, write_people
+from dyngs.human.synthetic.capture import KEYPOINTS_FILE, NUM_KEYPOINTS, PeopleOptions, write_people
 
 SMALL = PeopleOptions(people=2, size=64, cameras=3)
 

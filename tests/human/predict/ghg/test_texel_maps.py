@@ -14,7 +14,7 @@ from dyngs.core.camera import Cameras
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.loader import Image
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
+from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate, posed_vertices
@@ -29,8 +29,12 @@ from dyngs.human.predict.ghg.network import (
     colours_nearby,
     observe_texels,
 )
-from dyngs.human.synthetic.capture import PosedMesh, render_mesh
-from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
+from dyngs.human.synthetic.capture import (
+    PosedMesh,
+    render_mesh,
+    texel_coordinates,
+    texture_coordinates,
+)
 
 
 @cache

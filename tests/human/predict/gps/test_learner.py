@@ -28,7 +28,7 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.predict.gps.learner import learner, predictor
 from dyngs.human.predict.gps.rectification import neighbours
-from dyngs.human.synthetic.people import PeopleOptions, write_people
+from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.training.prediction import network_trainer
