@@ -17,8 +17,13 @@ from scipy import ndimage
 from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, shrunk
 from dyngs.core.errors import DyngsError, show
 from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
-from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
-from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.images.images import (
+    SUFFIXES,
+    area_downscale_uint8,
+    files_in,
+    read_image,
+    target_size,
+)
 from dyngs.data.times import evenly_spaced
 from dyngs.io.write import write_image
 
@@ -67,8 +72,6 @@ class Separation:
     """How well masks separate a person from the background.
 
     Attributes:
-        contrast: median difference from the background inside the masks, in its standard
-            deviations.
         on_edges: fraction of the masks' outlines along which the image changes more than the
             background does: outlines of who is there are edges of the image, outlines of who has
                 left are edges of the background.
@@ -77,7 +80,6 @@ class Separation:
             frames: somebody stands there so long that the background may be a part of them.
     """
 
-    contrast: float
     on_edges: float
     area: float
     staying: float
@@ -188,7 +190,6 @@ def _moves(images: np.ndarray) -> bool:
 def separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
     """Return how well masks (F, H, W) bool separate what is in images (F, H, W, 3) uint8 from the
     background."""
-    inside = []
     on_edges = []
     slope = _slope(background.colours)
     for image, mask in zip(images, masks, strict=True):
@@ -196,14 +197,13 @@ def separation(background: Background, images: np.ndarray, masks: np.ndarray) ->
             ndimage.binary_erosion(mask, border_value=1)
         )
         if outline.any():
-            inside.append(np.median(_difference(background, image)[mask]))
             on_edges.append(float((_slope(image.astype(np.float32)) > slope)[outline].mean()))
-    if not inside:
-        return Separation(0.0, 0.0, 0.0, 0.0)
+    if not on_edges:
+        return Separation(0.0, 0.0, 0.0)
     often = masks.mean(0) > OFTEN
     staying = float((masks & often).sum() / masks.sum())
     area = float(np.median(masks.mean((1, 2))))
-    return Separation(float(np.median(inside)), float(np.mean(on_edges)), area, staying)
+    return Separation(float(np.mean(on_edges)), area, staying)
 
 
 def _difference(background: Background, image: np.ndarray) -> np.ndarray:
@@ -273,7 +273,7 @@ def with_background_masks(
 
     Args:
         empty: an image without the person, or a folder of one for each camera, whose name ends in
-            the camera's number (or is that of any image of it); None: the median over time.
+            the camera's number; None: the median over time.
     """
     cameras = _fixed_cameras(capture)
     plates = {} if empty is None else _plates(empty, cameras)
@@ -297,7 +297,7 @@ def with_background_masks(
     if worst is not None:
         say(
             f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
-            f"images, the person differs by {worst.contrast:.0f} times the noise and covers {worst.area:.1%} of them"
+            f"images, the person covers {worst.area:.1%} of them"
         )
     splits = each_view(
         capture.splits, lambda view: replace(view, silhouette=silhouettes[view.name])
@@ -334,25 +334,19 @@ def _plates(empty: Path, cameras: Sequence[_Camera]) -> Mapping[int, Path]:
                 f"{empty}: is one image for {len(cameras)} cameras; give a folder with one each"
             )
         return {0: empty}
-    files = find_masks(empty) if empty.is_dir() else {}
-    if not files:
-        raise DyngsError(f"{empty}: no image of the background there")
     numbers = {
         int(found[1]): path
-        for name, path in files.items()
+        for path in files_in(empty, SUFFIXES)
         if (found := re.search(r"(\d{1,9})\D*$", path.stem))
     }
+    if not numbers:
+        raise DyngsError(f"{empty}: no image of the background there")
     plates = {}
     for index, camera in enumerate(cameras):
-        named = (mask_of(f"{view.name}{view.image_path.suffix}", files) for view in camera.views)
-        path = next(
-            (path for path in named if path is not None), numbers.get(camera.views[0].camera_id)
-        )
-        if path is None:
-            raise DyngsError(
-                f"{empty}: no background for {camera.where}; call it {camera.views[0].camera_id}.png"
-            )
-        plates[index] = path
+        number = camera.views[0].camera_id
+        if number not in numbers:
+            raise DyngsError(f"{empty}: no background for {camera.where}; call it {number}.png")
+        plates[index] = numbers[number]
     return plates
 
 

@@ -46,6 +46,8 @@ RESOLVED_NAME = "config.yaml"
 REMOVED_KEYS: dict[tuple[str, ...], object] = {
     ("model", "loose"): False,
     ("budget", "min_fps"): None,
+    ("optim", "sparse"): False,
+    ("model", "deform", "time_resolution"): 0,
 }
 """Keys of earlier versions that configurations of runs may still have, with the value at which they
 had no effect."""

@@ -38,7 +38,6 @@ as (n - 1) / n."""
 SCATTERED = 0.5
 """Distance between cameras that follow each other in time, in medians of the distance of any two,
 from which time and viewpoint have nothing to do with each other."""
-_MAX_NAMED = 5
 # longest over shortest gap of evenly spaced times, with allowance for rounding in the files
 _EVEN = 1.1
 _DIGITS = re.compile(r"(\d+)")
@@ -446,50 +445,24 @@ def sequence_warnings(splits: Splits) -> list[str]:
     """Return warnings of images with one camera, pose and time, and of cameras with different
     numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
-    return [*_repeated(views), *_frame_counts(views)]
-
-
-def _repeated(views: list[View]) -> list[str]:
     images: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
+    frames: defaultdict[int, set[Path]] = defaultdict(set)
     for view in views:
-        images[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(
-            view.image_path, view
-        )
+        frames[view.camera_id].add(view.image_path)
+        key = (view.camera_id, view.time, view.cam_from_world.round(9).tobytes())
+        images[key].setdefault(view.image_path, view)
+    warnings = []
     doubled = [list(same.values()) for same in images.values() if len(same) > 1]
-    if not doubled:
-        return []
-    first, second = doubled[0][:2]
-    return [
-        f"{sum(map(len, doubled))} images share camera, pose and time with another one, first {first.name} and "
-        f"{second.name} at time {first.time:g}; are their times right?"
-    ]
-
-
-def _frame_counts(views: list[View]) -> list[str]:
-    cameras: defaultdict[int, list[View]] = defaultdict(list)
-    for view in views:
-        cameras[view.camera_id].append(view)
-    counts = {camera: len({view.image_path for view in seen}) for camera, seen in cameras.items()}
-    if len(set(counts.values())) < 2 or max(counts.values()) < 2:
-        return []
-    usual = max(Counter(counts.values()).items(), key=lambda item: (item[1], item[0]))[0]
-    odd = [camera for camera in sorted(counts) if counts[camera] != usual]
-    labels = _camera_labels(cameras)
-    named = ", ".join(f"{labels[camera]} has {counts[camera]}" for camera in odd[:_MAX_NAMED])
-    more = f" ({len(odd) - _MAX_NAMED} more cameras differ)" if len(odd) > _MAX_NAMED else ""
-    return [f"cameras have different numbers of frames: {named} frames, others {usual}{more}"]
-
-
-def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
-    """Name cameras for messages: by the folder if a camera has one of its own, else by number."""
-    folders = {
-        camera: {view.name.rpartition("/")[0] for view in seen} for camera, seen in cameras.items()
-    }
-    firsts = {camera: min(names) for camera, names in folders.items()}
-    own = Counter(firsts.values())
-    return {
-        camera: firsts[camera]
-        if len(folders[camera]) == 1 and own[firsts[camera]] == 1 and firsts[camera]
-        else f"camera {camera}"
-        for camera in cameras
-    }
+    if doubled:
+        first, second = doubled[0][:2]
+        warnings.append(
+            f"{sum(map(len, doubled))} images share camera, pose and time with another one, first {first.name} and "
+            f"{second.name} at time {first.time:g}; are their times right?"
+        )
+    counts = {camera: len(paths) for camera, paths in frames.items()}
+    if len(set(counts.values())) > 1:
+        few = min(counts, key=lambda camera: counts[camera])
+        warnings.append(
+            f"cameras have different numbers of frames, from {counts[few]} (camera {few}) to {max(counts.values())}"
+        )
+    return warnings

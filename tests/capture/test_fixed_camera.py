@@ -4,12 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 
 from dyngs.capture.fixed_camera import FOCAL, read_fixed_camera
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.images.images import read_image
 from dyngs.io.write import write_image
 
 
@@ -28,15 +26,6 @@ def test_frames_are_in_order_with_one_camera(tmp_path: Path) -> None:
     assert views[3].intrinsics.tolist() == [[FOCAL * 16, 0, 8], [0, FOCAL * 16, 6], [0, 0, 1]]
     assert not capture.has_alpha
     assert "guessed" in capture.warnings[0]
-
-
-def test_hdr_is_tone_mapped_in_the_cache_with_a_note(tmp_path: Path) -> None:
-    write_clip(tmp_path / "a.mp4", encoded(patches(), BT2020, HLG), (BT2020, HLG, BT2020))
-    for _ in range(2):  # decoded, and found in the cache
-        capture = read_fixed_camera(DataConfig(root=tmp_path / "a.mp4"))
-        image = read_image(capture.splits["train"][1].image_path).numpy()
-        assert np.sqrt(np.mean((image - 255 * patches()) ** 2)) < 2.5
-        assert "1 video: HLG is tone-mapped to SDR" in capture.warnings[1]
 
 
 def test_frames_are_chosen_by_number_or_evenly(

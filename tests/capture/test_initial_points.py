@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +13,6 @@ from room_surfaces import distances_to_surface
 import dyngs
 from dyngs.capture.initial_points import (
     ENOUGH,
-    OVERLAPPING,
-    TIME_STEPS,
-    clip_pairs,
     points_in_silhouettes,
     points_over_clip,
     triangulated_points,
@@ -37,37 +33,10 @@ from dyngs.data.synthetic.captures import (
 from dyngs.io.write import write_image
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A moving thing around the origin, an image from elsewhere at each time."""
-    options = DynamicOptions(size=48, num_times=10, num_cameras=1, num_val=0, num_test=1, samples=1)
-    return write_dynamic_capture("spin", tmp_path_factory.mktemp("clip") / "capture", options)
-
-
 def begin(capture: Capture, triangulate: int = 24) -> tuple[Capture, list[str]]:
     return with_first_points(
         capture, DataConfig(root=capture.root), PointsInit(triangulate=triangulate)
     )
-
-
-def shifted(root: Path, out: Path) -> Path:
-    """The same capture elsewhere, with times from 0 to 0.055."""
-    out.mkdir()
-    for folder in ("train", "test"):
-        (out / folder).symlink_to(root / folder)
-        content = json.loads((root / f"transforms_{folder}.json").read_text())
-        for frame in content["frames"]:
-            pose = np.array(frame["transform_matrix"])
-            pose[:3, 3] += (7, -3, 11)
-            frame |= {"transform_matrix": pose.tolist(), "time": 0.055 * frame["time"]}
-            frame.pop("instance_mask_path", None)
-        (out / f"transforms_{folder}.json").write_text(json.dumps(content))
-    return out
-
-
-def test_around_the_origin_random_points_stay(root: Path) -> None:
-    capture, lines = begin(read_capture(root))
-    assert (capture.points, lines) == (None, [])
 
 
 def test_real_points_are_used(shared: Path) -> None:
@@ -167,20 +136,6 @@ def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
     np.testing.assert_array_equal(again.xyz, found.xyz)
     monkeypatch.setattr("dyngs.capture.initial_points.MIN_CLIP_POINTS", len(found.xyz) + 1)
     assert points_over_clip(views, furnished) is None
-
-
-def test_pairs_of_a_clip_are_bounded(furnished: DataConfig) -> None:
-    """Near in time, or of overlapping images; and none twice."""
-    views = train_views(furnished)
-    few = [replace(views[i % len(views)], time=i / 5) for i in range(6)]
-    assert (
-        {(0, 1), (0, 2), (0, 4), (1, 5)}
-        <= set(clip_pairs(few))
-        <= {(i, j) for j in range(6) for i in range(j)}
-    )
-    many = [replace(views[i % len(views)], time=i / 39) for i in range(40)]
-    pairs = clip_pairs(many)
-    assert len(set(pairs)) == len(pairs) <= 40 * (len(TIME_STEPS) + OVERLAPPING)
 
 
 RADIUS, FOCAL, SIDE, DISTANCE = 0.4, 60.0, 64, 4.0

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.capture import initial_points, plane_sweep
+from dyngs.capture import initial_points
 from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.plane_sweep import (
     dense_points,
     points_of_depth_maps,
 )
 from dyngs.config import DataConfig, PointsInit
-from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.capture import Capture, View
 from dyngs.io.write import write_image
 
 WIDTH, HEIGHT, FOCAL, SLOPE, DISTANCE = 64, 48, 66.0, 0.3, 4.0
@@ -113,16 +113,6 @@ def test_depth_maps_in_another_unit_have_none(tmp_path: Path) -> None:
     assert points_of_depth_maps(plain, options, 1000) is None
 
 
-def test_a_still_capture_without_points_begins_with_those_of_its_depth_maps(tmp_path: Path) -> None:
-    capture = Capture(tmp_path, "polycam", {"train": tuple(_views(tmp_path))})
-    begun, lines = with_first_points(
-        capture, DataConfig(root=tmp_path), PointsInit(num_random=2000, dense=0)
-    )
-    assert lines == ["2,000 first points are from the depth maps"]
-    assert begun.points is not None
-    assert np.abs(begun.points.xyz[:, 2] - SLOPE * begun.points.xyz[:, 0]).max() < 1e-4
-
-
 def test_a_still_capture_without_any_points_is_swept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -196,22 +186,3 @@ def test_without_evidence_there_are_no_points(tmp_path: Path, fault: str) -> Non
     elif fault == "no points seen":
         sparse = SPARSE - (0, 0, 100)
     assert dense_points(views, DataConfig(root=tmp_path), sparse, 1000) is None
-
-
-def test_dense_points_join_few_sparse_ones_of_still_captures_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    views = _views(tmp_path, 4)
-    options = DataConfig(root=tmp_path)
-    points = PointCloud(SPARSE, np.full(SPARSE.shape, 128, np.uint8))
-    capture = Capture(root=tmp_path, format="colmap", splits={"train": tuple(views)}, points=points)
-    joined, lines = with_first_points(capture, options, PointsInit(dense=1000))
-    assert joined.points is not None
-    assert len(joined.points.xyz) == len(SPARSE) + 1000
-    assert np.array_equal(joined.points.xyz[: len(SPARSE)], SPARSE)
-    assert lines == ["1,000 points of depth maps were added to 60 (init.dense)"]
-    monkeypatch.setattr(plane_sweep, "MAPS", 0)  # none can be found
-    for init in (PointsInit(dense=1000), PointsInit(), PointsInit(dense=120)):
-        same, lines = with_first_points(capture, options, init)
-        assert same.points is points
-        assert not lines

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,9 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import (
     about_pelvis,
     body_frames,
-    read_body_file,
-    rows_of,
     with_fitted_body,
 )
-from dyngs.data.capture import BodyFrames, Capture, View
+from dyngs.data.capture import BodyFrames, Capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
@@ -156,21 +153,6 @@ def test_bad_parameters(change: dict[str, Any], line: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def view_of(frame: int | None) -> View:
-    return View(f"v{frame}", Path(f"{frame}.png"), np.eye(4), np.eye(3), 4, 3, frame=frame)
-
-
-def test_views_find_their_rows_by_frame() -> None:
-    body = replace(random_body(0), frames=(2, 5, 9))
-    assert rows_of(FILE, body, [view_of(9), view_of(2), view_of(9)]).tolist() == [2, 0, 2]
-    with pytest.raises(
-        DyngsError, match=r"2 frames that have images \(3, 4\).* 3 frames from 2 to 9"
-    ):
-        rows_of(FILE, body, [view_of(2), view_of(4), view_of(3), view_of(4)])
-    with pytest.raises(DyngsError, match=r"None\.png has no frame number"):
-        rows_of(FILE, body, [view_of(None)])
-
-
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     options = HumanOptions(size=16, num_frames=3, num_new=2, num_cameras=2, num_test=1, samples=1)
@@ -185,14 +167,6 @@ def write(path: Path, count: int = 3, **more: np.ndarray) -> Path:
         path, poses=np.zeros((count, 165)), trans=rows * np.ones(3), betas=np.zeros(44), **more
     )
     return path
-
-
-def test_rows_are_for_the_frames_that_the_file_names(tmp_path: Path) -> None:
-    body = read_body_file(write(tmp_path / "b.npz", frames=np.array([7, 3, 5])))
-    assert body.frames == (3, 5, 7)
-    assert body.trans[:, 0].tolist() == [1, 2, 0]
-    assert (body.shape_space, body.fitted_to) == ("smpl", "")
-    assert read_body_file(write(tmp_path / "c.npz")).frames == (0, 1, 2)
 
 
 def test_a_fit_replaces_the_bodies_of_a_capture(capture: Capture, tmp_path: Path) -> None:

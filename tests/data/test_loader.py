@@ -189,16 +189,6 @@ def test_images_given_out_on_a_gpu_are_the_same(
         assert there.bytes_on_gpu == {None: 6 * 8 * 12 * 3, 0: 0}.get(free, int(2.5 * 8 * 12 * 4))
 
 
-def test_a_damaged_image_is_reported_when_its_turn_comes(tmp_path: Path) -> None:
-    views = views_of(tmp_path, 3)
-    images = ImageLoader(views, DataConfig(root=Path()), decoding_threads=1)
-    views[2].image_path.unlink()
-    images.expect([1, 2])
-    assert images[1].name == "1"
-    with pytest.raises(DyngsError, match=r"2\.png"):
-        images[2]
-
-
 def test_mask_follows_the_image(tmp_path: Path) -> None:
     """A small pixel counts only if all that it covers counts."""
     keep = np.full((8, 12, 1), 255, np.uint8)
@@ -212,15 +202,6 @@ def test_mask_follows_the_image(tmp_path: Path) -> None:
     assert small is not None
     assert torch.nonzero(small == 0).tolist() == [[1, 2]]
     assert set(small.unique().tolist()) == {0.0, 1.0}
-
-
-def test_undistorted_image_ignores_what_the_lens_did_not_see(tmp_path: Path) -> None:
-    view = replace(views_of(tmp_path, 1, 3)[0], lens=Lens("opencv", (3.0, 0.0, 0.0, 0.0)))
-    mask = loader((view,))[0].mask
-    assert mask is not None
-    assert (mask[0, 11], mask[4, 6]) == (0, 1)
-    gentle = replace(view, lens=Lens("opencv", (-0.01, 0.0, 0.0, 0.0)))
-    assert loader((gentle,))[0].mask is None
 
 
 def test_missing_images_are_found_at_once(tmp_path: Path) -> None:

@@ -86,29 +86,12 @@ def test_two_formats_in_one_folder(nerfstudio_root: Path) -> None:
     assert read(nerfstudio_root, format="colmap").format == "colmap"
 
 
-@pytest.mark.parametrize(("every", "test"), [(8, [0, 8]), (3, [0, 3, 6, 9, 12, 15]), (0, [])])
-def test_every_nth_by_name_is_held_out(blender_root: Path, every: int, test: list[int]) -> None:
-    (blender_root / "transforms_test.json").unlink()
-    capture = read(blender_root, test_every=every)
-    everything = sorted(f"train/r_{i}" for i in range(16))
-    assert names(capture, "test") == [everything[i] for i in test]
-    assert names(capture, "train") == [name for i, name in enumerate(everything) if i not in test]
-
-
 def test_nothing_recognised_lists_what_was_looked_for(tmp_path: Path) -> None:
     with pytest.raises(DyngsError) as caught:
         read(tmp_path)
     files = ("transforms_train.json", "transforms.json", "cameras.bin", "colmap/sparse/0")
     for wanted in (*files, "dataset.json", "poses_bounds.npy", "cameras.json"):
         assert wanted in str(caught.value)
-
-
-def test_missing_images_are_a_warning_and_then_an_error_of_the_loader(colmap_root: Path) -> None:
-    (colmap_root / "images/left/03.jpg").unlink()
-    capture = read(colmap_root)
-    assert "1 of 9 images are missing" in capture.warnings[0]
-    with pytest.raises(DyngsError, match=r"left/03\.jpg"):
-        ImageLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
 
 
 def test_views_without_images_may_be_left_out(colmap_root: Path) -> None:
@@ -149,35 +132,6 @@ def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> No
     assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
     assert (capture.span, capture.seconds) == ((0.0, 0.06), None)
     assert dict(report_on(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
-
-
-def test_times_from_0_to_1_are_kept_exactly(blender_root: Path) -> None:
-    set_times(blender_root, "train", [i / 15 for i in range(16)])
-    set_times(blender_root, "test", [0.1, 0.3])
-    edit_json(blender_root / "transforms_train.json", lambda c: c.update(fps=30))
-    edit_json(blender_root / "transforms_test.json", lambda c: c["frames"].clear())
-    capture = read(blender_root)
-    assert {view.time for view in capture.splits["train"]} == {i / 15 for i in range(16)}
-    assert (capture.span, capture.seconds) == ((0.0, 1.0), pytest.approx(0.5))
-    facts = dict(report_on(capture).facts)
-    assert (facts["times"], facts["duration"]) == (
-        "16 in 0 to 1",
-        "0.5 seconds from time 0 to time 1",
-    )
-
-
-def test_seconds_of_numbered_images(tmp_path: Path) -> None:
-    write_colmap(tmp_path)
-    ordered = DataConfig(root=tmp_path, times="order", frames_per_second=10)
-    capture = read_capture(ordered)
-    assert capture.in_seconds
-    assert capture.span is not None
-    assert capture.seconds == pytest.approx(capture.span[1] - capture.span[0])
-    plain = read_capture(ordered.model_copy(update={"frames_per_second": None}))
-    assert plain.span is not None
-    assert capture.span == pytest.approx(np.array(plain.span) / 10)
-    with pytest.raises(DyngsError, match=r"frames_per_second=10 needs data\.times=order"):
-        read_capture(ordered.model_copy(update={"times": "files"}))
 
 
 def test_frames_of_any_format_with_times(blender_root: Path) -> None:
@@ -241,33 +195,6 @@ def test_real_captures(
         ImageLoader(views, DataConfig.model_validate({"root": shared / name}))
 
 
-def test_new_poses_keep_times_and_frames_of_their_own(shared: Path) -> None:
-    """They are another clip: choosing frames of the first one leaves them alone."""
-    if not (shared / "human" / "casual_m").is_dir():
-        pytest.skip("the captures of people are not here")
-    capture = read_capture(
-        DataConfig.model_validate({"root": shared / "human" / "casual_m", "frames": "0:5"})
-    )
-    assert (capture.format, capture.warnings, capture.has_alpha) == ("body_json", (), True)
-    assert {name: len(views) for name, views in capture.splits.items()} == {
-        "train": 40,
-        "test": 20,
-        "val": 0,
-        "pose": 32,
-    }
-    assert {view.time for view in capture.splits["train"]} == {0.0, 0.25, 0.5, 0.75, 1.0}
-    assert sorted({view.time for view in capture.splits["pose"]}) == pytest.approx(
-        [i / 7 for i in range(8)]
-    )
-    assert capture.body is not None
-    assert {name: len(body.frames) for name, body in capture.body.items()} == {
-        "train": 20,
-        "val": 20,
-        "test": 20,
-        "pose": 8,
-    }
-
-
 def test_a_fisheye_is_undistorted_to_the_pinhole_that_is_asked_for(tmp_path: Path) -> None:
     """A wide one shows more of what the lens saw, and leaves out of the loss what it did not
     see."""
@@ -328,18 +255,6 @@ def test_maps_come_with_the_image(tmp_path: Path) -> None:
     assert float(small.depth.min()) == 3
 
 
-def test_missing_priors_are_done_without(tmp_path: Path) -> None:
-    with_priors(tmp_path)
-    for name in ("b_depth.npy", "c_moves.png", "tracks.npz"):
-        (tmp_path / name).unlink()
-    capture = read_capture(DataConfig(root=tmp_path, test_every=0))
-    assert [view.depth_path is None for view in capture.splits["train"]] == [False, True, False]
-    assert capture.tracks_path is None
-    assert any("1 of 3 depth maps are missing" in line for line in capture.warnings)
-    assert any("1 of 3 motion masks are missing" in line for line in capture.warnings)
-    assert any("tracks.npz are missing" in line for line in capture.warnings)
-
-
 @pytest.mark.parametrize(
     "key", ["depth_file_path", "flow_file_path", "motion_mask_path", "instance_mask_path"]
 )
@@ -357,11 +272,3 @@ def test_priors_outside_the_capture_are_refused(tmp_path: Path, key: str) -> Non
     )
     with pytest.raises(DyngsError, match="outside the capture"):
         read_capture(root)
-
-
-def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
-    np.save(with_priors(tmp_path) / "b_flow.npy", np.zeros((4, 6, 2)))
-    with pytest.raises(
-        DyngsError, match=r"b_flow\.npy: the flow field is 6x4 but its image is 12x8"
-    ):
-        loaded(tmp_path)[1]

@@ -79,19 +79,6 @@ def test_smallest_copy_that_is_large_enough(
     assert wanted in line
 
 
-def test_copies_that_are_incomplete_are_not_read(root: Path) -> None:
-    (root / "images_2/1.png").unlink()
-    # another photo of that name
-    write_image(root / "images_2/2.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    write_image(root / "images_2/3.png", np.zeros((WIDTH // 2, WIDTH // 2, 3), np.uint8))
-    capture, _ = read(root, downscale=2)
-    (line,) = capture.warnings
-    assert line.startswith(
-        "images_2, images_4, images_8: not read; data.downscale=2 reads images_2 if each image has its copy"
-    )
-    assert {view.image_path.parent.name for view in capture.splits["train"]} == {"images"}
-
-
 @pytest.mark.parametrize("is_absent", [False, True])
 def test_copies_of_a_colmap_capture(tmp_path: Path, is_absent: bool) -> None:
     write_colmap(tmp_path)

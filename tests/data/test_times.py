@@ -18,7 +18,6 @@ from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.times import (
     SECONDS_FILE,
     clip_seconds,
-    distinct_times,
     hold_out_frames,
     number_cameras,
     parse_frames,
@@ -26,7 +25,6 @@ from dyngs.data.times import (
     select_frames,
     span_in_files,
     split_by_camera,
-    still_if_constant,
     times_by_name,
     unit_times,
     videos,
@@ -115,15 +113,6 @@ def test_span_and_seconds() -> None:
     numbered = train(*(replace(kept, frame=10 * i) for i, kept in enumerate(uneven["train"])))
     assert clip_seconds(numbered, 4.0) == pytest.approx(5.0)
     assert span_in_files(train(view("a", None)), train(view("a", None))) is None
-
-
-@pytest.mark.parametrize("time", [0.0, 0.25, 7.0])
-def test_constant_times_are_a_still_scene(time: float) -> None:
-    splits, notes = unit_times(ROOT, train(view("a", time), view("b", time)))
-    assert notes == []
-    still, notes = still_if_constant(splits)
-    assert times_of(still) == [None, None]
-    assert notes == [f"all images have time {time:g}: treated as a static scene"]
 
 
 def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View, ...]]:
@@ -287,20 +276,6 @@ def test_times_are_counted_over_all_splits() -> None:
     assert kept["train"][1].time == kept["test"][0].time
 
 
-def test_a_hair_apart_is_one_time() -> None:
-    """Also where rounding to decimals would part them; the distance to the neighbour counts."""
-    times = [0.0, 0.5, 0.5000004, 0.5000008, 0.500003, 1.0]
-    assert list(distinct_times(splits(times, [])["train"]).values()) == [
-        0.0,
-        0.5,
-        0.5,
-        0.5,
-        0.500003,
-        1.0,
-    ]
-    assert len(select_frames(ROOT, splits(times, []), "1:2")["train"]) == 3
-
-
 def filmed(camera: int, split: Split) -> dict[Split, tuple[View, ...]]:
     """A camera at five times."""
     views = (_at(f"c{camera}/{i}", i / 4) for i in range(5))
@@ -312,32 +287,6 @@ def test_held_out_frames_are_a_clip_of_their_own(frames: str) -> None:
     kept, held = hold_out_frames(ROOT, filmed(0, "train"), frames)
     assert [(v.name, v.time) for v in kept["train"]] == [("c0/0", 0), ("c0/1", 0.5), ("c0/2", 1)]
     assert [(v.name, v.time) for v in held] == [("c0/3", 0), ("c0/4", 1)]
-
-
-def test_held_out_frames_are_seen_from_the_test_cameras_if_there_are_any() -> None:
-    splits = filmed(0, "train") | filmed(1, "test")
-    kept, held = hold_out_frames(ROOT, splits, "1::2")
-    assert [v.name for v in held] == ["c1/1", "c1/3"]
-    assert [v.name for v in kept["train"]] == ["c0/0", "c0/2", "c0/4"]
-    assert [v.name for v in kept["test"]] == ["c1/0", "c1/2", "c1/4"]
-    mixed: dict[Split, tuple[View, ...]] = {
-        "train": splits["train"][:4],
-        "test": splits["train"][4:],
-    }
-    assert [v.name for v in hold_out_frames(ROOT, mixed, "3:")[1]] == ["c0/3", "c0/4"], "one camera"
-
-
-@pytest.mark.parametrize(
-    ("frames", "message"),
-    [
-        (":", "leaves no training views"),
-        ("9:", "picks none of the capture's 5 times"),
-        ("3", "data.pose_frames='3': write"),
-    ],
-)
-def test_frames_that_cannot_be_held_out(frames: str, message: str) -> None:
-    with pytest.raises(DyngsError, match=message):
-        hold_out_frames(ROOT, filmed(0, "train"), frames)
 
 
 def test_cameras_that_are_trained_on() -> None:
@@ -381,10 +330,6 @@ def test_other_names_are_in_natural_order() -> None:
     times, line = _times("shot9-a", "shot10-a", "shot1-a")
     assert times == {"shot1-a": 0, "shot9-a": 1, "shot10-a": 2}
     assert "shot1-a first" in line
-
-
-def test_the_same_number_twice_is_no_time() -> None:
-    assert _times("a_1", "b_1", "c_1")[0] == {"a_1": 0, "b_1": 1, "c_1": 2}
 
 
 def test_a_frame_rate_makes_seconds_of_numbers() -> None:

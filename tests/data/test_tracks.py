@@ -37,21 +37,6 @@ def test_rows_are_found_by_the_names_of_views(tmp_path: Path) -> None:
     assert tracks.xy[2, 1].tolist() == [10, 11]
 
 
-@pytest.mark.parametrize(
-    ("changes", "word"),
-    [
-        ({"visible": np.ones((2, 2))}, r"visible \(F, P\)"),
-        ({"xy": np.ones((3, 2))}, r"xy \(F, P, 2\)"),
-        ({"names": np.arange(3)}, "of text"),
-        ({"names": np.array(["a", "b", "a"])}, "more than once"),
-        ({"names": None}, "names"),
-    ],
-)
-def test_arrays_that_do_not_fit(tmp_path: Path, changes: dict[str, Any], word: str) -> None:
-    with pytest.raises(DyngsError, match=rf"a\.npz.*{word}"):
-        read_tracks(write(tmp_path / "a.npz", **changes))
-
-
 def some_tracks() -> TrueTracks:
     random = np.random.default_rng(0)
     points = random.normal(size=(3, 4, 3)).astype(np.float32)

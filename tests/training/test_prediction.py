@@ -14,7 +14,7 @@ from dyngs.api.train import train
 from dyngs.core.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
 from dyngs.training.new_trainer import build
-from dyngs.training.prediction import rate_at
+from dyngs.training.prediction import NetworkTrainer, rate_at
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,7 @@ def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_pa
     """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the
     next step is good."""
     trainer = build(config(folder, tmp_path))
+    assert isinstance(trainer, NetworkTrainer)
     trainer.step()
     for count, factor in enumerate((1e25, float("nan")), 1):
         before = {name: x.clone() for name, x in trainer.learner.network.state_dict().items()}

@@ -96,16 +96,12 @@ def _kept(views: Sequence[View]) -> str:
         100 * kept_fraction(view.lens, view.intrinsics, view.width, view.height)
         for view in distorted
     ]
-    ratios = [view.lens.focal_ratio for view in distorted]
-    if max(ratios) > 1:
-        how = f"to a pinhole with {_range([1 / ratio for ratio in ratios])} of the focal length"
-    else:
-        how = "with the same focal length"
-    more = (
-        " (data.undistort=wide keeps more)"
-        if max(ratios) == 1 and min(fractions) < MUCH_LOST
-        else ""
-    )
+    shorter = [1 / view.lens.focal_ratio for view in distorted]
+    how = "with the same focal length"
+    more = " (data.undistort=wide keeps more)" if min(fractions) < MUCH_LOST else ""
+    if min(shorter) < 1:
+        how = f"to a pinhole with {_range(shorter)} of the focal length"
+        more = ""
     return f"; undistorted {how}, which keeps {_range(fractions)} % of each image{more}"
 
 
@@ -116,15 +112,9 @@ def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
     if not known:
         return []
     factor = max(known) / min(known)
-    said = f"by EXIF tags of {len(known)} of {len(views)} images, "
-    if factor < SAME_LIGHT:
-        return [("exposure", f"{said}the same")]
-    return [
-        (
-            "exposure",
-            f"{said}up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters",
-        )
-    ]
+    light = f"up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters"
+    light = "the same" if factor < SAME_LIGHT else light
+    return [("exposure", f"by EXIF tags of {len(known)} of {len(views)} images, {light}")]
 
 
 def _prior_facts(capture: Capture) -> Iterator[tuple[str, str]]:
@@ -258,6 +248,8 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras are
     left out.
     """
+    from PIL import Image, ImageDraw, ImageFont
+
     Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
     poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in views])
@@ -270,59 +262,31 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     extent = max(float((high - low).max()) * 1.2, 1e-6)
     depth = extent * min(0.08, 0.4 / len(poses) ** 0.5)
     panels = []
-    for title, horizontal, vertical in (("from above", 0, 1), ("from the side", 0, 2)):
-        shown = [horizontal, vertical]
+    for title, shown in (("from above", [0, 1]), ("from the side", [0, 2])):
+        image = Image.new("RGB", (2 * size, 2 * size), BACKGROUND)  # at twice its size
+        draw = ImageDraw.Draw(image)
         middle = 0.5 * (low + high)[shown]
-        panel = _Panel(size, axes[shown], middle, extent)
-        panel.draw_points(xyz, rgb)
+
+        def places(points: np.ndarray, at: list[int] = shown, middle: np.ndarray = middle) -> list:
+            """Return columns and rows of world points (P, 3); they may lie outside the panel."""
+            flat = np.clip((points @ axes[at].T - middle) / extent + 0.5, -10.0, 10.0)
+            return ((flat * (1, -1) + (0, 1)) * (2 * size - 1)).tolist()
+
+        for (x, y), colour in zip(places(xyz), np.maximum(rgb, 60).tolist(), strict=True):
+            draw.rectangle((x, y, x + 1, y + 1), fill=tuple(colour))
         for (split, view), pose in zip(views, poses, strict=True):
-            panel.draw_frustum(view, pose, depth, SPLIT_COLORS[split])
-        panels.append(panel.finished(title))
+            corners = np.array(
+                [[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]]
+            )
+            rays = np.c_[corners, np.ones(4)] @ np.linalg.inv(view.intrinsics).T
+            rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
+            frustum = np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3]
+            tips = [tuple(place) for place in places(frustum)]
+            line = [tips[i] for i in (0, 1, 2, 3, 4, 1, 2, 0, 3, 4, 0)]
+            draw.line(line, fill=SPLIT_COLORS[split], width=2)
+        draw.text((16, 12), title, fill=(204, 204, 204), font=ImageFont.load_default(28))
+        panels.append(np.asarray(image.resize((size, size))))
     write_image(out, np.concatenate(panels, axis=1))
-
-
-class _Panel:
-    """One square of the plot, drawn at twice its size: ``extent`` units around ``center`` (2,),
-    axes (2, 3)."""
-
-    def __init__(self, size: int, axes: np.ndarray, center: np.ndarray, extent: float) -> None:
-        from PIL import Image, ImageDraw
-
-        self._size, self._axes, self._center, self._extent = size, axes, center, extent
-        self._image = Image.new("RGB", (2 * size, 2 * size), BACKGROUND)
-        self._draw = ImageDraw.Draw(self._image)
-
-    def draw_points(self, xyz: np.ndarray, rgb: np.ndarray) -> None:
-        for (x, y), colour in zip(self._places(xyz), np.maximum(rgb, 60).tolist(), strict=True):
-            self._draw.rectangle((x, y, x + 1, y + 1), fill=tuple(colour))
-
-    def draw_frustum(
-        self, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]
-    ) -> None:
-        """Draw lines from the camera's centre to the corners of its image, and the image's border,
-        ``depth`` away."""
-        corners = np.array(
-            [[0, 0, 1], [view.width, 0, 1], [view.width, view.height, 1], [0, view.height, 1]],
-            float,
-        )
-        rays = corners @ np.linalg.inv(view.intrinsics).T
-        rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
-        tips = self._places(np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3])
-        self._draw.line([tips[i] for i in (0, 1, 2, 0, 3, 4, 0)], fill=color, width=2)
-        self._draw.line([tips[i] for i in (2, 3)], fill=color, width=2)
-        self._draw.line([tips[i] for i in (4, 1)], fill=color, width=2)
-
-    def finished(self, title: str) -> np.ndarray:
-        """Return the (S, S, 3) uint8 panel with its title at the upper left."""
-        from PIL import ImageFont
-
-        self._draw.text((16, 12), title, fill=(204, 204, 204), font=ImageFont.load_default(28))
-        return np.asarray(self._image.resize((self._size, self._size)))
-
-    def _places(self, points: np.ndarray) -> list[tuple[float, float]]:
-        """Return columns and rows of world points (P, 3); they may lie outside the panel."""
-        flat = np.clip((points @ self._axes.T - self._center) / self._extent + 0.5, -10.0, 10.0)
-        return [(x, y) for x, y in ((flat * (1, -1) + (0, 1)) * (2 * self._size - 1)).tolist()]
 
 
 def _drawing_axes(poses: np.ndarray) -> np.ndarray:

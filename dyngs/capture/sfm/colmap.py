@@ -3,8 +3,6 @@ in."""
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +13,6 @@ from dyngs.capture.sfm.photos import Photo
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.io.containment import MAX_MEGAPIXELS
-from dyngs.io.lock import LOCK_NAME, writing
 from dyngs.io.write import write_text
 
 if TYPE_CHECKING:
@@ -173,43 +170,3 @@ def quiet_colmap() -> Iterator[None]:
         ) from error
     finally:
         pycolmap.logging.minloglevel = level
-
-
-_KEY = "task.txt"
-
-
-@contextmanager
-def working(out: Path, task: str) -> Iterator[Path]:
-    """Yield the hidden work folder next to ``out``, which holds what a stopped run of the same task
-    has done.
-
-    It is removed when the block ends, and when it raises an error of ours: what failed once fails
-    again. It stays where the user or the system stops the program. ``task``: images and options in
-    words; a folder of another task is emptied first. Raises DyngsError: another process works
-    there; it cannot be made.
-    """
-    work = out.parent / f".{out.name}.sfm"
-    if work.is_symlink():
-        raise DyngsError(f"{work}: is a link; remove it")
-    with writing(work):
-        key = work / _KEY
-        try:
-            work.chmod(0o700)
-            if not key.is_file() or key.read_text(encoding="utf-8") != task:
-                _empty(work)
-                write_text(key, task)
-            yield work
-        except (DyngsError, OSError):
-            shutil.rmtree(work, ignore_errors=True)
-            raise
-        shutil.rmtree(work, ignore_errors=True)
-
-
-def _empty(work: Path) -> None:
-    for entry in os.scandir(work):
-        if entry.name == LOCK_NAME:
-            continue
-        if entry.is_dir(follow_symlinks=False):
-            shutil.rmtree(entry.path)
-        else:
-            os.unlink(entry.path)

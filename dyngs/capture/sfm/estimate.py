@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from dyngs.capture.sfm.colmap import (
     incremental_options,
     match_listed,
     quiet_colmap,
-    working,
 )
 from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
 from dyngs.capture.sfm.matches import (
@@ -35,7 +33,7 @@ from dyngs.capture.sfm.matches import (
     parallax_of,
     without_movers,
 )
-from dyngs.capture.sfm.photos import Photo, copied, digest_of, gather_photos, lay_out
+from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.images.images import read_header
@@ -49,8 +47,8 @@ from dyngs.data.images.video import (
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import write_seconds
 from dyngs.io.containment import images_up_to, inside, staying_within
-from dyngs.io.fields import first_few, read_json_object
-from dyngs.io.outputs import require_new_folder
+from dyngs.io.fields import first_few
+from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
 
 if TYPE_CHECKING:
@@ -58,7 +56,6 @@ if TYPE_CHECKING:
 
 _NUM_FRAMES = 100
 _SMALL_ANGLE_DEG = 1.0
-_FEWEST_MATCHED = 3
 _MOVING_FRACTION = 0.02
 # parallax, as a fraction of the longest side and in pixels, below which the camera did not move,
 # and below which it hardly moved
@@ -122,40 +119,29 @@ def estimate_poses(
     ``out/sparse/0``).
 
     Work is done in a hidden folder next to ``out``; it is renamed at the end, so ``out`` is
-    complete or absent. A stopped run leaves that folder, and the next one with the same images and
-    options goes on with its features and matches. Of several models the one with most images is
-    kept. Raises DyngsError: too few images, an ``out`` in use, a camera that stands still or only
-    rotates, or nothing could be registered, with advice.
+    complete or absent. Of several models the one with most images is kept. Raises DyngsError: too
+    few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
+    registered, with advice.
 
     Args:
         source: a folder of photos (subfolders included) or a video file.
         out: a folder that does not exist, or is empty.
     """
-    require_new_folder(out)
     if not source.exists():
         raise DyngsError(f"no such folder of photos or video: {source}")
     if options.masks is not None and not options.masks.is_dir():
         raise DyngsError(f"no such folder of masks: {options.masks}")
-    try:
-        masks = "" if options.masks is None else digest_of(options.masks)
-        with (
-            working(out, f"{digest_of(source)} {masks} {replace(options, num_threads=0)}") as work,
-            staying_within(source, options.follow_links or source.is_file()),
-            images_up_to(options.max_megapixels),
-        ):
-            result = _posed_in(work, source, out, options, report)
-            if out.exists():
-                out.rmdir()
-            os.replace(work / "capture", out)
-        return result
-    except OSError as error:
-        raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
+    with (
+        new_folder(out) as capture,
+        staying_within(source, options.follow_links or source.is_file()),
+        images_up_to(options.max_megapixels),
+    ):
+        return _posed_in(capture, source, out, options, report)
 
 
 def _posed_in(
-    work: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress
+    capture: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress
 ) -> SfmResult:
-    capture = work / "capture"
     if source.is_file():
         images = _frames_of(source, capture, options, report)
     else:
@@ -169,34 +155,31 @@ def _posed_in(
     with quiet_colmap():
         masks = options.masks
         with nullcontext() if masks is None else staying_within(masks, options.follow_links):
-            task = _laid_out(work, photos, source.is_file(), options, report)
-        stronger = find_features(task)
-        if stronger > 1:
-            notes.append(
-                f"features with {stronger:g} times the usual contrast were taken: frames have many"
-            )
+            task = _laid_out(capture, photos, source.is_file(), options, report)
+        find_features(task)
         match_pairs(task, pairs_to_match(task))
         notes += _parallax_seen(task)
         model, more = _mapped(task)
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
-    counts = matched_images(task.database)
-    lonely = {own[name] for name, count in counts.items() if count < _FEWEST_MATCHED}
     missing = _write_model(model, capture, own)
-    notes += [*more, *_advice(missing, lonely, images.blurred, task.is_video)]
+    notes += [*more, *_advice(missing, images.blurred, task.is_video)]
     count = len(photos)
     points = model.reconstruction.num_points3D()
     result = SfmResult(
         out, count, count - len(missing), missing, points, model.error_px, tuple(notes)
     )
     result.write(capture)
+    shutil.rmtree(task.images.parent)
     return result
 
 
 def _laid_out(
-    work: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ReportProgress
+    capture: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ReportProgress
 ) -> SfmTask:
-    folder = work / "capture" / "images"
+    folder = capture / "images"
+    work = capture / "colmap"
+    work.mkdir()
     found = {} if options.masks is None else find_masks(options.masks)
     masks = {
         photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None
@@ -207,9 +190,7 @@ def _laid_out(
         )
     names = lay_out(photos, folder, work / "images", masks)
     for name, mask in masks.items():
-        target = folder.with_name("masks") / (name + mask.suffix)
-        if not target.exists():
-            copied(inside(mask).resolve(), target)
+        copied(inside(mask).resolve(), folder.with_name("masks") / (name + mask.suffix))
     used = work / "masks" if masks else None
     return SfmTask(
         work / "database.db", work / "images", names, photos, options, report, is_video, used
@@ -298,25 +279,18 @@ def _write_model(model: SfmModel, capture: Path, names: dict[str, str]) -> tuple
         if image.has_pose:
             registered.add(image.name)
     sparse = capture / "sparse" / "0"
-    shutil.rmtree(sparse, ignore_errors=True)
     sparse.mkdir(parents=True)
     model.reconstruction.write(sparse)
     return tuple(name for name in names.values() if name not in registered)
 
 
-def _advice(
-    unregistered: Sequence[str], lonely: set[str], blurred: Sequence[str], is_video: bool
-) -> Iterator[str]:
-    """Yield lines about what to film better: images without a pose, that match few others, that are
-    less sharp."""
-    apart = sum(name in lonely for name in unregistered)
-    if apart:
+def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool) -> Iterator[str]:
+    """Yield lines about what to film better: images without a pose, or less sharp than others."""
+    if unregistered:
         more = "move slower there" if is_video else "take more photos around them"
-        yield f"{apart} images without a pose match fewer than three others: {more}"
-    if apart < len(unregistered):
         yield (
-            f"{len(unregistered) - apart} images without a pose match others, but fit no common scene: things that "
-            "move fill them, or the camera only rotated there"
+            f"{len(unregistered)} images without a pose: {more}, unless things that move fill them, or the camera only "
+            "rotated there"
         )
     if blurred:
         more = "more light or a slower hand" if is_video else "take them again"
@@ -326,35 +300,26 @@ def _advice(
 def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportProgress) -> _Images:
     """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
 
-    Two passes, so that only one image is held in memory: the first one measures. Frames of a
-    stopped run are kept.
+    Two passes, so that only one image is held in memory: the first one measures.
     """
-    images = capture / "images"
-    done = capture.parent / "frames.json"
-    if not done.is_file():
-        measures = measured(read_frames(video))
-        choice = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
-        if choice.num_frames >= 3 and choice.reach < STILL:
-            raise DyngsError(
-                f"{video}: the camera stands still (the image moves by {choice.reach:.2%} of its width), which "
-                "gives no depth; film while walking sideways around the scene"
-            )
-        names = {index: f"frame_{index:05d}.png" for index in choice.numbers}
-        for place, (index, rgb) in enumerate(read_numbered_frames(video, choice.numbers)):
-            write_image(images / names[index], rgb)
-            report("frames of the video", place + 1, len(names))
-        seconds = frame_seconds(video, len(measures))
-        write_seconds(capture, {name: seconds[index] for index, name in names.items()})
-        blurred = [names[index] for index in choice.blurred]
-        notes = [*colour_notes([probe_video(video)]), choice.summary()]
-        fields = {"names": list(names.values()), "blurred": blurred, "notes": notes}
-        write_text(done, json.dumps(fields))
-    stored = {
-        key: tuple(map(str, cast("list[object]", value)))
-        for key, value in read_json_object(done).items()
-    }
-    photos = [Photo(name, read_header(images / name), name) for name in stored["names"]]
-    return _Images(photos, stored["blurred"], stored["notes"])
+    measures = measured(read_frames(video))
+    choice = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
+    if choice.num_frames >= 3 and choice.reach < STILL:
+        raise DyngsError(
+            f"{video}: the camera stands still (the image moves by {choice.reach:.2%} of its width), which "
+            "gives no depth; film while walking sideways around the scene"
+        )
+    names = {index: f"frame_{index:05d}.png" for index in choice.numbers}
+    photos = []
+    for index, rgb in read_numbered_frames(video, choice.numbers):
+        path = capture / "images" / names[index]
+        write_image(path, rgb)
+        photos.append(Photo(path.name, read_header(path), path.name))
+        report("frames of the video", len(photos), len(names))
+    seconds = frame_seconds(video, len(measures))
+    write_seconds(capture, {name: seconds[index] for index, name in names.items()})
+    notes = (*colour_notes([probe_video(video)]), choice.summary())
+    return _Images(photos, tuple(names[index] for index in choice.blurred), notes)
 
 
 # Features, and which images are compared
@@ -363,18 +328,10 @@ _AT_ONCE, _MATCHING_CALLS = 8, 16
 # images up to this long are doubled in size for finding features: they have few otherwise
 _SMALL_PX = 1000
 _PEAK = 0.02 / 3
-_STRONGER = (1.0, 1.5, 2.0, 3.0, 4.0)
-_TRIED = 3
-# features of a frame of a video, on average over three of them, above which weak ones are left out
-ENOUGH = 4000
 
 
-def find_features(task: SfmTask) -> float:
-    """Find SIFT features of all images that have none in the database yet.
-
-    Returns how many times the usual contrast a feature must have: more than 1 where frames of a
-    video have more than ``ENOUGH``. The largest features would be the coarse ones, whose positions
-    are not exact.
+def find_features(task: SfmTask) -> None:
+    """Find SIFT features of all images.
 
     COLMAP is called for some images at a time: it has no callbacks, and its database must not be
     opened by another copy of SQLite in the same process, whose end would take away COLMAP's locks.
@@ -393,39 +350,20 @@ def find_features(task: SfmTask) -> float:
         mode = pycolmap.CameraMode.SINGLE
     side = min(task.side, LONGEST_SIDE)
 
-    def extract(database: Path, names: Sequence[str], stronger: float) -> None:
-        extraction = feature_options(task.options.num_threads, LONGEST_SIDE, MAX_FEATURES)
-        extraction.sift.peak_threshold = stronger * _PEAK
-        extraction.sift.first_octave = -1 if side <= _SMALL_PX else 0
-        pycolmap.extract_features(
-            database, task.images, names, camera_mode=mode, reader_options=reader,
-            extraction_options=extraction, device=pycolmap.Device.cpu,
-        )  # fmt: skip
-
-    def least_contrast() -> float:
-        places = np.linspace(0, len(task.names) - 1, _TRIED + 2).round()[1:-1]
-        names = [task.names[place] for place in sorted({int(place) for place in places})]
-        trial = task.database.with_name("trial.db")
-        for stronger in _STRONGER:
-            trial.unlink(missing_ok=True)
-            pycolmap.Database.open(trial).close()
-            extract(trial, names, stronger)
-            with pycolmap.Database.open(trial) as opened:
-                if opened.num_keypoints() <= ENOUGH * len(names):
-                    return stronger
-        return _STRONGER[-1]
-
-    if _num_images(task.database) < len(task.names):
-        task.database.unlink(missing_ok=True)
-        pycolmap.Database.open(task.database).close()
-        pycolmap.import_images(task.database, task.images, mode, task.names, reader)
-        _enter_focal_lengths(task)
-    stronger = least_contrast() if task.is_video else 1.0
+    extraction = feature_options(task.options.num_threads, LONGEST_SIDE, MAX_FEATURES)
+    extraction.sift.peak_threshold = _PEAK
+    extraction.sift.first_octave = -1 if side <= _SMALL_PX else 0
+    pycolmap.Database.open(task.database).close()
+    pycolmap.import_images(task.database, task.images, mode, task.names, reader)
+    _enter_focal_lengths(task)
     count = len(task.names)
     for first in range(0, count, _AT_ONCE):
-        extract(task.database, task.names[first : first + _AT_ONCE], stronger)
-        task.report("features, images", min(first + _AT_ONCE, count), count)
-    return stronger
+        names = task.names[first : first + _AT_ONCE]
+        pycolmap.extract_features(
+            task.database, task.images, names, camera_mode=mode, reader_options=reader,
+            extraction_options=extraction, device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        task.report("features, images", first + len(names), count)
 
 
 def match_pairs(task: SfmTask, pairs: Sequence[tuple[int, int]]) -> None:
@@ -438,30 +376,6 @@ def match_pairs(task: SfmTask, pairs: Sequence[tuple[int, int]]) -> None:
         part = ordered[first : first + step]
         match_listed(task.database, task.names, part, task.options.num_threads)
         task.report("matching, pairs", first + len(part), len(ordered))
-
-
-def matched_images(database: Path) -> dict[str, int]:
-    """Return how many other images each one was matched with, by name."""
-    import pycolmap
-
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        ids, geometries = opened.read_two_view_geometries()
-    counts = dict.fromkeys(names, 0)
-    for key, geometry in zip(ids, geometries, strict=True):
-        if len(geometry.inlier_matches):
-            for image in pycolmap.pair_id_to_image_pair(key):
-                counts[image] += 1
-    return {names[image]: count for image, count in counts.items()}
-
-
-def _num_images(database: Path) -> int:
-    import pycolmap
-
-    if not database.is_file():
-        return 0
-    with closing(pycolmap.Database.open(database)) as opened:
-        return int(opened.num_images())
 
 
 def _enter_focal_lengths(task: SfmTask) -> None:

@@ -81,7 +81,7 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
     that they are to be rotated, and readers of ours do. Those that are upside down, mirrored or
     square cannot be told by their size: they are written upright, as PNG, and so are HEIC photos
     and the first frame of GIF files. Hidden files and those of ``out``, the capture that will be
-    made, are left out; images that are there already are left. Raises DyngsError: a file is no
+    made, are left out. Raises DyngsError: a file is no
     image, truncated, too large, or lies outside the folder; pillow-heif is missing.
     """
     result = out.resolve()
@@ -97,8 +97,7 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
     for photo, header in headers.items():
         relative = photo.relative_to(source)
         target = images / names[relative]
-        if not target.exists():
-            conversions.add(_store(photo, target, header))
+        conversions.add(_store(photo, target, header))
         stored = (
             header if header is not None and target.suffix == photo.suffix else read_header(target)
         )
@@ -129,8 +128,7 @@ def lay_out(
     names.
 
     COLMAP ignores the orientation of EXIF, and its lists of pairs cannot hold names with white
-    space. The folder must not outlive the work, as files in it may be links to the photos; images
-    that are there already are left.
+    space. The folder must not outlive the work, as files in it may be links to the photos.
     """
     names = []
     images.mkdir(exist_ok=True)
@@ -143,14 +141,13 @@ def lay_out(
         is_written = lies or photo.header.format_name not in _FOR_COLMAP
         name = f"{index:06d}" + (".png" if is_written else _FOR_COLMAP[photo.header.format_name])
         names.append(name)
-        if not (images / name).exists():
-            if is_written:
-                write_image(images / name, read_image(stored, upright=True).numpy())
-            else:
-                try:
-                    os.link(stored, images / name)
-                except OSError:
-                    shutil.copyfile(stored, images / name)
+        if is_written:
+            write_image(images / name, read_image(stored, upright=True).numpy())
+        else:
+            try:
+                os.link(stored, images / name)
+            except OSError:
+                shutil.copyfile(stored, images / name)
         mask = masks.get(photo.name)
         if mask is not None:
             target = images.with_name("masks") / f"{name}.png"

@@ -8,7 +8,6 @@ its clip, which shows what is static.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,8 +45,8 @@ from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import evenly_spaced, write_seconds
 from dyngs.io.containment import images_up_to, inside, staying_within
 from dyngs.io.fields import first_few, is_number, read_json_object
-from dyngs.io.outputs import require_new_folder
-from dyngs.io.write import temporary_folder_beside, write_image, write_text
+from dyngs.io.outputs import new_folder
+from dyngs.io.write import write_image, write_text
 
 if TYPE_CHECKING:
     import pycolmap
@@ -103,18 +102,12 @@ def poses_of_videos(
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
     """
-    require_new_folder(out)
-    work = temporary_folder_beside(out)
-    try:
-        with staying_within(source, options.follow_links), images_up_to(options.max_megapixels):
-            lines = _write_capture(work, source, options, report)
-        if out.exists():
-            out.rmdir()
-        os.replace(work, out)
-    except OSError as error:
-        raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    with (
+        new_folder(out) as work,
+        staying_within(source, options.follow_links),
+        images_up_to(options.max_megapixels),
+    ):
+        lines = _write_capture(work, source, options, report)
     return "\n".join((*lines, f"written: {out}"))
 
 

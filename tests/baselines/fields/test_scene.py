@@ -13,9 +13,10 @@ from dyngs.baselines.fields.keys import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene, stored_space
 from dyngs.core.errors import DyngsError
+from dyngs.gaussians.restored import restored_model
 from dyngs.models.renderable import DrawOptions
 from dyngs.ops.rays import Space
-from dyngs.training.new_trainer import assemble, restored_model
+from dyngs.training.new_trainer import assemble
 
 
 def scene_of(space: Space) -> FieldScene:

@@ -44,19 +44,6 @@ def test_few_images_far_apart_are_ill_posed(count: int, degrees: float, says: bo
     assert [line.startswith(expected) for line in lines] == [True] * says
 
 
-def test_several_cameras_at_each_time_are_no_problem() -> None:
-    capture = clip(12, 35.0)
-    both = [
-        replace(v, name=f"b{v.name}", time=1 - (v.time or 0.0), camera_id=1)
-        for v in capture.splits["train"]
-    ]
-    assert (
-        before_training(capture.replace(splits={"train": (*capture.splits["train"], *both)})) == []
-    )
-    still = tuple(replace(view, time=None) for view in capture.splits["train"])
-    assert before_training(capture.replace(splits={"train": still})) == []
-
-
 def test_one_fixed_camera() -> None:
     capture = clip(12, 0.0)
     (line,) = before_training(capture)
@@ -135,12 +122,6 @@ def test_masks_that_ignore_nearly_everything(tmp_path: Path, mask: np.ndarray, l
     assert str(tmp_path / "mask1.png") in problem
     assert problem in before_training(capture)
     assert problem in report_on(capture).problems
-
-
-def test_what_cannot_be_read_is_left_to_others(tmp_path: Path) -> None:
-    capture = capture_with(tmp_path, mask_of(1))
-    (tmp_path / "mask1.png").write_text("no image")
-    assert masks_of(capture) == ("5 of 6 images; white counts, black is ignored", [])
 
 
 @pytest.mark.parametrize(

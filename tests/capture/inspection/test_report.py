@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from tiny_captures import edit_json, write_cameras_json, write_video
 
 from dyngs.capture.inspection.report import draw_cameras, format_report, inspect_capture, report_on
 from dyngs.config import DataConfig
@@ -68,21 +67,6 @@ def test_one_bad_view_gives_its_line(tmp_path: Path, changes: dict[str, Any], li
     assert any(line in problem for problem in report.problems), report.problems
     assert all("\n" not in problem for problem in report.problems)
     assert line in format_report(report)
-
-
-def test_damaged_images_and_masks(tmp_path: Path) -> None:
-    capture = _with_view(_capture(tmp_path), mask_path=tmp_path / "mask.png")
-    write_image(tmp_path / "mask.png", np.ones((5, 5)))
-    (tmp_path / "3.png").write_text("no image")
-    cut = tmp_path / "4.png"
-    write_image(cut, np.random.default_rng(0).uniform(size=(24, 32, 3)))
-    cut.write_bytes(cut.read_bytes()[:500])
-    shallow = report_on(capture).problems
-    deep = report_on(capture, deep=True).problems
-    assert any("mask.png has 5x5" in line for line in shallow)
-    assert any("3.png" in line for line in shallow)
-    assert not any("4.png" in line for line in shallow)
-    assert any("4.png" in line for line in deep)
 
 
 def test_scene_faults(tmp_path: Path) -> None:
@@ -145,27 +129,6 @@ def test_cameras_by_times(tmp_path: Path) -> None:
     assert dict(report_on(moving).facts)["sequence"].startswith("4 cameras (1 moving) x 3 times")
 
 
-def test_videos_are_not_decoded_to_be_inspected(tmp_path: Path) -> None:
-    write_cameras_json(tmp_path, ("cam00", "cam01", "cam02", "cam03"), test=["cam00"])
-    for i in range(4):
-        write_video(tmp_path / f"cam0{i}.mp4", 3, fps=25)
-    before = sorted(tmp_path.iterdir())
-    report = inspect_capture(tmp_path)
-    assert not report.problems, report.problems
-    facts = dict(report.facts)
-    assert (facts["frame rate"], facts["sequence"]) == (
-        "25 per second",
-        "4 cameras x 3 times, 12 images",
-    )
-    assert facts["video frames"] == "0 of 12 are decoded already"
-    assert sorted(tmp_path.iterdir()) == before
-    edit_json(tmp_path / "cameras.json", lambda content: content.update(fps=24))
-    report = inspect_capture(tmp_path, deep=True)
-    assert not report.problems, report.problems
-    assert dict(report.facts)["frame rate"] == "24 per second"
-    assert dict(report.facts)["video frames"] == "12 of 12 are decoded already"
-
-
 def test_drawing_shows_cameras_and_points(tmp_path: Path) -> None:
     capture = _capture(tmp_path)
     draw_cameras(capture, tmp_path / "cameras.png", size=100)
@@ -200,22 +163,3 @@ def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
     assert any(f"{image}: a link that leads out" in line for line in report.problems[1:])
     followed = inspect_capture(DataConfig(root=root, follow_links=True))
     assert followed.capture is not None
-
-
-@pytest.mark.parametrize(
-    ("light", "said"),
-    [
-        ((None, None), None),
-        ((0.02, 0.02), "the same"),
-        ((0.01, 0.03), "up to 3 times as much light"),
-        ((None, 1), "of 6"),
-    ],
-)
-def test_exposures_of_the_tags_are_a_fact(
-    tmp_path: Path, light: tuple[float | None, ...], said: str | None
-) -> None:
-    capture = _capture(tmp_path)
-    views = [replace(view, exposure=light[i % 2]) for i, view in enumerate(capture.splits["train"])]
-    facts = dict(report_on(capture.replace(splits={**capture.splits, "train": tuple(views)})).facts)
-    assert ("exposure" in facts) is (said is not None)
-    assert said is None or said in facts["exposure"]

@@ -12,8 +12,6 @@ from dyngs.capture.sfm.frame_choice import (
     chosen_frames,
     displaced_by,
     measured,
-    motion_between,
-    shrunk,
 )
 
 
@@ -22,16 +20,6 @@ def _wave(shift: float, width: int = 192) -> np.ndarray:
     rows = np.arange(width * 3 // 4)
     grey = 128 + 60 * np.sin(columns / 11)[None] + 50 * np.cos(rows / 9)[:, None]
     return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
-
-
-def test_motion_is_a_share_of_the_width() -> None:
-    still = shrunk(_wave(0))
-    assert motion_between(still, still) == (0.0, 0.0)
-    one = motion_between(still, shrunk(_wave(1)))[0]
-    assert one == pytest.approx(0.5 / 192, rel=0.7), "about half is along the gradients"
-    assert motion_between(still, shrunk(_wave(2)))[0] == pytest.approx(2 * one, rel=0.3)
-    brighter = motion_between(still, still + 20)[0]
-    assert brighter < 1e-6, "exposure is no motion"
 
 
 def test_a_pause_is_skipped_and_frames_are_spread_over_the_motion() -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hdr_clips import BT2020, PQ, encoded, patches
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -77,27 +76,6 @@ def test_heic_becomes_png_with_its_tags(tmp_path: Path, orientation: int) -> Non
     heif = pytest.importorskip("pillow_heif")
     shown = np.asarray(heif.HeifImageFile(tmp_path / "photos" / "a.HEIC").convert("RGB"))
     assert np.array_equal(stored, shown)
-
-
-def test_hdr_heic_is_tone_mapped_with_a_note(tmp_path: Path) -> None:
-    heif = pytest.importorskip("pillow_heif")
-    levels = np.round(65535 * encoded(patches(), BT2020, PQ)).astype(np.uint16)
-    (tmp_path / "photos").mkdir()
-    heif.from_bytes(mode="RGB;16", size=(64, 48), data=levels.tobytes()).save(
-        tmp_path / "photos" / "a.HIF",
-        format="HEIF",
-        quality=95,
-        color_primaries=BT2020,
-        transfer_characteristics=PQ,
-        matrix_coefficients=BT2020,
-        full_range_flag=1,
-    )
-    names, notes = _gather(tmp_path)
-    assert notes == (
-        "HEIC photos: PQ is tone-mapped to SDR (white: 203 cd/m2; brighter is clipped)",
-    )
-    stored = read_image(tmp_path / "images" / names["a.HIF"]).numpy()
-    assert np.sqrt(np.mean((stored - 255 * patches()) ** 2)) < 4
 
 
 @pytest.mark.parametrize(

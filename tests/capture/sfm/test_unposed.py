@@ -69,13 +69,6 @@ def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
     assert len(asked) == 2
 
 
-def test_masks_beside_the_images_are_no_photos(tmp_path: Path, asked: list[Path]) -> None:
-    _photos(tmp_path / "scan" / "images")
-    _photos(tmp_path / "scan" / "masks")
-    with_poses(DataConfig(root=tmp_path / "scan"), say=lambda _: None)
-    assert asked == [tmp_path / "scan" / "images"]
-
-
 def test_no_output_replaces_the_video_that_a_run_is_made_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,17 +86,6 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
         assert "clip.mp4: is the file that is read" in capsys.readouterr().err
         (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
     assert video.read_bytes() == before
-
-
-def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
-    data = DataConfig(root=_videos(tmp_path / "rig", 2))
-    first = with_poses(data, needs_times=True, say=lambda _: None)
-    assert with_poses(data, needs_times=True, say=lambda _: None) == first
-    assert asked == [tmp_path / "rig"]
-    (tmp_path / "rig" / "videos.json").write_text('{"starts": 0}')
-    assert with_poses(data, needs_times=True, say=lambda _: None).root != first.root, (
-        "offsets are given now"
-    )
 
 
 def test_what_cannot_work_is_said_before_poses_are_estimated(

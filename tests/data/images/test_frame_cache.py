@@ -104,17 +104,6 @@ def test_another_video_under_the_same_name(root: Path) -> None:
     assert read_image(frames.paths[0]).shape == (16, 32, 3)
 
 
-def test_huge_videos_are_told_apart_by_samples_and_time(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(frame_cache, "WHOLE_BYTES", 10)
-    video = root / "cam00.mp4"
-    first = planned_frames(video).paths
-    assert planned_frames(video).paths == first
-    os.utime(video, ns=(0, 10**18))
-    assert not set(planned_frames(video).paths) & set(first)
-
-
 def test_the_limit_is_refused_at_once(root: Path) -> None:
     frames = plan(root / "cam00.mp4")
     decode_frames(root, some(frames, 0), 10)

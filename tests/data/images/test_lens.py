@@ -11,7 +11,6 @@ from dyngs.data.geometry import pinhole_matrix
 from dyngs.data.images.lens import (
     WIDEST_DEG,
     distort,
-    is_pinhole,
     kept_fraction,
     undistort,
     undistort_map,
@@ -22,12 +21,6 @@ from dyngs.data.images.lens import (
 BARREL = Lens("opencv", (-0.2, 0.05, 0.002, -0.003))
 FISHEYE = Lens("fisheye", (0.05, -0.02, 0.003, 0.0))
 INTRINSICS = pinhole_matrix(50.0, 52.0, 31.0, 23.5)
-
-
-def test_zero_coefficients_are_a_pinhole_except_for_a_fisheye() -> None:
-    assert is_pinhole(Lens())
-    assert is_pinhole(Lens("opencv", (0.0,) * 8))
-    assert not is_pinhole(Lens("fisheye", (0.0,) * 4))
 
 
 def test_known_points() -> None:
@@ -92,17 +85,6 @@ def test_no_ghosts_where_the_polynomial_turns_back() -> None:
     assert bool(inside[32, 60])
     assert not bool(lens_map.valid[32, 60]), "r = 0.95"
     assert bool(lens_map.valid[32, 45]), "r = 0.45"
-
-
-def test_share_of_a_fisheye_image_that_is_kept() -> None:
-    """Equidistant: a point at a distance r (in focal lengths) from the middle is seen at tan(r) by
-    the pinhole."""
-    intrinsics = pinhole_matrix(200, 200, 200, 200)
-    fraction = kept_fraction(Lens("fisheye", (0.0, 0.0, 0.0, 0.0)), intrinsics, 400, 400)
-    x, y = np.meshgrid(*[(np.arange(1000) + 0.5) / 500 - 1] * 2)
-    r = np.hypot(x, y)
-    inside = (np.maximum(abs(x), abs(y)) * np.tan(r) / r <= 1) & (r < np.pi / 2)
-    assert fraction == pytest.approx(inside.mean(), abs=0.01)
 
 
 def fisheye_matrix(degrees: float) -> np.ndarray:

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tiny_captures import random_pixels, write_image
+from tiny_captures import write_image
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.capture import Lens, Silhouette, View
+from dyngs.data.capture import Lens, View
 from dyngs.data.images.lens import undistort_map, undistorted_points
 from dyngs.data.images.maps import (
-    cut_out,
     flow_at,
     nearest_positions,
     read_depth,
     read_flow,
-    read_labels,
     silhouette_box,
     taken_at,
 )
@@ -46,21 +43,6 @@ def test_floats_are_taken_as_they_are(tmp_path: Path, ending: str) -> None:
     assert read_depth(path).tolist() == [[2.5, 0], [0, 0]]
 
 
-def test_labels_of_sixteen_bits_are_not_rounded_away(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.png", np.array([[[0], [1], [300]]], np.uint16))
-    assert read_labels(tmp_path / "a.png").tolist() == [[0, 1, 300]]
-
-
-def test_each_colour_of_a_label_image_is_a_label_and_alpha_is_none(tmp_path: Path) -> None:
-    colours = np.array([[[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 0, 0]]], np.uint8)
-    for image in (colours, np.pad(colours, ((0, 0), (0, 0), (0, 1)), constant_values=255)):
-        write_image(tmp_path / "a.png", image)
-        (labels,) = read_labels(tmp_path / "a.png").tolist()
-        assert labels[0] == 0
-        assert labels[1] == labels[4]
-        assert len(set(labels)) == 4
-
-
 def flo(width: int, height: int, values: np.ndarray) -> bytes:
     return struct.pack("<fii", 202021.25, width, height) + values.astype("<f4").tobytes()
 
@@ -78,34 +60,6 @@ def test_sizes_are_checked_before_memory_is_allocated(tmp_path: Path) -> None:
     (tmp_path / "a.flo").write_bytes(flo(2**30, 2**30, np.zeros(2)))
     with pytest.raises(DyngsError, match="megapixels"):
         read_flow(tmp_path / "a.flo")
-
-
-@pytest.mark.parametrize(
-    ("person", "expected"),
-    [("white", [0, 1, 128, 255]), ("black", [255, 254, 127, 0]), ("nonzero", [0, 255, 255, 255])],
-)
-def test_silhouettes_become_alpha(tmp_path: Path, person: Any, expected: list[int]) -> None:
-    write_image(tmp_path / "m.png", np.array([[[0], [1], [128], [255]]], np.uint8))
-    pixels = torch.from_numpy(random_pixels(1, 4, 3))
-    cut = cut_out(pixels, Silhouette(tmp_path / "m.png", person))
-    assert cut[0, :, 3].tolist() == expected
-    assert torch.equal(cut[..., :3], pixels)
-
-
-def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
-    hdf5 = tmp_path / "m.hdf5"
-    masks = np.zeros((5, 2, 3), np.uint8)
-    masks[3, 1, 2] = 1
-    with h5py.File(hdf5, "w") as file:
-        file.create_dataset("masks", data=masks, compression="lzf")
-    pixels = torch.zeros(2, 3, 3, dtype=torch.uint8)
-    assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [
-        [0, 0, 0],
-        [0, 0, 255],
-    ]
-    with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
-        cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
 
 
 def test_the_box_holds_all_that_is_shown() -> None:

@@ -203,13 +203,3 @@ def test_untagged_video_is_bt601_in_sd_and_bt709_in_hd(
     assert levels_off(path, rgb) < 2.5
     note = "HD without colour tags is read as BT.709" if matrix == BT709 else ""
     assert probe_video(path).colours == note
-
-
-def test_a_matrix_that_cannot_be_converted_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    ictcp = 14
-    write_clip(path, patches(), (BT2020, PQ, ictcp))
-    with pytest.raises(
-        DyngsError, match=r"a\.mp4: its colours have the matrix 14 .* export .*HDR10"
-    ):
-        probe_video(path)
