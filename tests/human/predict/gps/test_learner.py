@@ -18,6 +18,7 @@ from tiny_stereo import stereo_config, stereo_people
 from dyngs.api.predict import predict
 from dyngs.api.train import train
 from dyngs.config import DataConfig
+from dyngs.core.conventions import report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.aim import look_at
@@ -31,7 +32,7 @@ from dyngs.human.predict.gps.rectification import neighbours
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.training.prediction import network_trainer
+from dyngs.training.new_trainer import build
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_pat
 
 def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:
     """Of depth in the first half, of images in the second, on the same examples."""
-    trainer = network_trainer(stereo_config(folder, tmp_path / "run", steps=80))
+    trainer = build(stereo_config(folder, tmp_path / "run", steps=80))
 
     @torch.no_grad()
     def error(step: int) -> float:
@@ -158,7 +159,11 @@ def test_one_moment_of_several_is_what_its_run_is_trained_on(
     (person / "body_train.npz").unlink()
     data = DataConfig(root=person)
     found: Predictor = predictor(
-        stereo_config(folder, tmp_path), load_checkpoint(checkpoint_paths(run)[-1]), data
+        stereo_config(folder, tmp_path),
+        load_checkpoint(checkpoint_paths(run)[-1]),
+        data,
+        [].append,
+        report_nothing,
     )
     later = [i for i, view in enumerate(found.views) if view.frame == 1][:2]
     assert found.run_config(later).data.frames == "1:2"
