@@ -12,7 +12,6 @@ import pytest
 import torch
 import trimesh
 from scaled_captures import scaled_capture
-from tiny_field_people import NETWORKS, SIZES
 from tiny_fields import write_tiny_capture
 from tiny_people import NET
 from tiny_stereo import STEREO
@@ -46,8 +45,8 @@ SCENES = {
 NETWORK_KEYS = {
     "human_predictor": {"kind": "human_predictor"} | NET.model_dump(),
     "gps": STEREO.model_dump(),
-    "keypoint_nerf": {"kind": "keypoint_nerf"} | SIZES | NETWORKS["keypoint_nerf"],
-    "eg_human_nerf": {"kind": "eg_human_nerf"} | SIZES | NETWORKS["eg_human_nerf"],
+    "keypoint_nerf": {"kind": "keypoint_nerf", "source_views": 3},
+    "eg_human_nerf": {"kind": "eg_human_nerf", "source_views": 3},
 }
 
 

@@ -35,7 +35,7 @@ def plain(tmp_path: Path) -> Path:
     ).path
 
 
-@pytest.mark.parametrize("kind", readable(), ids=str)
+@pytest.mark.parametrize("kind", readable(), ids=lambda kind: kind.name)
 def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: Path) -> None:
     before = plain.read_bytes()
     path = tmp_path / f"a{kind.suffixes[0]}"

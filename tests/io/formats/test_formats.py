@@ -184,7 +184,7 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
         assert (back.world_offset, back.turned) == (FAR, turn.turn)
 
 
-@pytest.mark.parametrize("kind", readable(), ids=str)
+@pytest.mark.parametrize("kind", readable(), ids=lambda kind: kind.name)
 def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
     """In comments, or in a note beside the file; turned for viewers or not."""
     path = tmp_path / f"a{kind.suffixes[0]}"
