@@ -383,7 +383,8 @@ def _section(
     """Return the section of the texts in ``given``. Raises DyngsError: the first fault."""
     values = dict(given)
     for key in given:
-        if key not in section.model_fields:
+        was_flag = key.startswith("move_") and "moves" in section.model_fields  # see FieldSection
+        if key not in section.model_fields and not was_flag:
             raise DyngsError(
                 layers.origin_of((*above, key)) + _about_unknown(section, (*above, key), layers)
             )

@@ -33,7 +33,9 @@ class FieldSection(Section):
         if not flags:
             return given
         usual = given.get("moves", cls.model_fields["moves"].default)
-        moves = [x for x in get_args(Attribute) if flags.get(f"move_{x}", x in usual)]
+        moves = [
+            x for x in get_args(Attribute) if flags.get(f"move_{x}", x in usual) in (True, "true")
+        ]
         return {k: x for k, x in given.items() if k not in flags} | {"moves": moves}
 
 
