@@ -52,10 +52,9 @@ from dyngs.data.tracks import read_true_tracks
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
-from dyngs.evaluate.regions import Regions
 from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.tracks import TrackScores, track_scores
-from dyngs.evaluate.view_scores import score_views
+from dyngs.evaluate.view_scores import Regions, score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.parameters import Parameters

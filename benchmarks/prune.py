@@ -26,8 +26,7 @@ from dyngs.api.prune import file_of, prune_run, prune_within
 from dyngs.api.scene_file import write_scene_file
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.comparison import Cost, compared
-from dyngs.evaluate.report import evaluate_run, scene_of_split, split_views
+from dyngs.evaluate.report import Cost, compared, evaluate_run, scene_of_split, split_views
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.stored_file import drawable, read_scene

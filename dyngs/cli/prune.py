@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from dyngs.compress.search import Promise
-    from dyngs.evaluate.comparison import Cost
+    from dyngs.evaluate.report import Cost
 
 MAX_LOSS = 0.2
 _EPILOG = """\
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Prune, compare with the run before, and print a table."""
     from dyngs.api.prune import file_of
     from dyngs.api.train import num_cores
-    from dyngs.evaluate.comparison import compared
+    from dyngs.evaluate.report import compared
     from dyngs.runs.checkpoint import load_run
 
     keys = {"prune": "fraction", "score": "score", "masks": "mask_times", "steps": "steps"}

@@ -1,19 +1,23 @@
-"""Scores of single views, and their means: the render against the truth, and how long it took to
-draw.
+"""Scores of views: the render against the truth, whole, on parts of the image and over time, and how
+long it took to draw.
 
 Of people also inside their box, and on black, as published figures have it. Where training images
 differ in exposure, so do test images: the published protocol (Martin-Brualla et al. 2021) fits the
-left half, and scores the right half.
+left half, and scores the right half. Both measures of flicker are in grey levels of 255 and mean
+absolute values over pixels, channels and time steps, of images clamped to [0, 1]. Local letters: T
+images of a camera, H x W pixels, R a rendered image, G the true one, t its time, k time steps in
+order.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -21,15 +25,139 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.core.metrics import Lpips, flip, psnr, ssim
+from dyngs.core.metrics import Lpips, MetricValue, flip, psnr, ssim
+from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
-from dyngs.data.loader import Image
-from dyngs.evaluate.regions import Regions
+from dyngs.data.loader import Image, ImageLoader
+from dyngs.data.times import evenly_spaced, static_cameras
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
 from dyngs.ops.device import finish
+
+RegionMetric = Literal["psnr_foreground", "psnr_moving", "psnr_static"]
+REGION_METRICS: tuple[RegionMetric, ...] = ("psnr_foreground", "psnr_moving", "psnr_static")
+
+# a region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing
+FEWEST_PIXELS = 25
+CHANGE = 0.05
+"""Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as
+moving."""
+MEDIAN_IMAGES = 31  # number of images, spread over the clip, from which a camera's median is taken
+FEWEST_IMAGES = 3
+
+NO_ALPHA = "the images have no alpha and no silhouettes"
+NO_TIMES = "the images have no times"
+NO_MOTION_KNOWN = (
+    "the views have no motion masks, and no camera of this split stands still while time passes"
+)
+TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
+
+
+class Regions:
+    """The regions of the images of one split; ``loader`` holds those of ``views``, ``background``
+    (3,) is behind them.
+
+    The foreground is where the true image is not fully transparent. What moves is known, in this
+    order, from motion masks, and before cameras that stand still from pixels that differ by
+    ``CHANGE`` from their median over time. What is left does not move. Where there is a foreground,
+    both are parts of it.
+    """
+
+    def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:
+        self._loader, self._background = loader, background
+        self._cameras = {
+            views[i].name: indices
+            for indices in static_cameras(views)
+            if len(indices) >= FEWEST_IMAGES
+            for i in indices
+        }
+        self._medians: dict[tuple[int, ...], Tensor] = {}
+        self._has_times = any(view.time is not None for view in views)
+        self._moving_from: set[str] = set()
+        self._has_alpha = False
+
+    def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[str, float | None]:
+        """Return the PSNR of a view's regions, dB, by metric; None for too few such pixels, or
+        unknown ones."""
+        moves = self.moving(image)
+        foreground = None if image.alpha is None else image.alpha > 0
+        self._has_alpha |= foreground is not None
+        inside = (
+            torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
+        )
+        parts = {
+            "psnr_foreground": foreground,
+            "psnr_moving": None if moves is None else moves & inside,
+            "psnr_static": None if moves is None else ~moves & inside,
+        }
+        return {
+            metric: _psnr_inside(part, image, rendered, truth) for metric, part in parts.items()
+        }
+
+    def scores_of_things(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
+        """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it
+        shows, by label."""
+        if image.labels is None:
+            return {}
+        labels = image.labels if image.alpha is None else image.labels * (image.alpha > 0)
+        found = labels[labels != 0].unique().cpu().tolist()
+        scores = {label: _psnr_inside(labels == label, image, rendered, truth) for label in found}
+        return {label: score for label, score in scores.items() if score is not None}
+
+    def moving(self, image: Image) -> Tensor | None:
+        """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
+        if image.moves is not None:
+            self._moving_from.add("motion masks")
+            return image.moves >= 0.5
+        indices = self._cameras.get(image.name)
+        if indices is None:
+            return None
+        self._moving_from.add("change over time")
+        change = (image.composite(self._background) - self._median(indices)).abs().mean(-1)
+        return _opened(change > CHANGE)
+
+    @property
+    def moving_from(self) -> str | None:
+        """How it was found what moves in the images so far; None where it was not."""
+        return " and ".join(sorted(self._moving_from)) or None
+
+    def reason(self, metric: RegionMetric) -> str:
+        """Return why no image so far has a score of this region."""
+        if metric == "psnr_foreground":
+            return TOO_SMALL if self._has_alpha else NO_ALPHA
+        if self._moving_from:
+            return TOO_SMALL
+        return NO_MOTION_KNOWN if self._has_times else NO_TIMES
+
+    def _median(self, indices: Sequence[int]) -> Tensor:
+        """Return the (H, W, 3) median over time of the images of a camera that stands still."""
+        key = tuple(indices)
+        if key not in self._medians:
+            chosen = [indices[i] for i in evenly_spaced(len(indices), MEDIAN_IMAGES)]
+            shown = [
+                (255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte()
+                for i in chosen
+            ]
+            self._medians[key] = torch.stack(shown).median(dim=0).values
+        return self._medians[key].float() / 255
+
+
+def _psnr_inside(
+    part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor
+) -> float | None:
+    if part is None:
+        return None
+    weights = part.float() if image.mask is None else part * image.mask
+    return psnr(rendered, truth, weights) if int((weights > 0).sum()) >= FEWEST_PIXELS else None
+
+
+def _opened(shown: Tensor) -> Tensor:
+    """Return (H, W) bool, ``shown`` less what no square of 3x3 pixels fits into."""
+    grown = torch.nn.functional.max_pool2d((~shown)[None, None].float(), 3, stride=1, padding=1)
+    kept = 1 - grown
+    return torch.nn.functional.max_pool2d(kept, 3, stride=1, padding=1)[0, 0] > 0.5
 
 
 @dataclass(frozen=True)
@@ -291,3 +419,109 @@ def _require_finite(score: ViewScore, mask: Tensor | None) -> None:
             empty = mask is not None and not bool((mask > 0).any())
             why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
             raise DyngsError(f"view {score.name!r}: {name} is not finite, {why}")
+
+
+MAX_MOMENTS = 60  # number of training times up to which flicker is measured at all of them
+
+_SAMPLED_TRIPLES = MAX_MOMENTS // 3
+
+
+@dataclass(frozen=True)
+class TimeScore:
+    """PSNR (dB) at one time step: the mean of the views taken then."""
+
+    time: float
+    psnr: float
+    num_views: int
+
+
+def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """Return ``times`` within [0, 1], and a line of warning where one was not."""
+    if not all(math.isfinite(t) for t in times):
+        raise DyngsError(
+            f"times must be finite numbers in [0, 1], got {', '.join(f'{t:g}' for t in times)}"
+        )
+    inside = tuple(min(max(float(t), 0.0), 1.0) for t in times)
+    count = sum(a != b for a, b in zip(times, inside, strict=True))
+    if not count:
+        return inside, ()
+    return inside, (f"{count} of {len(times)} times lie outside [0, 1] and were clamped to it",)
+
+
+def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeScore, ...]:
+    """Return the PSNR at each distinct time, ascending, from (time, psnr) of the views that have a
+    time."""
+    found: defaultdict[float, list[float]] = defaultdict(list)
+    for at, value in scores:
+        if at is not None:
+            found[at].append(value)
+    return tuple(
+        TimeScore(time, fmean(values), len(values)) for time, values in sorted(found.items())
+    )
+
+
+def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
+    """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one
+    camera, without truth.
+
+    Where time steps are not evenly spaced, R_k is compared with the line between its neighbours: 2
+    |w R_{k-1} + (1 - w) R_{k+1} - R_k| with
+    w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 time steps, 20 triples of
+    neighbours are taken, evenly spaced. A scene in which nothing moves has 0.
+    """
+    if drawing.scene.is_static:
+        return MetricValue(0.0)
+    if len(times) < 3:
+        return MetricValue(None, f"needs at least three training times, there are {len(times)}")
+    seen: dict[int, Tensor] = {}
+    values = []
+    last = len(times) - 1
+    sampled = np.linspace(1, last - 1, _SAMPLED_TRIPLES).round().astype(int).tolist()
+    for k in range(1, last) if last < MAX_MOMENTS else sampled:
+        seen = {
+            i: seen[i] if i in seen else drawing.image(cameras, times[i]).clamp(0, 1)
+            for i in (k - 1, k, k + 1)
+        }
+        before, now, after = (times[i] for i in (k - 1, k, k + 1))
+        line = torch.lerp(seen[k + 1], seen[k - 1], (after - now) / (after - before))
+        values.append(2 * 255 * float((line - seen[k]).abs().double().mean()))
+    return MetricValue(fmean(values))
+
+
+def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
+    """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time,
+    at fixed cameras.
+
+    Over all neighbours in time of each pose that has several times; a mask leaves out what does not
+    count in one of the two. Something that should move but does not has it, as has everything that
+    flickers.
+    """
+    if all(view.time is None for view in views):
+        return MetricValue(None, NO_TIMES)
+    total, weight = 0.0, 0.0
+    for indices in static_cameras(views):
+        errors = (_signed_error(drawing, loader[i]) for i in indices)
+        before, counted = next(errors)
+        for now, counts in errors:
+            weights = torch.minimum(counted, counts)
+            total += float(((now - before).abs().mean(-1) * weights).double().sum())
+            weight += float(weights.double().sum())
+            before, counted = now, counts
+    if not weight:
+        return MetricValue(None, "no camera of this split stands still while time passes")
+    return MetricValue(255 * total / weight)
+
+
+def flicker_of_split(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
+    """Return ``flicker`` before the first camera of the split, at the training times."""
+    if all(view.time is None for view in views):
+        return MetricValue(None, NO_TIMES)
+    return flicker(drawing, loader[0].cameras, drawing.scene.times)
+
+
+def _signed_error(drawing: Drawing, image: Image) -> tuple[Tensor, Tensor]:
+    """Return (H, W, 3) render minus truth and its mask (H, W): R' - R - (G' - G) is the difference
+    of two of them."""
+    truth = image.composite(drawing.background).clamp(0, 1)
+    counts = torch.ones(truth.shape[:2], device=truth.device) if image.mask is None else image.mask
+    return drawing.image(image.cameras, image.time).clamp(0, 1) - truth, counts

@@ -18,9 +18,8 @@ from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import load_lpips, psnr, ssim
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.evaluate.regions import Regions
 from dyngs.evaluate.report import images_of_split
-from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
+from dyngs.evaluate.view_scores import Drawing, Regions, seconds_in_turn
 from dyngs.io.write import write_image
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.renderable import Renderable

@@ -18,7 +18,7 @@ from dyngs.compress.stage import quality_of
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
-from dyngs.evaluate.comparison import compared
+from dyngs.evaluate.report import compared
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoint, load_run
 from dyngs.training.new_trainer import assemble
 

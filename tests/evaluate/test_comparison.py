@@ -9,8 +9,7 @@ from tiny_fields import busy_config
 
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.evaluate.comparison import compared
-from dyngs.evaluate.report import evaluate_run
+from dyngs.evaluate.report import compared, evaluate_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -15,7 +15,7 @@ from moving_scene import camera
 
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.evaluate.regions import (
+from dyngs.evaluate.view_scores import (
     NO_ALPHA,
     NO_MOTION_KNOWN,
     NO_TIMES,

@@ -22,7 +22,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.temporal import (
+from dyngs.evaluate.view_scores import (
     Drawing,
     TimeScore,
     clamped_times,
