@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dyngs.config import DefaultStrategy, SceneInit
 from dyngs.core.camera import Cameras
+from dyngs.core.section import SceneModel
 from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.times import evenly_spaced
@@ -27,7 +28,6 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
-from dyngs.static.keys import StaticModel
 
 # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
 SURVEYED = 200
@@ -135,7 +135,7 @@ def start(run: RunStart) -> GaussianModel:
     return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
 
 
-def restore(model: StaticModel, checkpoint: Checkpoint) -> StaticScene:
+def restore(model: SceneModel, checkpoint: Checkpoint) -> StaticScene:
     """Return the scene of a checkpoint."""
     scene = StaticScene.restored(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")

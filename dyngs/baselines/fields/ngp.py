@@ -25,11 +25,11 @@ from dyngs.baselines.fields.field import (
     with_time,
 )
 from dyngs.baselines.fields.keys import NgpModel
-from dyngs.baselines.fields.thinning import reached_samples, thinned_samples
 from dyngs.core.initialisation import glorot
 from dyngs.core.state import Role, State, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.volume import reached_samples, thinned_samples
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
 from dyngs.ops.rays import Rays, Space, Steps, composite, march

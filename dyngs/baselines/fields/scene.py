@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from dyngs.baselines.fields.field import Field
-from dyngs.baselines.fields.space import rays_of
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, StateTensor, prefixed
 from dyngs.core.tensor_checks import require_moments, require_tensor
@@ -23,6 +22,7 @@ from dyngs.models.renderable import (
     composited,
     fixed_cameras,
 )
+from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Space
 
 CHUNK = 1 << 13  # Rays drawn together

@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from dyngs.baselines.fields.keys import FieldModel
-from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
 from dyngs.data.loader import Image
 from dyngs.data.scene_space import extent_of
-from dyngs.ops.rays import Rays, Space
+from dyngs.ops.rays import Space
 
 MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
 # Along an axis of a single cube, and of each of several: looking at all takes a while
@@ -96,35 +94,6 @@ def _cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
             f"and a field holds {2 ** (MOST_CASCADES - 1)} times: give model.half_extent"
         )
     return min(max(needed + 1, 2), MOST_CASCADES)  # what is behind the points, too
-
-
-def rays_of(cameras: Cameras, pixels: Tensor | None = None) -> tuple[Rays, Tensor]:
-    """Return the rays of one camera through the centres of ``pixels`` (R,), row by row; None: of
-    all.
-
-    Also (R,) the view-space z of what lies a unit along each.
-    """
-    if pixels is None:
-        pixels = torch.arange(cameras.width * cameras.height, device=cameras.intrinsics.device)
-    intrinsics = cameras.intrinsics[0]
-    pose = cameras.cam_from_world[0]
-    x = pixels % cameras.width + 0.5
-    y = torch.div(pixels, cameras.width, rounding_mode="floor") + 0.5
-    local = torch.stack(
-        [
-            (x - intrinsics[0, 2]) / intrinsics[0, 0],
-            (y - intrinsics[1, 2]) / intrinsics[1, 1],
-            torch.ones_like(x),
-        ],
-        -1,
-    ).to(pose.dtype)
-    z = 1 / local.square().sum(-1).sqrt()
-    local = local * z[:, None]
-    rotation = pose[:3, :3]
-    directions = (
-        local[:, :1] * rotation[0] + local[:, 1:2] * rotation[1] + local[:, 2:] * rotation[2]
-    )
-    return Rays(cameras.centers.expand(len(x), 3), directions), z
 
 
 def part_of(image: Image, pixels: Tensor) -> Image:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.baselines.fields.field import Field
 from dyngs.baselines.fields.scene import FieldScene, stored_times
-from dyngs.baselines.fields.space import part_of, rays_of
+from dyngs.baselines.fields.space import part_of
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import State, moved_to, prefixed
 from dyngs.data.loader import Image
@@ -22,6 +22,7 @@ from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Look, Loss, Model, Updated
 from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
+from dyngs.models.volume import rays_of
 from dyngs.ops.adam import AdamUpdate
 from dyngs.ops.device import sent
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import DefaultStrategy, ShColour
+from dyngs.config.kinds import section_of_kind
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
@@ -23,7 +24,6 @@ from dyngs.gaussians.surface import Mesh, Seen, colours_of, fused, opaque_box, s
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.static.keys import StaticModel
 
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000
@@ -69,7 +69,7 @@ def _trained(run: RunStart, steps: int) -> GaussianModel:
     strategy = DefaultStrategy(max_gaussians=MOST_GAUSSIANS)
     train = config.train.model_copy(update={"steps": steps, "initial_downscale": 1})
     changed = {
-        "model": StaticModel(sh_degree=0),
+        "model": section_of_kind("static").model_validate({"sh_degree": 0}),
         "strategy": strategy,
         "train": train,
         "colour": ShColour(),

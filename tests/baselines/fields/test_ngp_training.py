@@ -13,11 +13,11 @@ from small_fields import NGP, config_of
 from dyngs.baselines.fields.frusta import seen_cells
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.ngp_training import NgpTraining
-from dyngs.baselines.fields.space import rays_of
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.models.volume import rays_of
 from dyngs.ops.native import kernel_threads
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer

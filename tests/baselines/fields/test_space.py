@@ -11,12 +11,13 @@ import torch
 from small_fields import config_of
 
 from dyngs.baselines.fields.keys import NgpModel
-from dyngs.baselines.fields.space import MOST_CASCADES, part_of, rays_of, space_of
+from dyngs.baselines.fields.space import MOST_CASCADES, part_of, space_of
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.models.volume import rays_of
 
 
 @pytest.fixture

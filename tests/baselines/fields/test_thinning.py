@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.baselines.fields.thinning import EVERY, LIGHT, reached_samples, thinned_samples
+from dyngs.models.volume import EVERY, LIGHT, reached_samples, thinned_samples
 from dyngs.ops.rays import Samples, composite
 
 

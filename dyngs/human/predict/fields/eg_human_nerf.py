@@ -21,7 +21,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from dyngs.baselines.fields.space import rays_of
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.boundaries import OUTWARDS, Boundaries
@@ -39,6 +38,7 @@ from dyngs.human.predict.fields.features import (
 from dyngs.human.predict.fields.keys import EgHumanNerfModel
 from dyngs.human.predict.fields.network import CHUNK, NEAR, FieldNetwork, Known, Picture
 from dyngs.human.predict.fields.people import Body
+from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Rays
 
 # Of guided samples from where the surface is expected, m

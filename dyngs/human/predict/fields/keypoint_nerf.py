@@ -18,8 +18,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, softplus
 
-from dyngs.baselines.fields.space import rays_of
-from dyngs.baselines.fields.thinning import kept_samples, reached_samples, thinned_samples
 from dyngs.core.camera import Cameras
 from dyngs.human.body.joints import JOINT_PARENTS
 from dyngs.human.predict.fields.features import (
@@ -34,6 +32,7 @@ from dyngs.human.predict.fields.features import (
 from dyngs.human.predict.fields.keys import KeypointNerfModel
 from dyngs.human.predict.fields.network import CHUNK, NEAR, FieldNetwork, Known, Picture
 from dyngs.human.predict.fields.people import KEY_POINTS, Body, Sources
+from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
 from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
 
 OCTAVES = 3
