@@ -106,7 +106,7 @@ class VariantRuns:
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
         if isinstance(run.model, BgTriangleModel):
-            sizes = {name: getattr(run.model, name) for name in ("max_triangles", "num_first")}
+            sizes = {"max_triangles": run.model.max_triangles}
             changes += [
                 f"model.{name}={max(4, round(wanted.triangles * size))}"
                 for name, size in sizes.items()

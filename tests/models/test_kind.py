@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from dyngs.export.chosen_path import PathOptions, choose_path
 from toy_plugin import FOLDER, installed
 
 import dyngs
@@ -21,6 +20,7 @@ from dyngs.config.schema import keys_table
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run

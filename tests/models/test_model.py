@@ -38,14 +38,11 @@ TRAINED = {
         ],
     ),
     "human": ("person", ["model.resolution=16", "model.fit=false", "model.sh_degree=0"]),
-    "ngp": (
-        "still",
-        ["model.levels=4", "model.log2_rows=10", "model.log2_samples=10", "model.cells=16"],
-    ),
-    "nerf": ("still", ["model.width=16", "model.coarse=8", "model.fine=8", "model.rays=32"]),
+    "ngp": ("still", ["model.sizes=tiny"]),
+    "nerf": ("still", ["model.sizes=tiny"]),
     "bg_triangle": (
         "still",
-        ["init.num_random=40", "model.gaussian_steps=20", "model.num_first=40"],
+        ["init.num_random=40", "model.gaussian_steps=20", "model.max_triangles=40"],
     ),
     "toy": ("still", []),
 }

@@ -25,15 +25,6 @@ def samples_of(
     return densities.flatten(), samples
 
 
-def test_all_that_light_gets_to_are_reached() -> None:
-    densities, samples = samples_of(4, 40, torch.Generator().manual_seed(0))
-    found, which = reached_samples(densities, samples)
-    assert found.offsets.diff().tolist() == [23, 40, 23, 40], (
-        "three samples of the wall leave less than 1e-4"
-    )
-    assert torch.equal(found.coords, samples.coords[which])
-
-
 def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:
     generator = torch.Generator().manual_seed(0)
     densities, samples = samples_of(40, 40, generator)
