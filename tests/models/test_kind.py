@@ -39,9 +39,7 @@ def toy() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(
-        folder, StillOptions(size=24, num_train=6, num_test=2, samples=1, distance=4.0)
-    )
+    write_still_capture(folder, StillOptions(size=24, num_train=6, num_test=2, samples=1))
     return folder
 
 

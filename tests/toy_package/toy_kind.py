@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from dyngs.gaussians.adam import AdamState
 from pydantic import Field
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from dyngs.core.section import ModelSection
 from dyngs.core.state import Role, State, StateTensor, prefixed
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
+from dyngs.gaussians.parameters import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import ModelKind, RunStart
 from dyngs.models.model import Drawn, Model, Updated

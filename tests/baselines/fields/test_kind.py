@@ -104,12 +104,12 @@ def test_what_does_not_go_is_refused(
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        (["train.robust=always"], "draws no whole images"),
-        (["train.exposure=always"], "draws no whole images"),
-        (["camera.refine=always"], "draws no whole images"),
-        (["budget.max_gaussians=10"], "no Gaussians"),
+        (["train.robust=always"], "has no effect with model.kind=ngp"),
+        (["train.exposure=always"], "has no effect with model.kind=ngp"),
+        (["camera.refine=always"], "has no effect with model.kind=ngp"),
+        (["budget.max_gaussians=10"], "has no effect with model.kind=ngp"),
         (["model.time=true"], "the images have no times"),
-        (["model.features=3"], "model.features"),
+        (["model.sizes=huge"], "one of tiny, cpu, published"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(

@@ -48,10 +48,10 @@ def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
         )
         * 4
     )
-    shifts = torch.rand(50, 16, generator=torch.Generator().manual_seed(2))
+    shifts = torch.rand(50, 24, generator=torch.Generator().manual_seed(2))
     seen = field.seen(Rays(origins, -origins / 4), 0.0, near=0.1, shifts=shifts)
     assert seen.coarse is not None
     (seen.colour + seen.coarse.colour).mean().backward()
     grads = [x.grad for name, x in field.parameters.items() if "weight" in name]
     assert all(grad is not None and 0 < float(grad.abs().max()) < 10 for grad in grads)
-    assert [n.weight.shape[0] for n, _ in pairwise(field.coarse.trunk)] == [8] * 8
+    assert [n.weight.shape[0] for n, _ in pairwise(field.coarse.trunk)] == [32] * 8

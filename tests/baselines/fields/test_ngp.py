@@ -53,7 +53,7 @@ def test_rays_see_what_places_along_them_are(time: bool) -> None:
             assert (seen.colour[r] - (weights[:, None] * colours).sum(0)).abs().max() < 0.02
             assert (seen.transmittance[r] - left.prod()).abs() < 0.02
     assert float(seen.transmittance.max()) == 1
-    assert float(seen.transmittance.min()) < 0.2
+    assert float(seen.transmittance.min()) < 0.6
 
 
 def test_mist_is_as_thick_in_each_cube() -> None:
