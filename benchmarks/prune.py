@@ -30,8 +30,7 @@ from dyngs.evaluate.comparison import Cost, compared
 from dyngs.evaluate.report import evaluate_run, scene_of_split, split_views
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.runs.stored_file import read_scene
-from dyngs.runs.stored_tensors import drawable
+from dyngs.runs.stored_file import drawable, read_scene
 
 ONCE = "prune.steps=1"
 NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.fraction=0"

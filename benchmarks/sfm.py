@@ -24,8 +24,8 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from dyngs.api.train import train
-from dyngs.capture.sfm import estimate_poses
-from dyngs.capture.sfm_work import SfmOptions
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import estimate_poses
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
@@ -115,13 +115,13 @@ def row(capture: Path, options: argparse.Namespace, overrides: Sequence[str]) ->
             result.num_images,
             result.mean_error_px,
         ]
-        figures.write_text(json.dumps([*fields, result.mapper]))
-    seconds, cpu, registered, count, error_px, mapper = json.loads(figures.read_text())
+        figures.write_text(json.dumps(fields))
+    seconds, cpu, registered, count, error_px = json.loads(figures.read_text())
     posed = all_views(read_capture(DataConfig(root=out)).splits)
     frames = [views[int(view.image_path.stem[6:])] if video else view for view in posed]
     labels = [view.image_path.stem for view in frames]
     off = errors(centres(posed, labels), centres(views, [view.image_path.stem for view in views]))
-    text = f"| {name} | {seconds:.0f} ({cpu:.0f}) | {registered} of {count}, {mapper} | {error_px:.2f} px "
+    text = f"| {name} | {seconds:.0f} ({cpu:.0f}) | {registered} of {count} | {error_px:.2f} px "
     text += f"| {off.mean():.2%}, {off.max():.2%} "
     if options.train:
         preset = "dynamic" if video else "static"

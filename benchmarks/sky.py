@@ -24,7 +24,7 @@ import trimesh
 
 import dyngs
 from dyngs.api.train import train
-from dyngs.capture.silhouettes import points_in_silhouettes
+from dyngs.capture.initial_points import points_in_silhouettes
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.metrics import psnr

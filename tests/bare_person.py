@@ -13,9 +13,7 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import SH_C0
-from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.corrections import new_corrections
-from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.posing import Skeleton, new_corrections, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate

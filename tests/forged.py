@@ -26,12 +26,13 @@ from dyngs.runs.stored_file import (
     _DTYPES,
     MAGIC,
     MAX_HEADER,
+    Coding,
+    TensorKind,
     _Header,
     _Info,
     _stored,
     compressed,
 )
-from dyngs.runs.stored_tensors import Coding, TensorKind
 from dyngs.static.keys import StaticModel
 
 Tensors = dict[str, Tensor]

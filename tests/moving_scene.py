@@ -94,7 +94,7 @@ def row_of_balls(count: int = 5) -> Gaussians:
     )
 
 
-SLIDING = ControlNodesField(nodes=2, pieces=1, move_rotations=False, move_scales=False)
+SLIDING = ControlNodesField(nodes=2, pieces=1, moves=())
 
 
 def sliding_nodes() -> ControlNodes:

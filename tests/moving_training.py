@@ -19,8 +19,9 @@ from dyngs.deform.fields import new_field
 from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
+from dyngs.deform.schedule import DeformSchedule
 from dyngs.deform.still_error import StillErrors
-from dyngs.deform.training import DeformSchedule, DynamicTraining, TrainingViews
+from dyngs.deform.training import DynamicTraining, TrainingViews
 from dyngs.gaussians import EditResult, Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import GaussianTimeStep

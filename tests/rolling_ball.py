@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.data.synthetic.captures import hemisphere_cameras
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, Sphere, render_scene
 from dyngs.data.synthetic.scenes import scene_at
-from dyngs.deform.bodies.paths import NEVER, Shots
+from dyngs.deform.bodies.paths import NEVER, FrameStack
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -21,7 +21,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 @functools.cache
 def rolling(
     count: int = 24, size: int = 72, turns: bool = True
-) -> tuple[Shots, np.ndarray, np.ndarray]:
+) -> tuple[FrameStack, np.ndarray, np.ndarray]:
     """The images, and the ball's true (T, 3) centres and (T, 3, 3) rotations; without ``turns`` it
     slides."""
     balls = []
@@ -33,7 +33,7 @@ def rolling(
 
 
 @functools.cache
-def hopping(count: int = 48, size: int = 64) -> tuple[Shots, np.ndarray, np.ndarray]:
+def hopping(count: int = 48, size: int = 64) -> tuple[FrameStack, np.ndarray, np.ndarray]:
     """The same of a ball that hops on the spot four times, and spins by two turns about a tilted
     axis."""
     balls = []
@@ -49,7 +49,7 @@ def hopping(count: int = 48, size: int = 64) -> tuple[Shots, np.ndarray, np.ndar
     return seen(balls, size)
 
 
-def seen(balls: Sequence[Sphere], size: int) -> tuple[Shots, np.ndarray, np.ndarray]:
+def seen(balls: Sequence[Sphere], size: int) -> tuple[FrameStack, np.ndarray, np.ndarray]:
     """The images of ``balls``, one at each time, and their centres and rotations."""
     count = len(balls)
     times = np.linspace(0.0, 1.0, count)
@@ -61,7 +61,7 @@ def seen(balls: Sequence[Sphere], size: int) -> tuple[Shots, np.ndarray, np.ndar
     still = [_shown(Scene((plate,)), pose, size) for pose in poses]
     focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
     lens = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    shots = Shots(
+    shots = FrameStack(
         times=times,
         images=np.stack(images),
         still=np.stack(still),

@@ -15,14 +15,11 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.schedule import Rates
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
-from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
-from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
+from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanModel
@@ -114,7 +111,7 @@ def _person() -> HumanScene:
     subject = Subject(
         Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)), shapes
     )
-    scene = HumanTraining(PERSON, (0, 1, 2), Rates(10)).first_scene(gaussians, subject)
+    scene = first_scene(gaussians, subject)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)
     return scene

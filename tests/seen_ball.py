@@ -8,14 +8,14 @@ import torch
 from small_triangles import camera
 
 from dyngs.core.camera import Cameras
-from dyngs.gaussians.surface import Seen
+from dyngs.gaussians.surface import DepthView
 
 RADIUS, SIZE = 0.8, 48
 LOW = torch.full((3,), -1.0)
 HIGH = torch.full((3,), 1.0)  # Corners of a box around it
 
 
-def seen_from(turn: torch.Tensor) -> Seen:
+def seen_from(turn: torch.Tensor) -> DepthView:
     """A ball around the origin, red where x > 0; ``turn`` (3, 3) of the camera."""
     looking = camera(SIZE)
     pose = looking.cam_from_world.clone()
@@ -32,11 +32,13 @@ def seen_from(turn: torch.Tensor) -> Seen:
     world = (depth[..., None] * ray - torch.tensor([0.0, 0, 4])) @ turn
     colour = torch.zeros(SIZE, SIZE, 3)
     colour[..., 0] = (world[..., 0] > 0).float()
-    return Seen(Cameras(pose, looking.intrinsics, SIZE, SIZE), depth, (inside > 0).float(), colour)
+    return DepthView(
+        Cameras(pose, looking.intrinsics, SIZE, SIZE), depth, (inside > 0).float(), colour
+    )
 
 
 @cache
-def views() -> list[Seen]:
+def views() -> list[DepthView]:
     turns = [torch.eye(3)]
     for axis, other in ((0, 2), (1, 2)):
         for cosine, sine in ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)):

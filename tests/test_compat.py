@@ -306,10 +306,10 @@ def test_unsupported_arguments_are_refused_by_name(name: str, scene: Scene) -> N
             {"rasterize_mode": "mip"},
             "rasterize_mode must be one of classic, antialiased, got 'mip'",
         ),
-        ({"sh_degree": 3}, "with sh_degree colors must be"),
+        ({"sh_degree": 3}, "colors must be"),
         (
             {"colors": torch.zeros(7, 3).double()},
-            r"colors must be \(20, D\) or \(2, 20, D\), got \(7, 3\)",
+            r"colors must be .* 20, D\), got \(7, 3\)",
         ),
         (
             {"colors": torch.zeros(20, 4, 3).double(), "sh_degree": 2},

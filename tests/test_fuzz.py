@@ -18,8 +18,8 @@ import dyngs
 from dyngs.data.read import FORMATS
 
 ROOT = Path(__file__).resolve().parents[1]
-INPUTS = max(4, settings.default.max_examples // 10)
-"""Changed inputs of a reader; a hundred with HYPOTHESIS_PROFILE=long. ``python -m fuzz`` tries
+INPUTS = max(5, settings.default.max_examples // 20)
+"""Changed inputs of a reader; fifty with HYPOTHESIS_PROFILE=long. ``python -m fuzz`` tries
 more."""
 
 pytestmark = pytest.mark.skipif(

@@ -42,9 +42,7 @@ from dyngs.training.new_trainer import assemble, with_points
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(
-        folder, StillOptions(size=16, num_train=5, num_test=1, samples=1)
-    )
+    write_still_capture(folder, StillOptions(size=16, num_train=5, num_test=1, samples=1))
     return folder
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -152,12 +154,12 @@ def test_missing_packages_give_a_reason(monkeypatch) -> None:
 def test_lpips_never_downloads(monkeypatch, tmp_path) -> None:
     """With packages but without weights, nothing is constructed."""
 
-    def forbidden(*_: object) -> None:
+    def forbidden(**_: object) -> None:
         raise AssertionError("constructed without weights")
 
     monkeypatch.setattr(metrics, "find_spec", lambda name: object())
     monkeypatch.setattr(metrics, "_backbone_file", lambda net: tmp_path / "alexnet.pth")
-    monkeypatch.setattr(metrics, "_lpips_distance", forbidden)
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=forbidden))
     lpips = load_lpips("alex")
     assert lpips.distance is None
     assert "alexnet.pth are not in torch's cache" in str(lpips.reason)

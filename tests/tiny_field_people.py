@@ -1,4 +1,4 @@
-"""Small synthetic people, and small networks that predict fields of them, for tests."""
+"""Small synthetic people, and networks that predict fields of them, for tests."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.predict.fields.people import Person, person_of
 from dyngs.human.synthetic.people import PeopleOptions, write_people
 
-NETWORKS: dict[str, dict[str, object]] = {
-    "keypoint_nerf": {"step": 0.04},
-    "eg_human_nerf": {"samples": 8},
-}
-"""Keys of small networks, by kind."""
-SIZES = {"features": 8, "width": 8, "patch": 16, "source_views": 3}
+NETWORKS = ("eg_human_nerf", "keypoint_nerf")
 
 
 def field_people(folder: Path, people: int = 2) -> Path:
@@ -27,7 +22,7 @@ def field_config(kind: str, folder: Path, run: Path, **train: object) -> Config:
     return Config.model_validate(
         {
             "data": {"root": folder},
-            "model": {"kind": kind} | SIZES | NETWORKS[kind],
+            "model": {"kind": kind, "source_views": 3},
             "train": {"steps": 4, "save_every": 2, "alpha_weight": 0.1} | train,
             "run": {"dir": run, "threads": 1},
         }

@@ -26,20 +26,20 @@ from dyngs.ops.quaternions import identity_quat
 
 KINDS = ("hexplane", "mlp", "control_nodes")  # fields that begin as the identity
 ALL_KINDS = (*KINDS, "free")
-HEADS = ("move_rotations", "move_scales", "move_opacities", "move_colors")
+HEADS = ("rotations", "scales", "opacities", "colors")
 TIMES = (0.0, 0.37, 1.0)
 
 
 def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
     """Options of a field that moves every attribute, or only positions."""
-    heads = dict.fromkeys(HEADS, everything)
+    moves = HEADS if everything else ()
     if kind == "hexplane":
-        return HexplaneField(channels=3, resolution=5, levels=(1, 2), width=8, **heads)
+        return HexplaneField(channels=3, resolution=5, levels=(1, 2), width=8, moves=moves)
     if kind == "control_nodes":
-        return ControlNodesField(nodes=5, pieces=3, **heads)
+        return ControlNodesField(nodes=5, pieces=3, moves=moves)
     if kind == "free":
         return FreeField()
-    return MlpField(depth=2, width=8, **heads)
+    return MlpField(depth=2, width=8, moves=moves)
 
 
 def tiny_setup(num_moving: int = 9, num_times: int = 10) -> FieldSetup:

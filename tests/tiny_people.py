@@ -10,7 +10,7 @@ from dyngs.config import Config, DataConfig
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.ghg.learner import Filmed, filmed
+from dyngs.human.predict.ghg.learner import TrainingPerson, filmed
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
@@ -19,9 +19,6 @@ NET = HumanPredictorModel(
     resolution=32,
     scaffold_heights=(0.0, 0.02),
     source_views=3,
-    source_sets=1,
-    target_views=1,
-    widths=(8, 8),
 )
 
 
@@ -37,7 +34,7 @@ def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -
     return folder
 
 
-def person(capture: Path, model: HumanPredictorModel = NET) -> Filmed:
+def person(capture: Path, model: HumanPredictorModel = NET) -> TrainingPerson:
     """The person of one capture."""
     return filmed(DataConfig.model_validate({"root": capture}), model, body())
 

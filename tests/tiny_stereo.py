@@ -9,7 +9,7 @@ from dyngs.config import Config
 from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.human.synthetic.people import PeopleOptions, write_people
 
-STEREO = GpsModel(person_px=32, widths=(8, 8, 8), depth_fraction=0.5)
+STEREO = GpsModel(person_px=32)
 PEOPLE = PeopleOptions(people=2, size=40, cameras=24)
 
 

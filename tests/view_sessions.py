@@ -11,9 +11,8 @@ from moving_scene import Sliding, camera, moving_scene
 
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened, opened_scene
-from dyngs.view.cameras import pose_of
-from dyngs.view.captured_views import Viewpoint
 from dyngs.view.session import Eye, Sent, Session
+from dyngs.view.views import Viewpoint, pose_of
 
 
 def opened_at(scene: GaussianScene, name: str = "balls") -> Opened:

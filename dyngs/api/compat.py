@@ -21,8 +21,7 @@ from dyngs.ops.checks import (
     check_choice,
     check_count,
     check_finite,
-    check_near_and_far,
-    check_number,
+    check_tensors,
 )
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
@@ -148,9 +147,16 @@ def rasterization(
     if any(refused.values()):
         names = ", ".join(name for name, used in refused.items() if used)
         raise DyngsError(f"rasterization: dyngs does not support {names} with the value given")
-    _check_settings(width, height, near_plane, far_plane, radius_clip, eps2d, channel_chunk)
+    for name, count in (("width", width), ("height", height), ("channel_chunk", channel_chunk)):
+        check_count(f"rasterization: {name}", count, 1, LARGEST_COUNT)
     check_choice("rasterization: render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     check_choice("rasterization: rasterize_mode", rasterize_mode, ("classic", "antialiased"))
+    try:
+        limits = ProjectionOptions(
+            eps2d, near_plane, far_plane, 1 / 255, radius_clip, rasterize_mode == "antialiased"
+        )
+    except DyngsError as error:
+        raise DyngsError(f"rasterization: {error}") from None
     tensors = {
         "means": means,
         "quats": quats,
@@ -161,14 +167,11 @@ def rasterization(
     tensors |= {"viewmats": viewmats, "Ks": Ks} | (
         {} if backgrounds is None else {"backgrounds": backgrounds}
     )
-    _check_shapes(tensors, sh_degree, with_colors="RGB" in render_mode)
+    _check_tensors(tensors, sh_degree, with_colors="RGB" in render_mode)
     check_finite(tensors)
     check_focal_lengths(Ks, "Ks")
     check_poses(viewmats, "viewmats")
     cameras = Cameras(viewmats, Ks, width, height)
-    limits = ProjectionOptions(
-        eps2d, near_plane, far_plane, 1 / 255, radius_clip, rasterize_mode == "antialiased"
-    )
     splats = _project(means, quats, scales, opacities, cameras, limits, packed=packed)
     shades = _colors(means, cameras, colors, splats.projection, sh_degree)
     channels, backgrounds = _with_depth(shades, splats.projection.depths, backgrounds, render_mode)
@@ -199,45 +202,17 @@ class _Splats:
         return x if self.camera_ids is None else x[self.camera_ids, self.gaussian_ids]
 
 
-def _check_settings(
-    width: int,
-    height: int,
-    near: float,
-    far: float,
-    radius_clip: float,
-    eps2d: float,
-    channel_chunk: int,
-) -> None:
-    try:
-        for name, count in (("width", width), ("height", height), ("channel_chunk", channel_chunk)):
-            check_count(name, count, 1, LARGEST_COUNT)
-        check_near_and_far(near, far)
-        check_number("radius_clip", radius_clip, 0)
-        check_number("eps2d", eps2d, 0)
-    except DyngsError as error:
-        raise DyngsError(f"rasterization: {error}") from None
-
-
-def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None, *, with_colors: bool) -> None:
-    means = tensors["means"]
-    colors = tensors["colors"]
+def _check_tensors(tensors: dict[str, Tensor], sh_degree: int | None, *, with_colors: bool) -> None:
+    """Raise an error unless the tensors fit each other."""
+    op = "rasterization"
     for name, x in tensors.items():
         if not isinstance(x, Tensor):
-            raise DyngsError(
-                f"rasterization: {name} must be a torch tensor, got {type(x).__name__}"
-            )
-        if x.device != means.device:
-            raise DyngsError(
-                f"rasterization: {name} is on {x.device}, but means on {means.device}; use one device"
-            )
-    if means.ndim != 2:
-        raise DyngsError(
-            f"rasterization: means must be (N, 3), got {tuple(means.shape)}; scenes are not batched here"
-        )
-    if means.dtype not in (torch.float32, torch.float64):
-        raise DyngsError(
-            f"rasterization: means is {means.dtype}; use float32 (or float64 for checks)"
-        )
+            raise DyngsError(f"{op}: {name} must be a torch tensor, got {type(x).__name__}")
+    means = tensors["means"]
+    colors = tensors["colors"]
+    if means.ndim != 2 or means.dtype not in (torch.float32, torch.float64):
+        got = f"{tuple(means.shape)} {means.dtype}"
+        raise DyngsError(f"{op}: means must be (N, 3) float32 (or float64 for checks), got {got}")
     n = len(means)
     c = tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
     shapes: dict[str, tuple[int, ...]] = {
@@ -245,36 +220,24 @@ def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None, *, with_col
         "quats": (n, 4),
         "scales": (n, 3),
         "opacities": (n,),
+        "viewmats": (c, 4, 4),
+        "Ks": (c, 3, 3),
     }
-    shapes |= {"viewmats": (c, 4, 4), "Ks": (c, 3, 3)}
     if with_colors:  # to depth alone the background does not matter
         shapes["backgrounds"] = (c, *((3,) if sh_degree is not None else colors.shape[-1:]))
-    for name, x in tensors.items():
-        if name in shapes and tuple(x.shape) != shapes[name]:
-            raise DyngsError(f"rasterization: {name} must be {shapes[name]}, got {tuple(x.shape)}")
-        if x.dtype != means.dtype:
-            raise DyngsError(
-                f"rasterization: {name} is {x.dtype}, but means is {means.dtype}; use one dtype"
-            )
-    _check_colors(colors, n, c, sh_degree)
-
-
-def _check_colors(colors: Tensor, n: int, c: int, sh_degree: int | None) -> None:
-    if sh_degree is None:
-        if tuple(colors.shape[:-1]) not in ((n,), (c, n)) or colors.shape[-1] == 0:
-            raise DyngsError(
-                f"rasterization: colors must be ({n}, D) or ({c}, {n}, D), got {tuple(colors.shape)}"
-            )
-        return
-    if tuple(colors.shape[:-2]) not in ((n,), (c, n)) or colors.shape[-1] != 3:
-        raise DyngsError(
-            f"rasterization: with sh_degree colors must be ([{c},] {n}, K, 3), got {tuple(colors.shape)}"
-        )
-    check_count("rasterization: sh_degree", sh_degree, 0, MAX_SH_DEGREE)
-    if (sh_degree + 1) ** 2 > colors.shape[-2]:
-        raise DyngsError(
-            f"rasterization: sh_degree {sh_degree} does not fit {colors.shape[-2]} coefficients"
-        )
+    given = {name: (x, shapes.get(name, tuple(x.shape))) for name, x in tensors.items()}
+    check_tensors(op, given, means.dtype)
+    values = 1 if sh_degree is None else 2
+    per_gaussian = tuple(colors.shape[:-values]) in ((n,), (c, n))
+    if not per_gaussian or (colors.shape[-1] == 0 if sh_degree is None else colors.shape[-1] != 3):
+        wanted = "D" if sh_degree is None else "K, 3"
+        got = tuple(colors.shape)
+        raise DyngsError(f"{op}: colors must be ([{c},] {n}, {wanted}), got {got}")
+    if sh_degree is not None:
+        check_count(f"{op}: sh_degree", sh_degree, 0, MAX_SH_DEGREE)
+        if (sh_degree + 1) ** 2 > colors.shape[-2]:
+            count = colors.shape[-2]
+            raise DyngsError(f"{op}: sh_degree {sh_degree} does not fit {count} coefficients")
 
 
 def _project(

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from dyngs.compress.measure import storage_plan
-from dyngs.compress.precision import GREY_LEVELS, Precision, mean_square_change
+from dyngs.compress.measure import GREY_LEVELS, Precision, mean_square_change, storage_plan
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.models.renderable import Renderable
@@ -19,8 +18,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.frame import read_frame, write_frame
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.stored_file import decoded, encoded, write_scene
-from dyngs.runs.stored_tensors import FIELD, drawable
+from dyngs.runs.stored_file import FIELD, decoded, drawable, encoded, write_scene
 from dyngs.training.new_trainer import restored_model
 
 MISSED = 1.05

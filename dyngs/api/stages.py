@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dyngs.api.choose import choose
 from dyngs.api.first_scene import first_of
-from dyngs.capture.unposed import with_poses
+from dyngs.capture.sfm.unposed import with_poses
 from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ReportProgress

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import json
 
 from dyngs.cli.arguments import (
     Commands,
     add_command,
     add_device,
+    add_json,
     computing_device,
     input_path,
-    output_path,
     whole,
 )
+from dyngs.cli.output import numbers_table, print_tables
 
 
 def add_parser(commands: Commands) -> None:
@@ -30,9 +32,7 @@ def add_parser(commands: Commands) -> None:
         "--repeats", type=kind, default=30, metavar="N", help="repetitions (default 30)"
     )
     add_device(parser, "cpu")
-    parser.add_argument(
-        "--json", type=output_path, metavar="FILE", help="write the results as JSON as well"
-    )
+    add_json(parser)
 
 
 def run_rasterize(arguments: argparse.Namespace) -> int:
@@ -41,10 +41,9 @@ def run_rasterize(arguments: argparse.Namespace) -> int:
 
     from dyngs.cli.kernel_bench import (
         bench_rasterize,
-        format_report,
         garden_workload,
         random_workload,
-        write_report,
+        report_cells,
     )
 
     device = computing_device(arguments.device)
@@ -53,7 +52,8 @@ def run_rasterize(arguments: argparse.Namespace) -> int:
         threads = [1]
     workload = garden_workload(arguments.points) if arguments.points else random_workload()
     report = bench_rasterize(workload.to(device), sorted(set(threads)), arguments.repeats)
-    print(format_report(report))
     if arguments.json:
-        write_report(report, arguments.json)
+        print(json.dumps(report, indent=2))
+    else:
+        print_tables(numbers_table(*report_cells(report)))
     return 0

@@ -12,7 +12,7 @@ from dyngs.cli.output import ProgressBar, print_lines, print_notes
 from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
-    from dyngs.human.fit.known_person import KnownAvatar
+    from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "spin", "room", "roll", "human", "people")
@@ -99,12 +99,6 @@ def _add_sfm(verbs: args.Commands) -> None:
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument(
-        "--mapper",
-        choices=("auto", "global", "incremental"),
-        default="auto",
-        help="COLMAP's mapping",
-    )
-    parser.add_argument(
         "--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep"
     )
     frames = "frames to take of a video (default 100; of each of several: up to 300)"
@@ -145,13 +139,6 @@ def _add_people(verbs: args.Commands) -> None:
     about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    parser.add_argument(
-        "--person",
-        type=int,
-        default=1,
-        metavar="N",
-        help="which of several people (1: the largest)",
-    )
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
     parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
@@ -226,7 +213,7 @@ def _add_synth(verbs: args.Commands) -> None:
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, or on videos without poses."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
-    from dyngs.capture.unposed import is_videos
+    from dyngs.capture.sfm.unposed import is_videos
     from dyngs.data.read import capture_folder
 
     arguments.path = capture_folder(arguments.path)
@@ -264,10 +251,10 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
 
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and print the next commands."""
-    from dyngs.capture.multi_video.estimate import poses_of_videos
-    from dyngs.capture.sfm import estimate_poses
-    from dyngs.capture.sfm_work import SfmOptions
-    from dyngs.capture.unposed import is_several_videos
+    from dyngs.capture.sfm.colmap import SfmOptions
+    from dyngs.capture.sfm.estimate import estimate_poses
+    from dyngs.capture.sfm.several_videos import poses_of_videos
+    from dyngs.capture.sfm.unposed import is_several_videos
     from dyngs.data.read import capture_folder
 
     limits = args.data_section(arguments.overrides)
@@ -280,7 +267,6 @@ def run_sfm(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{images}: --start is for a folder of several videos")
     options = SfmOptions(
         matching=arguments.matching,
-        mapper=arguments.mapper,
         num_frames=arguments.frames,
         masks=arguments.masks,
         starts=_starts(arguments.start),
@@ -300,7 +286,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 
 def _require_options_of_videos(arguments: argparse.Namespace) -> None:
     """Refuse options that several videos do not have."""
-    usual = {"matching": "auto", "mapper": "auto", "masks": None}
+    usual = {"matching": "auto", "masks": None}
     for option in (name for name, value in usual.items() if getattr(arguments, name) != value):
         raise DyngsError(
             f"{arguments.images}: --{option} is for one video or photos; leave it out for several videos"
@@ -350,15 +336,13 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
+    from dyngs.human.detect.detector import MediaPipe
     from dyngs.human.detect.find_person import write_found_person
-    from dyngs.human.detect.mediapipe import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
-        result = write_found_person(
-            options, arguments.out, detector, report, number=arguments.person
-        )
+        result = write_found_person(options, arguments.out, detector, report)
     print_lines(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
@@ -370,7 +354,7 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
     if person is None or not (person / RESOLVED_NAME).is_file():
         return None
     from dyngs.human.avatar.scene import avatar_of
-    from dyngs.human.fit.known_person import KnownAvatar
+    from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.runs.checkpoint import load_run
 
     run = load_run(person)

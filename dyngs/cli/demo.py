@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
+from dyngs.cli.output import numbers_table, print_tables
 from dyngs.core.errors import as_word
 
 
@@ -26,15 +27,13 @@ def add_parser(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo and print the results and the paths of the files."""
-    from rich.console import Console
-
     from dyngs.cli.demo_run import DemoOptions, result_table, run_demo
     from dyngs.cli.training_progress import TrainingProgress
 
     options = DemoOptions(steps=arguments.steps, threads=arguments.threads)
     with TrainingProgress() as progress:
         result = run_demo(arguments.out, options, [progress])
-    Console().print(result_table(result))
+    print_tables(numbers_table(*result_table(result)))
     print(f"truth, render, error  {result.images / 'sheet.png'}")
     print(f"test views            {result.images}")
     print(f"orbit video           {result.video}")

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dyngs.api.train import train
 from dyngs.config import Config
@@ -21,9 +20,6 @@ from dyngs.export.splat_files import write_run_splats
 from dyngs.io.lock import LOCK_NAME, InUseError, writing
 from dyngs.runs.opened import open_run
 from dyngs.training.events import Listener
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -134,9 +130,8 @@ def is_unused(folder: Path) -> bool:
     )
 
 
-def result_table(result: DemoResult) -> Table:
-    from rich.table import Table
-
+def result_table(result: DemoResult) -> tuple[str, list[str], list[list[str]]]:
+    """Return title, head and cells of the table of results."""
     report = result.report
     size = f"{report.width}x{report.height}"
     title = f"{counted(report.num_views, 'test view')} of {size}, {counted(report.step, 'step')}"
@@ -150,8 +145,4 @@ def result_table(result: DemoResult) -> Table:
         "training s": f"{report.seconds_train:.1f}",
         "total s": f"{result.seconds:.1f}",
     }
-    table = Table(title=title)
-    for name in cells:
-        table.add_column(name, justify="right")
-    table.add_row(*cells.values())
-    return table
+    return title, list(cells), [list(cells.values())]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
-from dyngs.cli.arguments import Commands, add_command
+from dyngs.cli.arguments import Commands, add_command, add_json
 from dyngs.core.errors import DyngsError
 
 _SAME = (
@@ -49,9 +50,8 @@ class Check:
 
 
 def add_parser(commands: Commands) -> None:
-    add_command(
-        commands, "doctor", run, "report versions, cores, instruction set and optional packages"
-    )
+    about = "report versions, cores, instruction set and optional packages"
+    add_json(add_command(commands, "doctor", run, about))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -60,6 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     findings = list(examine())
+    if arguments.json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=2))
+        return 0
     table = Table(show_header=False, box=None, pad_edge=False)
     colours = {"ok": "green", "absent": "yellow", "broken": "red"}
     for finding in findings:

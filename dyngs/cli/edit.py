@@ -139,7 +139,7 @@ def _edits(arguments: argparse.Namespace) -> Edits:
         frame=Frame(
             None if arguments.up is None else direction(arguments.up),
             None if arguments.origin is None else point(arguments.origin, "--origin"),
-            None if arguments.scale is None else scale_of(arguments.scale),
+            1.0 if arguments.scale is None else scale_of(arguments.scale),
         ),
         geo=None if arguments.geo in (None, _EXIF) else geo_frame(arguments.geo),
         gps=arguments.geo == _EXIF,

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.cli.output import print_notes
-from dyngs.core.errors import counted, escaped
+from dyngs.cli.output import numbers_table, print_notes, print_tables
+from dyngs.core.errors import counted
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from dyngs.evaluate.report import EvalReport
 
 _OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
@@ -42,13 +40,12 @@ def add_parser(commands: args.Commands) -> None:
         "done after camera.refine"
     )
     parser.add_argument("--refine", action="store_true", help=about)
+    args.add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print a table."""
     with heavy_imports():
-        from rich.console import Console
-
         from dyngs.config.io import load_resolved
         from dyngs.evaluate.report import evaluate_run, report_path
 
@@ -67,55 +64,65 @@ def run(arguments: argparse.Namespace) -> int:
         device=args.computing_device(arguments.device).type,
         data_root=args.data_root(arguments),
     )
-    Console().print(report_table(report))
+    if arguments.json:
+        print(report.to_json(), end="")
+        return 0
+    title = f"{counted(report.num_views, 'view')} of the {report.split} split"
+    print_tables(numbers_table(title, ("metric", "value"), report_rows(report)))
     print_notes(report.notes, report.warnings)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 
 
-def report_table(report: EvalReport) -> Table:
-    """Return a table of the mean metrics, with the reason where one is missing."""
-    from rich.markup import escape
-    from rich.table import Table
+def report_rows(report: EvalReport) -> list[tuple[str, str]]:
+    """Return labels and values of the mean metrics, with the reason where one is missing."""
 
-    table = Table(
-        "metric", "value", title=f"{counted(report.num_views, 'view')} of the {report.split} split"
-    )
-    table.add_row("PSNR", f"{report.psnr:.2f} dB")
+    def known(name: str, shown: str = "{:.4f}") -> str:
+        value = getattr(report, name)
+        return report.reasons.get(name, "not measured") if value is None else shown.format(value)
+
+    rows = [("PSNR", f"{report.psnr:.2f} dB")]
     if report.psnr_white is not None and report.psnr_black is not None:
-        table.add_row(
-            "PSNR on white, on black", f"{report.psnr_white:.2f} dB, {report.psnr_black:.2f} dB"
-        )
+        both = f"{report.psnr_white:.2f} dB, {report.psnr_black:.2f} dB"
+        rows.append(("PSNR on white, on black", both))
     if report.psnr_right is not None and report.psnr_right_fitted is not None:
         right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
-        table.add_row("PSNR of right halves", right)
+        rows.append(("PSNR of right halves", right))
     if report.psnr_own_poses is not None:
-        table.add_row(f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB")
-    table.add_row("SSIM", f"{report.ssim:.4f}")
-    for label, value in (*_rows_of_person(report), *_rows_of_regions(report)):
-        table.add_row(label, escape(escaped(value)))
-    for label, name, value in (
-        ("FLIP", "flip", report.flip),
-        (f"LPIPS ({report.lpips_net})", "lpips", report.lpips),
-    ):
-        reason = escape(report.reasons.get(name, "not measured"))
-        table.add_row(label, reason if value is None else f"{value:.4f}")
-    for label, value in _rows_over_time(report):
-        table.add_row(label, escape(escaped(value)))
-    field = f", {report.field_mb:.1f} of them the field" if report.num_moving else ""
-    deforming = f", {report.deform_fraction:.0%} of the time deforming" if report.num_moving else ""
-    table.add_row("image size", f"{report.width}x{report.height} on {report.background}")
+        rows.append((f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB"))
+    rows.append(("SSIM", f"{report.ssim:.4f}"))
+    rows += _rows_of_person(report)
+    rows += _rows_of_regions(report)
+    rows += [("FLIP", known("flip")), (f"LPIPS ({report.lpips_net})", known("lpips"))]
+    if report.psnr_per_time:
+        values = [at.psnr for at in report.psnr_per_time]
+        worst = min(report.psnr_per_time, key=lambda at: at.psnr)
+        mean = sum(values) / len(values)
+        spread = f"min {worst.psnr:.2f}, mean {mean:.2f}, max {max(values):.2f} dB; worst at time {worst.time:g}"
+        rows.append((f"PSNR at {counted(len(values), 'time')}", spread))
+        moves = report.num_moving or report.flicker is None
+        flicker = known("flicker", "{:.3f} of 255") if moves else "0 (nothing moves)"
+        rows.append(("flicker", flicker))
+        rows.append(("flicker error", known("flicker_error", "{:.3f} of 255")))
+        if report.track_error_px is not None:
+            close = f"{report.track_within_5px or 0:.0%} within 5 px"
+            still = f"{report.track_motion_px or 0:.2f} px if nothing moved"
+            rows.append(("tracks", f"{report.track_error_px:.2f} px off, {close}; {still}"))
+    rows.append(("image size", f"{report.width}x{report.height} on {report.background}"))
     if report.num_gaussians:
-        table.add_row("Gaussians", f"{report.num_gaussians:,}")
+        rows.append(("Gaussians", f"{report.num_gaussians:,}"))
+    field = deforming = ""
     if report.num_moving:
-        table.add_row("moving", f"{report.num_moving:,} ({report.moving_fraction:.1%})")
+        rows.append(("moving", f"{report.num_moving:,} ({report.moving_fraction:.1%})"))
+        field = f", {report.field_mb:.1f} of them the field"
+        deforming = f", {report.deform_fraction:.0%} of the time deforming"
     stored = "" if report.stored_mb is None else f"{report.stored_mb:.2f} MB on disk, as float32 "
-    table.add_row("model", f"{stored}{report.model_mb:.1f} MB{field}")
+    rows.append(("model", f"{stored}{report.model_mb:.1f} MB{field}"))
     if report.num_gaussians:
-        table.add_row("colour", f"{report.colour_floats:.1f} numbers per Gaussian")
-    table.add_row("rendering", f"{report.fps:.1f} frames/s{deforming}")
-    table.add_row("training", f"{counted(report.step, 'step')} in {report.seconds_train:.0f} s")
-    return table
+        rows.append(("colour", f"{report.colour_floats:.1f} numbers per Gaussian"))
+    rows.append(("rendering", f"{report.fps:.1f} frames/s{deforming}"))
+    rows.append(("training", f"{counted(report.step, 'step')} in {report.seconds_train:.0f} s"))
+    return rows
 
 
 def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
@@ -145,51 +152,14 @@ def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
-    moving = report.psnr_moving
-    static = report.psnr_static
-    for label, name, value in (
-        ("on what moves", "psnr_moving", moving),
-        ("on what does not", "psnr_static", static),
-    ):
+    for label, name in (("on what moves", "psnr_moving"), ("on what does not", "psnr_static")):
+        value = getattr(report, name)
         if value is not None:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
         elif report.psnr_per_time:
             rows.append((label, report.reasons.get(name, "not measured")))
     if len(report.psnr_things) > 1:
-        things = sorted(report.psnr_things.items(), key=lambda item: item[1])[:MOST_THINGS]
-        rows.append(
-            (
-                "on the worst things",
-                ", ".join(f"{label}: {value:.2f} dB" for label, value in things),
-            )
-        )
-    return rows
-
-
-def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
-    if not report.psnr_per_time:
-        return []
-    values = [at.psnr for at in report.psnr_per_time]
-    worst = min(report.psnr_per_time, key=lambda at: at.psnr)
-    low = min(values)
-    mean = sum(values) / len(values)
-    high = max(values)
-    spread = f"min {low:.2f}, mean {mean:.2f}, max {high:.2f} dB; worst at time {worst.time:g}"
-    rows = [(f"PSNR at {counted(len(values), 'time')}", spread)]
-    flickers = (
-        ("flicker", "flicker", report.flicker),
-        ("flicker error", "flicker_error", report.flicker_error),
-    )
-    for label, name, value in flickers:
-        reason = report.reasons.get(name, "not measured")
-        known = (
-            "0 (nothing moves)"
-            if name == "flicker" and not report.num_moving
-            else f"{value or 0:.3f} of 255"
-        )
-        rows.append((label, reason if value is None else known))
-    if report.track_error_px is not None:
-        close = f"{report.track_within_5px or 0:.0%} within 5 px"
-        still = f"{report.track_motion_px or 0:.2f} px if nothing moved"
-        rows.append(("tracks", f"{report.track_error_px:.2f} px off, {close}; {still}"))
+        worst = sorted(report.psnr_things.items(), key=lambda item: item[1])[:MOST_THINGS]
+        things = ", ".join(f"{label}: {value:.2f} dB" for label, value in worst)
+        rows.append(("on the worst things", things))
     return rows

@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
@@ -25,39 +25,25 @@ _OTHER_SUFFIXES = {
     ".npz": "tracks",
     ".safetensors": "avatar",
     ".dyngs": "dyngs",
+    ".html": "html",
+    ".json": "cameras",
 }
-_OTHER_SUFFIXES |= {".html": "html", ".json": "cameras"}
-
-_TIMES = ("time", "times")
-_PARTS = ("static", "dynamic")
-_AXES = ("up", "from_up", "sh_degree")
-_SHOWN = {"surface": "mesh"}  # Names of --format, where these are others
-_FOR_SPLATS = dict.fromkeys(_AXES, "it goes with files of Gaussians")
-_UNFIT: dict[str, dict[Any, str]] = {
-    "cameras": dict[str, str].fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
-    "html": {
-        "times": "the page plays the whole clip",
-        **dict.fromkeys(_PARTS, "the page shows the whole scene"),
-        "up": "the page turns with the scene; --from-up names its axis",
-        "sh_degree": "the page has the colours of the run",
-    },
-    "mesh": dict.fromkeys(
-        (*_TIMES, *_PARTS, *_AXES, "compress"), "the file has the rest pose, y up"
-    ),
-    "surface": dict.fromkeys(
-        ("motion", *_PARTS, "sh_degree"), "the file has the surface at its time"
-    ),
-    "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
-    "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses")
-    | _FOR_SPLATS,
-    "network": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
-    "tracks": _FOR_SPLATS | {"static": "Gaussians that never move have none"},
-    "bodies": dict.fromkeys(
-        ("times", "motion", "joints", "folder", "sh_degree", "compress", *_PARTS),
-        "the file has the whole clip",
-    ),
+_WHOLE = "cameras mesh dyngs avatar network"
+_UNFIT = {
+    "time": _WHOLE,
+    "times": f"{_WHOLE} html bodies",
+    "motion": "cameras dyngs avatar network surface bodies",
+    "static": f"{_WHOLE} html surface tracks bodies",
+    "dynamic": f"{_WHOLE} html surface bodies",
+    "up": f"{_WHOLE} html tracks",
+    "from_up": f"{_WHOLE} tracks",
+    "sh_degree": f"{_WHOLE} html surface tracks bodies {MOVING}",
+    "compress": "mesh bodies",
+    "joints": "bodies",
+    "folder": "bodies",
 }
-"""Options that do not go with a format, and why."""
+"""Options, and the formats that they do not go with; ``mesh`` is that of a person, ``surface`` of
+anything else."""
 _ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of a person"))
 _ONLY |= {"folder": ("html sog", "html or sog"), "max_gaussians_drawn": ("html", "html --folder")}
 _ONLY |= {
@@ -160,7 +146,7 @@ def add_parser(commands: args.Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print where they are and how large."""
     with heavy_imports():
-        from dyngs.runs.opened import open_scene
+        import dyngs.runs.opened  # noqa: F401
 
     args.require_motion_for_feet(arguments)
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
@@ -186,7 +172,7 @@ def run(arguments: argparse.Namespace) -> int:
     if kind in writers:
         return writers[kind](arguments)
     times = _times(arguments)
-    opened = _moved(arguments, open_scene(arguments.run_dir, data_root=args.data_root(arguments)))
+    opened = _moved(arguments, _open(arguments))
     times = opened.scene.times if arguments.motion is not None and times is None else times
     if opened.scene.is_static and times is not None:
         print_notes(("nothing moves in this run: it is the same at all times",))
@@ -201,21 +187,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
-    """Raise for the first option that does not go with a format, with the reason."""
-    shown = (
-        "bodies"
-        if arguments.bodies
-        else "joints"
-        if arguments.joints
-        else f"format {_SHOWN.get(kind, kind)}"
-    )
-    unfit = "bodies" if arguments.bodies else "mesh" if arguments.joints else kind
-    for name, reason in _UNFIT.get(unfit, {}).items():
+    """Raise for the first option that does not go with a format."""
+    unfit, shown = kind, f"format {'mesh' if kind == 'surface' else kind}"
+    if arguments.bodies:
+        unfit = shown = "bodies"
+    elif arguments.joints:
+        unfit, shown = "mesh", "joints"
+    for name, formats in _UNFIT.items():
         passed = getattr(arguments, name)
-        if passed is not None and passed is not False:  # a time may be 0
-            raise DyngsError(
-                f"--{name.replace('_', '-')} does not go with --{shown}{reason and f': {reason}'}"
-            )
+        if unfit in formats.split() and passed is not None and passed is not False:
+            raise DyngsError(f"--{name.replace('_', '-')} does not go with --{shown}")
     for name, (only, asked) in _ONLY.items():
         if kind not in only.split() and getattr(arguments, name) not in (None, False):
             raise DyngsError(f"--{name.replace('_', '-')} goes with --format {asked}")
@@ -255,6 +236,12 @@ def _kind(arguments: argparse.Namespace) -> str:
             f"{out}: viewers do not know this suffix as {stated}; use one of {all_suffixes()}"
         )
     return stated or named or "ply"
+
+
+def _open(arguments: argparse.Namespace) -> Opened:
+    from dyngs.runs.opened import open_scene
+
+    return open_scene(arguments.run_dir, data_root=args.data_root(arguments))
 
 
 def _is_sequence(arguments: argparse.Namespace) -> bool:
@@ -376,10 +363,6 @@ def _export_moving(
         writing_of,
     )
 
-    if arguments.sh_degree is not None:
-        raise DyngsError(
-            f"--sh-degree does not go with --format {MOVING}, which holds no harmonics"
-        )
     how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
     print_notes((line,))
     part = _part(arguments)
@@ -475,7 +458,6 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
     from dyngs.export.redrawn import compare_run
     from dyngs.export.splat_files import writing_of
     from dyngs.io.formats.formats import format_named, read_splats
-    from dyngs.runs.opened import open_scene
 
     if arguments.format not in (None, "glb"):
         raise DyngsError(f"--bodies goes with --format glb, not with {arguments.format}")
@@ -483,7 +465,7 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
     if out.is_dir() or out.suffix.lower() != SUFFIX:
         name = out / f"bodies{SUFFIX}" if out.is_dir() else f"{out.stem}{SUFFIX}"
         raise DyngsError(f"{out}: --bodies writes one file; give --out {name}")
-    opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
+    opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
     how, line = writing_of(opened, format_named("glb").up, arguments.up, arguments.from_up)
     written = write_bodies(opened, out, time, how)
@@ -498,7 +480,7 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
     from dyngs.export.rigged.mesh_file import Played, write_mesh
     from dyngs.export.rigged.splat_files import write_rigged_splats
-    from dyngs.runs.opened import FRAME_RATE, open_scene
+    from dyngs.runs.opened import FRAME_RATE
 
     option, stem = ("--joints", "rigged") if arguments.joints else ("--format mesh", "mesh")
     if arguments.joints and kind not in ("ply", "glb"):
@@ -515,9 +497,7 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         raise DyngsError(
             "--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb"
         )
-    opened = _moved(
-        arguments, open_scene(source, data_root=args.data_root(arguments))
-    ).in_own_frame()
+    opened = _moved(arguments, _open(arguments)).in_own_frame()
     played = (
         Played(arguments.motion.stem, opened.fps or FRAME_RATE)
         if arguments.motion is not None
@@ -548,14 +528,13 @@ def _export_surface(arguments: argparse.Namespace) -> int:
     """Write the surface of a scene, at several times one file each."""
     from dyngs.export.surface_file import Cut, upright_surface, write_surface
     from dyngs.gaussians.surface import num_holes
-    from dyngs.runs.opened import open_scene
 
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
     if arguments.times and out.suffix:
         raise DyngsError(
             f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one"
         )
-    opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
+    opened = _open(arguments)
     cut = Cut(arguments.level, arguments.cells, arguments.segments)
     how, line = upright_surface(
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
@@ -576,7 +555,6 @@ def _export_page(arguments: argparse.Namespace) -> int:
     """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it
     is seen."""
     from dyngs.export.html.page import write_folder, write_page
-    from dyngs.runs.opened import open_scene
 
     source: Path = arguments.run_dir
     most = arguments.max_gaussians_drawn
@@ -595,7 +573,7 @@ def _export_page(arguments: argparse.Namespace) -> int:
             else ("--format html writes one file", ".html")
         )
         raise DyngsError(f"{out}: {what}; give --out {out.with_suffix(suffix)}")
-    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
+    opened = _moved(arguments, _open(arguments))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     written = (
         write_folder(opened, out, most=most, time=time)

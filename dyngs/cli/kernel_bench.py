@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -19,7 +18,6 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import counted, reading
 from dyngs.core.state import fields_moved_to
 from dyngs.io.numpy_files import read_arrays
-from dyngs.io.write import write_text
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, TileEntries, bin_tiles, rasterize, tally
@@ -27,7 +25,7 @@ from dyngs.ops.rasterization import BlendOptions, Tally, TileEntries, bin_tiles,
 T = TypeVar("T")
 
 SGEMM_SIZE = 2048
-STAGES = ("project", "bin + sort", "blend", "blend backward", "project backward")
+STAGES = ("project", "bin + sort", "blend", "blend backward", "project backward", "sgemm")
 
 
 @dataclass(frozen=True)
@@ -48,44 +46,6 @@ class Workload:
     def to(self, device: torch.device) -> Workload:
         """Return the same workload on ``device``."""
         return fields_moved_to(self, device)
-
-
-@dataclass(frozen=True)
-class StageTimes:
-    """Median and shortest times by stage, and the rate of a float32 matrix product, at one number
-    of threads."""
-
-    threads: int
-    milliseconds: dict[str, float]
-    fastest: dict[str, float]
-    sgemm_gflops: float
-
-    @property
-    def total(self) -> float:
-        return sum(self.milliseconds.values())
-
-
-@dataclass(frozen=True)
-class RasterizeReport:
-    """Results of ``dyngs bench rasterize``.
-
-    Attributes:
-        entries, pairs: numbers of (tile, Gaussian) pairs, and of blended (pixel, Gaussian) pairs.
-        lanes_used: fraction of the computed pairs that were blended.
-        runs: times per number of threads; on a GPU one.
-        device: "cpu", or the name of the GPU.
-    """
-
-    isa: str
-    num_gaussians: int
-    num_visible: int
-    width: int
-    height: int
-    entries: int
-    pairs: int
-    lanes_used: float
-    runs: list[StageTimes]
-    device: str = "cpu"
 
 
 def garden_workload(path: Path) -> Workload:
@@ -130,8 +90,9 @@ def _with_random_shapes(means: Tensor, colors: Tensor, cameras: Cameras) -> Work
     return Workload(means, quats, scales, opacities, colors.contiguous(), cameras)
 
 
-def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> RasterizeReport:
-    """Measure every stage, interleaved over thread counts so that other load affects them alike.
+def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> dict[str, Any]:
+    """Measure every stage, interleaved over thread counts so that other load affects them alike;
+    return the report, whose ``runs`` hold milliseconds.
 
     A workload on a GPU is timed by CUDA events.
     """
@@ -141,31 +102,33 @@ def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> Rasteri
         )
     opacities = load.opacities[None]
     entries = bin_tiles(projection, opacities, load.size)
-    pairs, lanes = (
-        float(tally(projection, opacities, load.size, kind).double().sum())
-        for kind in (Tally.PIXELS, Tally.LANES)
-    )
-    samples = {count: {name: [] for name in (*STAGES, "sgemm")} for count in threads}
+    pairs = float(tally(projection, opacities, load.size, Tally.PIXELS).double().sum())
+    samples = {count: {name: [] for name in STAGES} for count in threads}
     for repeat in range(repeats + 2):
         for count in threads:
             taken = _time_stages(load, projection, entries, count)
             if repeat >= 2:  # the first two warm up caches and allocator
                 for name, seconds in taken.items():
-                    samples[count][name].append(seconds)
-    return RasterizeReport(
-        isa=active_isa(),
-        num_gaussians=len(load.means),
-        num_visible=int((projection.radii[0, :, 0] > 0).sum()),
-        width=load.size[0],
-        height=load.size[1],
-        entries=len(entries.gaussians),
-        pairs=int(pairs),
-        lanes_used=pairs / max(lanes, 1.0),
-        runs=[_summary(count, samples[count]) for count in threads],
-        device="cpu"
-        if load.means.device.type == "cpu"
-        else torch.cuda.get_device_name(load.means.device),
-    )
+                    samples[count][name].append(1e3 * seconds)
+    device = load.means.device
+    return {
+        "isa": active_isa(),
+        "device": "cpu" if device.type == "cpu" else torch.cuda.get_device_name(device),
+        "num_gaussians": len(load.means),
+        "num_visible": int((projection.radii[0, :, 0] > 0).sum()),
+        "width": load.size[0],
+        "height": load.size[1],
+        "entries": len(entries.gaussians),
+        "pairs": int(pairs),
+        "runs": [
+            {
+                "threads": count,
+                "milliseconds": {name: statistics.median(x) for name, x in found.items()},
+                "fastest": {name: min(x) for name, x in found.items()},
+            }
+            for count, found in samples.items()
+        ],
+    }
 
 
 _LIMITS = ProjectionOptions(near=0.01)
@@ -178,9 +141,7 @@ def _time_stages(
     leaves = [x.clone().requires_grad_() for x in (load.means, load.quats, load.scales)]
     splats = [projection.means2d, projection.factors, load.opacities[None], load.colors]
     means2d, factors, opacities, colors = (x.clone().requires_grad_() for x in splats)
-    flat = Projection(
-        means2d, projection.depths, factors, projection.compensations, projection.radii
-    )
+    flat = replace(projection, means2d=means2d, factors=factors)
     seconds: dict[str, float] = {}
     timed = partial(_timed, load.means.device)
     with kernel_threads(threads):
@@ -200,7 +161,12 @@ def _time_stages(
         outputs = [projected.means2d, projected.factors, projected.depths]
         grads = [torch.ones_like(x) for x in outputs]
         seconds["project backward"], _ = timed(lambda: torch.autograd.backward(outputs, grads))
-    seconds["sgemm"] = _sgemm_seconds(load.means.device, threads)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    a = torch.ones(SGEMM_SIZE, SGEMM_SIZE, device=load.means.device)
+    timed(lambda: a @ a)  # starts the threads
+    seconds["sgemm"], _ = timed(lambda: a @ a)
+    torch.set_num_threads(before)
     return seconds
 
 
@@ -218,58 +184,30 @@ def _timed(device: torch.device, work: Callable[[], T]) -> tuple[float, T]:
     return time.perf_counter() - start, result
 
 
-def _sgemm_seconds(device: torch.device, threads: int) -> float:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    a = torch.ones(SGEMM_SIZE, SGEMM_SIZE, device=device)
-    _timed(device, lambda: a @ a)  # starts the threads
-    seconds, _ = _timed(device, lambda: a @ a)
-    torch.set_num_threads(before)
-    return seconds
-
-
-def _summary(threads: int, samples: dict[str, list[float]]) -> StageTimes:
-    milliseconds = {name: 1e3 * statistics.median(samples[name]) for name in STAGES}
-    fastest = {name: 1e3 * min(samples[name]) for name in STAGES}
-    return StageTimes(
-        threads, milliseconds, fastest, 2e-9 * SGEMM_SIZE**3 / statistics.median(samples["sgemm"])
+def report_cells(report: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
+    """Return title, head and cells of the table: median and best milliseconds by stage."""
+    runs = report["runs"]
+    is_cpu = report["device"] == "cpu"
+    where = f"instruction set {report['isa']}" if is_cpu else report["device"]
+    title = (
+        f"{counted(report['num_gaussians'], 'Gaussian')}, {report['num_visible']:,} visible at "
+        f"{report['width']}x{report['height']}, {report['entries']:,} tile entries, "
+        f"{report['pairs'] / 1e6:.1f} M blended pairs; {where}"
     )
-
-
-def write_report(report: RasterizeReport, path: Path) -> None:
-    write_text(path, json.dumps(asdict(report), indent=2) + "\n")
-
-
-def format_report(report: RasterizeReport) -> str:
-    labels = [
-        counted(run.threads, "thread") if report.device == "cpu" else "cuda" for run in report.runs
+    head = [
+        "median (best) ms",
+        *(counted(run["threads"], "thread") if is_cpu else "cuda" for run in runs),
     ]
-    preparing = [
-        (run.milliseconds["project"] + run.milliseconds["bin + sort"]) / run.total
-        for run in report.runs
+    cells = [
+        [name, *(f"{run['milliseconds'][name]:.2f} ({run['fastest'][name]:.2f})" for run in runs)]
+        for name in STAGES
     ]
-    lines = [
-        f"{counted(report.num_gaussians, 'Gaussian')}, {report.num_visible:,} visible at "
-        f"{report.width}x{report.height}, {report.entries:,} tile entries, {report.pairs / 1e6:.1f} M blended pairs, "
-        f"{report.lanes_used:.0%} of the lanes used; "
-        + (f"instruction set {report.isa}" if report.device == "cpu" else report.device),
-        f"{'stage, median (best) ms':<26}" + "".join(f"{label:>20}" for label in labels),
-    ]
-    for name in STAGES:
-        cells = [
-            f"{run.milliseconds[name]:10.2f} ({run.fastest[name]:6.2f})" for run in report.runs
-        ]
-        lines.append(f"{name:<26}" + "".join(f"{cell:>20}" for cell in cells))
-    rows = [
-        ("all stages", [f"{run.total:.2f}" for run in report.runs]),
-        ("speed-up", [f"{report.runs[0].total / run.total:.2f}x" for run in report.runs]),
-        ("project + bin, fraction", [f"{fraction:.0%}" for fraction in preparing]),
-        ("sgemm, GFLOP/s", [f"{run.sgemm_gflops:.0f}" for run in report.runs]),
-    ]
+    totals = [sum(run["milliseconds"].values()) - run["milliseconds"]["sgemm"] for run in runs]
+    cells.append(["all stages", *(f"{total:.2f}" for total in totals)])
+    cells.append(["speed-up", *(f"{totals[0] / total:.2f}x" for total in totals)])
     for name in ("blend", "blend backward"):
-        rates = [1e-3 * report.pairs / run.milliseconds[name] for run in report.runs]
-        rows.append((f"{name}, M pairs/s", [f"{rate:.0f}" for rate in rates]))
-        per_flop = [rate / run.sgemm_gflops for rate, run in zip(rates, report.runs, strict=True)]
-        rows.append(("  per sgemm GFLOP/s", [f"{x:.2f}" for x in per_flop]))
-    lines += [f"{name:<26}" + "".join(f"{cell:>20}" for cell in cells) for name, cells in rows]
-    return "\n".join(lines)
+        rates = (1e-3 * report["pairs"] / run["milliseconds"][name] for run in runs)
+        cells.append([f"{name}, M pairs/s", *(f"{rate:.0f}" for rate in rates)])
+    rates = (2e-6 * SGEMM_SIZE**3 / run["milliseconds"]["sgemm"] for run in runs)
+    cells.append(["sgemm, GFLOP/s", *(f"{rate:.0f}" for rate in rates)])
+    return title, head, cells

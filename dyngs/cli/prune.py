@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
+from dyngs.cli.output import numbers_table, print_tables, results_alone
 from dyngs.core.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from dyngs.compress.search import Promise
     from dyngs.evaluate.comparison import Cost
 
@@ -62,12 +63,11 @@ def add_parser(commands: args.Commands) -> None:
     args.add_run_device(parser)
     args.add_overrides(parser, "key=value", "other config keys of the run (docs/cli.md)")
     parser.set_defaults(takes_root=True)
+    args.add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Prune, compare with the run before, and print a table."""
-    from rich.console import Console
-
     from dyngs.api.prune import file_of
     from dyngs.api.train import num_cores
     from dyngs.evaluate.comparison import compared
@@ -81,7 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
         *args.run_device(arguments),
         *arguments.overrides,
     ]
-    folder, promise = _pruned(arguments, overrides)
+    with results_alone(arguments.json):
+        folder, promise = _pruned(arguments, overrides)
     pruned = load_run(folder)
     device = args.computing_device(pruned.config.run.device)
     before, after = compared(
@@ -90,7 +91,11 @@ def run(arguments: argparse.Namespace) -> int:
         device,
         pruned.config.data.root,
     )
-    Console().print(cost_table(before, after, promise))
+    if arguments.json:
+        print(json.dumps({"before": asdict(before), "after": asdict(after)}, indent=2))
+        return 0
+    head = ("", "before", "pruned file", "")
+    print_tables(numbers_table("", head, cost_cells(before, after, promise)))
     if pruned.config.prune.mask_times > 1 and pruned.scene.masks is None:
         print(
             "note: --masks was ignored; they are for scenes in which a deformation field moves something"
@@ -128,42 +133,31 @@ def _decibels(text: str) -> float:
     return value
 
 
-def cost_table(before: Cost, after: Cost, promise: Promise | None = None) -> Table:
-    """Return a table that compares a run with the file of a pruned one."""
-    from rich.table import Table
-
-    # Short cells, so that no label wraps at 80 columns.
-    table = Table("", "before", "pruned file", "")
+def cost_cells(before: Cost, after: Cost, promise: Promise | None = None) -> list[list[str]]:
+    """Return the rows of a table that compares a run with the file of a pruned one."""
     ratio = before.num_gaussians / after.num_gaussians
-    table.add_row(
-        "Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", f"{ratio:.1f}x fewer"
-    )
-    rows = [
+    cells = [
+        [
+            "Gaussians",
+            f"{before.num_gaussians:,}",
+            f"{after.num_gaussians:,}",
+            f"{ratio:.1f}x fewer",
+        ]
+    ]
+    quality = [
         ("PSNR, training views", before.psnr_train, after.psnr_train),
         ("PSNR, held-out views", before.psnr_test, after.psnr_test),
     ]
     if promise is not None:
-        rows.insert(1, (f"PSNR, {promise.views}", promise.before, promise.after))
-    for label, old, new in rows:
+        quality.insert(1, (f"PSNR, {promise.views}", promise.before, promise.after))
+    for label, old, new in quality:
         if old is not None and new is not None:
-            table.add_row(label, f"{old:.2f} dB", f"{new:.2f} dB", f"{new - old:+.2f} dB")
-    faster = after.fps / before.fps
-    smaller = before.megabytes / after.megabytes
-    table.add_row(
-        "rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", f"{faster:.1f}x as fast"
-    )
-    table.add_row(
-        "model",
-        f"{before.megabytes:.2f} MB",
-        f"{after.megabytes:.2f} MB",
-        f"{smaller:.1f}x smaller",
-    )
-    if after.stored is not None:
-        smaller = before.megabytes / after.stored
-        table.add_row(
-            "file",
-            f"{before.megabytes:.2f} MB",
-            f"{after.stored:.3f} MB",
-            f"{smaller:.1f}x smaller",
-        )
-    return table
+            cells.append([label, f"{old:.2f} dB", f"{new:.2f} dB", f"{new - old:+.2f} dB"])
+    faster = f"{after.fps / before.fps:.1f}x as fast"
+    cells.append(["rendering", f"{before.fps:.1f} fps", f"{after.fps:.1f} fps", faster])
+    whole = before.megabytes
+    for label, mb, digits in (("model", after.megabytes, 2), ("file", after.stored, 3)):
+        if mb is not None:
+            smaller = f"{whole / mb:.1f}x smaller"
+            cells.append([label, f"{whole:.2f} MB", f"{mb:.{digits}f} MB", smaller])
+    return cells

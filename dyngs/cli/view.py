@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     with heavy_imports():
         import torch
 
-        from dyngs.view.people import motion_files
+        from dyngs.view.controls import motion_files
         from dyngs.view.server import Serving, Viewer
         from dyngs.view.source import first_of, open_source
 

@@ -4,7 +4,7 @@ are any, and taken away as far as views that judge nothing lose no more than is 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from dyngs.compress.stage import importance, quality_of, scoring_views
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import read_capture_of
@@ -35,20 +34,6 @@ LONE, NEIGHBOURS = 20.0, 4
 """Distance to the fourth neighbour over its median, from which a Gaussian is alone."""
 _TRIALS = 6  # of a bisection
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Suspects:
-    """Gaussians of one kind that may go."""
-
-    kind: str
-    rows: Tensor  # (K,) indices, in the order in which they go: what contributes least is the first
-
-    @staticmethod
-    def of(kind: str, found: Tensor, contribution: Tensor) -> Suspects:
-        """``found``: (N,) bool. ``contribution``: (N,) sums of blending weights, px."""
-        rows = torch.nonzero(found)[:, 0]
-        return Suspects(kind, rows[torch.sort(contribution[rows], stable=True).indices])
 
 
 def by_shape(gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
@@ -123,16 +108,52 @@ def cleaned_run(
             raise DyngsError(
                 f"{run_dir}: --clean needs two views or more, of which one judges what it costs"
             )
-        judge = Judge(trainer, unseen or [trainer.images[i] for i in held])
-        kept = judge.kept(suspects_of(trainer, held), max_loss, tell)
-        views = counted(len(judge.images), "validation view" if unseen else "training view")
-        before = judge.psnr_before
-        after = judge.psnr_of(kept)
+        images = unseen or [trainer.images[i] for i in held]
+        scene: GaussianScene = trainer.model.scene.unmasked()
+        before = quality_of(trainer, scene, images)
+        trained_before = quality_of(trainer, scene)
+
+        def losses(kept: Tensor) -> tuple[float, float]:
+            """Return the losses of mean PSNR, dB: of the views held out, and of 16 training views
+            as well, because few views may be kind by chance."""
+            left = scene.select(kept)
+            loss = before - quality_of(trainer, left, images)
+            return loss, max(loss, trained_before - quality_of(trainer, left))
+
+        kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
+        for kind, rows in suspects_of(trainer, held).items():
+            kept = taken(kept, kind, rows, lambda left: losses(left)[1] <= max_loss, tell)
+        loss, worst = losses(kept)
+        views = counted(len(images), "validation view" if unseen else "training view")
         gone = f"clean: {int((~kept).sum()):,} of {counted(len(kept), 'Gaussian')} go"
-        cost = f"{before:.2f} -> {after:.2f} dB ({after - before:+.3f}) on {views} held out"
-        lost = f"{max(judge.loss_of(kept), 0):.3f} of {max_loss:g} dB lost, with training views"
-        tell(f"{gone}; {cost}; {lost}")
+        cost = f"{before:.2f} -> {before - loss:.2f} dB ({-loss:+.3f}) on {views} held out"
+        tell(f"{gone}; {cost}; {max(worst, 0):.3f} of {max_loss:g} dB lost, with training views")
         return kept.cpu()
+
+
+def taken(
+    kept: Tensor, kind: str, rows: Tensor, may_stay: Callable[[Tensor], bool], tell: Tell
+) -> Tensor:
+    """Return (N,) bool: ``kept`` without the first of ``rows`` (K,), all or as many as bisection
+    finds."""
+    rows = rows[kept[rows]]
+    low = 0
+    high = count = len(rows)
+    trials = 0
+    left = kept
+    while count > low and trials <= _TRIALS:
+        trials += 1
+        tried = kept.clone()
+        tried[rows[:count]] = False
+        if bool(tried.any()) and may_stay(tried):
+            low = count
+            left = tried
+        else:
+            high = count
+        count = (low + high) // 2
+    if len(rows):
+        tell(f"clean: {kind}: {low:,} of {counted(len(rows), 'Gaussian')} go")
+    return left
 
 
 def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
@@ -151,9 +172,9 @@ def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
     return trainer
 
 
-def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]:
-    """Return what may go, the most harmless kind first, by its contribution to all training views
-    not ``held``."""
+def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tensor]:
+    """Return the rows (K,) that may go, by kind, the most harmless first; of each first those that
+    contribute least to all training views not ``held``."""
     scene: GaussianScene = trainer.model.scene.unmasked()
     views = scoring_views(trainer, scene)
     if scene.is_static:
@@ -161,70 +182,10 @@ def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]
         views = replace(views, cameras=[cameras[i] for i in range(len(cameras)) if i not in held])
     found = importance(views, slopes=False)
     contribution = found.contribution
-    opacities = found.opacities.amax(0)
-    shapes = by_shape(scene.at(None), opacities)
     kinds = {"never seen": contribution <= 0}
     if scene.is_static and len(trainer.images) >= FEWEST_VIEWS:
         kinds["floaters"] = floaters(trainer)
+    shapes = by_shape(scene.at(None), found.opacities.amax(0))
     kinds |= {kind: shapes[kind] for kind in ("lone", "faint", "veils", "needles")}
-    return [Suspects.of(kind, rows, contribution) for kind, rows in kinds.items()]
-
-
-class Judge:
-    """What views held out say of Gaussians that go; as few of them may be kind by chance, some
-    training views as well.
-
-    Args:
-        trainer: of the run, at its end.
-        images: the views held out.
-    """
-
-    def __init__(self, trainer: GaussianTrainer, images: Sequence[Image]) -> None:
-        self.images, self._trainer = images, trainer
-        self._scene: GaussianScene = trainer.model.scene.unmasked()
-        self.psnr_before = quality_of(trainer, self._scene, images)
-        self._trained_before = quality_of(trainer, self._scene)
-
-    def psnr_of(self, kept: Tensor) -> float:
-        """Return the mean PSNR of the views, drawn of the Gaussians where ``kept`` (N,) is true,
-        dB."""
-        return quality_of(self._trainer, self._scene.select(kept), self.images)
-
-    def loss_of(self, kept: Tensor) -> float:
-        """Return the larger loss of mean PSNR, of the views held out or of 16 training views,
-        dB."""
-        trained = self._trained_before - quality_of(self._trainer, self._scene.select(kept))
-        return max(self.psnr_before - self.psnr_of(kept), trained)
-
-    def kept(self, suspects: Sequence[Suspects], max_loss: float, tell: Tell) -> Tensor:
-        """Return (N,) bool which Gaussians stay when as many suspects go as may; by kind, the first
-        ones of each."""
-        kept = torch.ones(len(self._scene), dtype=torch.bool, device=self._scene.device)
-        for one in suspects:
-            rows = one.rows[kept[one.rows]]
-            if not len(rows):
-                continue
-            count = self._most(kept, rows, max_loss)
-            tell(f"clean: {one.kind}: {count:,} of {counted(len(rows), 'Gaussian')} go")
-            kept[rows[:count]] = False
-        return kept
-
-    def _most(self, kept: Tensor, rows: Tensor, max_loss: float) -> int:
-        """Return how many of ``rows`` (K,) may go besides what has gone: all, or what bisection
-        finds."""
-
-        def may_go(count: int) -> bool:
-            left = kept.clone()
-            left[rows[:count]] = False
-            return bool(left.any()) and self.loss_of(left) <= max_loss
-
-        if may_go(len(rows)):
-            return len(rows)
-        low = 0
-        high = len(rows)
-        for _ in range(_TRIALS):
-            middle = (low + high) // 2
-            if middle == low:
-                break
-            low, high = (middle, high) if may_go(middle) else (low, middle)
-        return low
+    order = torch.sort(contribution, stable=True).indices
+    return {kind: order[is_one[order]] for kind, is_one in kinds.items()}

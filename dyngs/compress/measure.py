@@ -4,34 +4,237 @@ that will do."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 
 import torch
 from torch import Tensor
 
-from dyngs.compress.precision import (
-    GREY_LEVELS,
-    Precision,
-    assumed_precision,
-    coarseness_of,
-    measured_precision,
-    rounded,
-)
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
+from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
-from dyngs.runs.stored_file import decoded, encoded
-from dyngs.runs.stored_tensors import COARSENESS, TRIANGLES, completed, drawable, step_below
+from dyngs.runs.stored_file import (
+    COARSENESS,
+    LIMIT,
+    MAX_COARSENESS,
+    TRIANGLES,
+    checked_coarseness,
+    coding_of,
+    completed,
+    decoded,
+    drawable,
+    encoded,
+    group_of,
+    restored,
+    step_below,
+)
 from dyngs.training.new_trainer import restored_model, restored_scene
+
+GREY_LEVELS = 255.0
+TRIALS = 4  # number of steps tried per group
+CLOSE = 0.8  # fraction of the allowed error from which the search ends
+FIRST_STEP = 2.0**-6  # first step as a fraction of the mean magnitude of the values
+WIDEST_JUMP = 32.0
+OUTLYING, USUAL_FRACTION = 64.0, 0.95
+"""Values so many times as large as this fraction of those that are not 0 are outliers: steps are
+chosen without them."""
+MOST_VISIBLE = 0.9  # quantile of visibility above which Gaussians are stored most finely
+ASSUMED_STEPS = {
+    "quats": 2**-8,
+    "log_scales": 2**-6,
+    "logit_opacities": 2**-10,
+    "sh_base": 2**-7,
+    "sh_rest": 2**-7,
+}
+
+Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]
+"""Images (H, W, 3), always from the same cameras at the same times, of a checkpoint's tensors."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Quantisation steps and the change of images that they cause."""
+
+    steps: dict[str, float]  # of each group of tensors; 0: it is stored as it is
+    # root mean square change of the images, grey levels of 255; None where none could be drawn
+    change: float | None = None
+    allowed: float | None = None  # what it was to be at most; None likewise
+
+
+def coarseness_of(visibility: Tensor) -> Tensor:
+    """Return (N,) uint8 octaves by which each Gaussian may be stored more coarsely than the most
+    visible ones.
+
+    An error of a Gaussian counts with the square of its weight in the images: half an octave per
+    octave. ``visibility``: (N,) sums of its blending weights over images.
+    """
+    if not len(visibility):
+        return torch.zeros(0, dtype=torch.uint8, device=visibility.device)
+    most = torch.quantile(
+        visibility[:: max(len(visibility) // 2**20, 1)].double(), MOST_VISIBLE
+    ).clamp_min(1e-30)
+    octaves = -0.5 * (visibility.double() / most).clamp(1e-30, 1.0).log2()
+    return octaves.round().clamp_max(MAX_COARSENESS).to(torch.uint8)
+
+
+def assumed_precision(gaussians: Gaussians) -> Precision:
+    """Return steps where no image can be drawn: fine ones; those of positions follow the size of
+    the Gaussians."""
+    log_scales = gaussians.log_scales.detach().double()
+    size = float(log_scales.median(1).values.median().exp()) if len(log_scales) else 1.0
+    return Precision(
+        {f"gaussians.{name}": step for name, step in ASSUMED_STEPS.items()}
+        | {"gaussians.means": size / 64}
+    )
+
+
+def measured_precision(
+    exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
+) -> Precision:
+    """Return the largest steps found that change the images by at most ``max_change``, grey levels
+    of 255.
+
+    ``exact``: from ``drawable``, with the coarseness of the Gaussians if they have any; ``draw``
+    draws its like anew. Raises DyngsError: a value is not finite.
+    """
+
+    def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
+        """Return the mean square over all values, with the tensors of these names quantised."""
+        return mean_square_change(wanted, draw(completed(rounded(exact, steps, names))))
+
+    allowed = (max_change / GREY_LEVELS) ** 2
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, x in exact.items():
+        group = group_of(name, x)
+        if group is not None and x.numel():
+            groups.setdefault(group, {})[name] = x
+    sizes = {name: sum(x.numel() for x in group.values()) for name, group in groups.items()}
+    steps: dict[str, float] = {}
+    enough: dict[str, float] = {}
+    for name, group in groups.items():
+        steps[name], is_enough = _largest_step(
+            lambda step, name=name, group=group: change({name: step}, group),
+            list(group.values()),
+            allowed * sizes[name] / sum(sizes.values()),
+        )
+        enough[name] = steps[name] if is_enough else 0.0
+    for tried in (steps, enough):
+        kept, found = _scaled(tried, change, allowed)
+        if found <= allowed:
+            break
+    else:
+        kept = dict.fromkeys((*groups, *exact), 0.0)
+        found = change(kept)
+    return Precision(kept, math.sqrt(found) * GREY_LEVELS, max_change)
+
+
+def rounded(
+    exact: Mapping[str, Tensor], steps: Mapping[str, float], names: Iterable[str] | None = None
+) -> dict[str, Tensor]:
+    """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
+
+    ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``names``:
+    of the tensors that are rounded.
+    """
+    coarseness = (
+        checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"]))
+        if COARSENESS in exact
+        else None
+    )
+    found = dict(exact)
+    for name in exact if names is None else names:
+        coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
+        found[name] = restored(exact[name], coding, coarseness)
+    return found
+
+
+def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> float:
+    """Return the mean square over all values of images in [0, 1], after clamping; NaN where one of
+    them is."""
+    total = sum(
+        float((x.clamp(0, 1) - y.clamp(0, 1)).double().square().sum())
+        for x, y in zip(before, after, strict=True)
+    )
+    return total / max(sum(x.numel() for x in before), 1)
+
+
+def _scaled(
+    steps: dict[str, float], change: Callable[[Mapping[str, float]], float], allowed: float
+) -> tuple[dict[str, float], float]:
+    """Return all steps times one factor, so that together they change the images by what is allowed
+    or less.
+
+    And the mean square change that they make, which is larger only where no factor that was tried
+    is small enough.
+    """
+    best = None
+    tried = steps
+    found = math.inf
+    factor = 1.0
+    for trial in range(2 * TRIALS):
+        tried = {name: step and step_below(factor * step) for name, step in steps.items()}
+        found = change(tried)
+        if found <= allowed and (best is None or found > best[1]):
+            best = (tried, found)
+        if best is not None and (trial >= TRIALS or found > CLOSE * allowed):
+            break
+        if math.isnan(found):
+            break
+        factor *= min(max(math.sqrt(0.95 * allowed / max(found, 1e-300)), 0.5), 2.0)
+    return (tried, found) if best is None else best
+
+
+def _largest_step(
+    change: Callable[[float], float], group: Sequence[Tensor], allowed: float
+) -> tuple[float, bool]:
+    """Return the largest step tried that changes images by at most ``allowed``, else the finest;
+    and whether it does.
+
+    The first one tried where these images do not depend on the group at all: others may.
+    """
+    size, mean_square = _usual_size(torch.cat([x.flatten() for x in group]))
+    if size == 0:
+        return 1.0, True
+    finest = 2 * size / LIMIT
+    coarsest = 4 * size
+    step = first = min(max(FIRST_STEP * math.sqrt(mean_square), finest), coarsest)
+    best = None
+    for _ in range(TRIALS):
+        step = step_below(min(max(step, finest), coarsest))
+        found = change(step)
+        if math.isnan(found):
+            return finest, False
+        if found <= allowed:
+            best = max(best or 0.0, step)
+            if found > CLOSE**2 * allowed or step >= coarsest / 2:
+                break
+        step *= min(
+            max(math.sqrt(0.9 * allowed / max(found, 1e-300)), 1 / WIDEST_JUMP), WIDEST_JUMP
+        )
+    if best is None:
+        return finest, change(step_below(finest)) <= allowed
+    return step_below(first) if best >= coarsest / 2 else best, True
+
+
+def _usual_size(values: Tensor) -> tuple[float, float]:
+    """Return the largest of the values without outliers, and the mean of their squares."""
+    sizes = values.abs().double()
+    nonzero = sizes[sizes > 0]
+    if not len(nonzero):
+        return 0.0, 0.0
+    usual = nonzero.kthvalue(max(int(USUAL_FRACTION * len(nonzero)), 1)).values
+    sizes = sizes[sizes <= OUTLYING * usual]
+    return float(sizes.max()), float(sizes.square().mean())
+
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""
@@ -57,12 +260,8 @@ class StoragePlan:
     images: Images | None = None  # draws what was compared; None where no image can be drawn
 
 
-@dataclass(frozen=True)
-class _Shot:
-    """Camera and time of one training image."""
-
-    cameras: Cameras
-    time: float | None
+Shot = tuple[Cameras, float | None]
+"""Camera and time of one training image."""
 
 
 def storage_plan(
@@ -93,8 +292,8 @@ def storage_plan(
     @torch.no_grad()
     def images(drawn: Renderable) -> list[Tensor]:
         return [
-            drawn.render(shot.cameras, shot.time, options=options, background=background).rgb[0]
-            for shot in shots
+            drawn.render(camera, time, options=options, background=background).rgb[0]
+            for camera, time in shots
         ]
 
     def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
@@ -166,7 +365,7 @@ def coarsest_file(
     return None
 
 
-def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> list[_Shot]:
+def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> list[Shot]:
     """Return at most ``count`` training views, evenly chosen; where they have no times, those of
     the scene."""
     chosen = _chosen(capture, count)
@@ -177,7 +376,7 @@ def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> l
             for i in range(len(chosen))
         ]
     cameras = training_cameras(chosen, config.data)
-    return [_Shot(camera, time) for camera, time in zip(cameras, times, strict=True)]
+    return list(zip(cameras, times, strict=True))
 
 
 def _chosen(capture: Capture, count: int) -> list[View]:
@@ -186,9 +385,9 @@ def _chosen(capture: Capture, count: int) -> list[View]:
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
-def _visibility(scene: GaussianScene, shots: Sequence[_Shot]) -> Tensor:
+def _visibility(scene: GaussianScene, shots: Sequence[Shot]) -> Tensor:
     scene = scene.unmasked()
     total = torch.zeros(len(scene), device=scene.gaussians.means.device)
-    for shot in shots:
-        total += contributions(scene.at(shot.time), shot.cameras, scene.options)[0]
+    for camera, time in shots:
+        total += contributions(scene.at(time), camera, scene.options)[0]
     return total

@@ -66,9 +66,39 @@ REMOVED_KEYS: dict[str, object] = {
     "model.width": 256,
     "strategy.opacity_reg": 0.01,
     "strategy.scale_reg": 0.01,
+    "optim.sparse": False,
+    "model.deform.time_resolution": 0,
 }
 """Keys of earlier versions that configurations of runs may still have, with the value at which they
 had no effect."""
+REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
+    "human": {
+        "refine_from": 0.1,
+        "fine_limbs": True,
+        "offset_weight": 2e-4,
+        "scale_weight": 1e-2,
+        "rigidity": 1e-2,
+        "smoothness": 1e-3,
+    },
+    "human_predictor": {
+        "min_silhouette_fraction": 0.9,
+        "source_sets": 6,
+        "target_views": 2,
+        "widths": [24, 32, 48, 64],
+    },
+    "gps": {"widths": [24, 40, 64], "depth_fraction": 0.4},
+    "keypoint_nerf": {"features": 32, "width": 64, "patch": 32, "step": 0.015},
+    "eg_human_nerf": {
+        "features": 32,
+        "width": 64,
+        "patch": 32,
+        "samples": 16,
+        "srdf_weight": 0.2,
+        "boundaries": True,
+        "visibility": True,
+    },
+}
+"""The same for keys of the section ``model`` of one kind."""
 MOST_KEYS = 40  # Of a section that are listed in one line
 _FOLLOW_LINKS = ("data", "follow_links")
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
@@ -144,6 +174,8 @@ def load_resolved(
         raise DyngsError(
             f"{file}: does not say which capture the run was trained on (data.root); restore the file"
         )
+    if isinstance(layers.tree.get("model"), dict):
+        layers.tree["model"] = without_removed_keys(layers.tree["model"])
     if isinstance(layers.tree["data"], dict):
         layers.tree["data"]["follow_links"] = follows_links_of_runs()
     body = layers.value_at(("data", "body"))
@@ -158,6 +190,13 @@ def load_resolved(
     return config.model_copy(
         update={"data": config.data.model_copy(update={"root": root.absolute()})}
     )
+
+
+def without_removed_keys(model: dict[str, object]) -> dict[str, object]:
+    """Return the section ``model`` of an earlier version without the keys of
+    ``REMOVED_MODEL_KEYS``."""
+    removed = REMOVED_MODEL_KEYS.get(str(model.get("kind")), {})
+    return {key: x for key, x in model.items() if key not in removed or x != removed[key]}
 
 
 def save_config(config: Config, path: Path) -> None:

@@ -52,6 +52,15 @@ def num_sh_terms(degree: int) -> int:
     return (degree + 1) ** 2
 
 
+def srgb_encoded(linear: np.ndarray) -> np.ndarray:
+    """Return the sRGB signal of linear light in [0, 1]."""
+    return np.where(
+        linear <= 0.0031308,
+        12.92 * linear,
+        1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
+    )
+
+
 def srgb_decoded(signal: np.ndarray) -> np.ndarray:
     """Return the linear light of an sRGB signal in [0, 1]."""
     return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)

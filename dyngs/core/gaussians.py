@@ -79,6 +79,19 @@ class Gaussians:
         return found
 
     @staticmethod
+    def isotropic(
+        means: Tensor, log_scales: Tensor | float, logit: float, base: Tensor, num_terms: int
+    ) -> Gaussians:
+        """Return balls at ``means`` (N, 3), of one size or (N, 1), with the harmonics ``base`` (N,
+        3) of degree 0 among ``num_terms``."""
+        count = len(means)
+        sh = means.new_zeros(count, num_terms, 3)
+        sh[:, 0] = base
+        quats = means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+        logits = means.new_full((count,), logit)
+        return Gaussians(means, quats, means.new_zeros(count, 3) + log_scales, logits, sh)
+
+    @staticmethod
     def joined(parts: Sequence[Gaussians]) -> Gaussians:
         """Return the Gaussians of all parts, whose harmonics are of one degree."""
         tensors = [part.tensors() for part in parts]

@@ -152,29 +152,25 @@ class Lpips:
 
 
 def load_lpips(net: LpipsNet = "alex", device: torch.device | str = "cpu") -> Lpips:
-    """Return LPIPS on ``device`` from ``torchmetrics`` or ``lpips``, only if the weights are
-    already in torch's cache.
+    """Return LPIPS on ``device`` from the package ``lpips``, only if the weights are already in
+    torch's cache.
 
-    Both packages would download missing weights, hence the check before either is constructed.
+    The package would download missing weights, hence the check before it is constructed.
     """
-    package = next(
-        (name for name in ("torchmetrics", "lpips") if find_spec(name) is not None), None
-    )
-    if package is None or find_spec("torchvision") is None:
-        return Lpips(
-            net,
-            "the packages lpips (or torchmetrics) and torchvision are not installed (dyngs[metrics])",
-        )
+    if find_spec("lpips") is None or find_spec("torchvision") is None:
+        return Lpips(net, "the packages lpips and torchvision are not installed (dyngs[metrics])")
     try:
         weights = _backbone_file(net)
         if not weights.is_file():
             return Lpips(
                 net, f"the weights {weights.name} are not in torch's cache ({weights.parent})"
             )
-        return Lpips(net, None, _lpips_distance(package, net, device))
+        from lpips import LPIPS  # pyright: ignore[reportMissingImports]
+
+        return Lpips(net, None, LPIPS(net=net, verbose=False).eval().to(device))
     except Exception as error:
         # whatever a third-party package raises is a reason, never a failed evaluation
-        return Lpips(net, f"{package} could not be set up: {' '.join(str(error).split())[:200]}")
+        return Lpips(net, f"lpips could not be set up: {' '.join(str(error).split())[:200]}")
 
 
 def _backbone_file(net: LpipsNet) -> Path:
@@ -188,18 +184,6 @@ def _backbone_file(net: LpipsNet) -> Path:
         "squeeze": models.SqueezeNet1_1_Weights.IMAGENET1K_V1,
     }
     return Path(torch.hub.get_dir()) / "checkpoints" / weights[net].url.rsplit("/", 1)[1]
-
-
-def _lpips_distance(
-    package: str, net: LpipsNet, device: torch.device | str
-) -> Callable[[Tensor, Tensor], Tensor]:
-    if package == "lpips":
-        from lpips import LPIPS  # pyright: ignore[reportMissingImports]
-
-        return LPIPS(net=net, verbose=False).eval().to(device)
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity as Metric  # pyright: ignore[reportMissingImports]
-
-    return Metric(net_type=net, normalize=False).eval().to(device)
 
 
 def _weighted_mean(values: Tensor, mask: Tensor | None) -> float:

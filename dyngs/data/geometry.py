@@ -52,21 +52,6 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
     return pose, error
 
 
-def matrix_fault(matrix: np.ndarray, where: str) -> str | None:
-    """Return one line, beginning with ``where``, on why ``matrix`` is no rigid pose; None where it
-    is."""
-    try:
-        checked_pose(matrix, where)
-    except DyngsError as error:
-        return str(error)
-    return None
-
-
-def pose_fault(view: View) -> str | None:
-    """Return one line on why the view's pose is not rigid, None where it is."""
-    return matrix_fault(view.cam_from_world, f"'{view.name}'")
-
-
 def cam_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
     """Return the OpenCV ``cam_from_world`` of a rigid (4, 4) OpenGL camera-to-world pose: y up, z
     backward."""

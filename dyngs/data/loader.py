@@ -102,32 +102,30 @@ class Image:
         its camera."""
         if factor == 1:
             return self
-        old = self.cameras
-        width = max(1, round(old.width / factor))
-        height = max(1, round(old.height / factor))
-        scale = old.intrinsics.new_tensor([width / old.width, height / old.height, 1.0])
-        alpha, mask, moves = (
-            None if x is None else area_downscale(x[..., None], width, height)[..., 0]
-            for x in (self.alpha, self.mask, self.moves)
-        )
+        cameras = self.cameras.scaled(1 / factor)
+        width, height = cameras.width, cameras.height
+
+        def mean(values: Tensor | None) -> Tensor | None:
+            if values is None:
+                return None
+            return area_downscale(values[..., None], width, height)[..., 0]
+
+        def nearest(values: Tensor | None) -> Tensor | None:
+            if values is None:
+                return None
+            return _nearest(values, image_maps.nearest_positions(width, height))
+
+        mask = mean(self.mask)
         return replace(
             self,
-            cameras=Cameras(old.cam_from_world, scale[:, None] * old.intrinsics, width, height),
+            cameras=cameras,
             rgb_premultiplied=area_downscale(self.rgb_premultiplied, width, height),
-            alpha=alpha,
+            alpha=mean(self.alpha),
             mask=None if mask is None else (mask > FULLY_KEPT).float(),
-            moves=moves,
-            depth=self._nearest(self.depth, width, height),
-            labels=self._nearest(self.labels, width, height),
+            moves=mean(self.moves),
+            depth=nearest(self.depth),
+            labels=nearest(self.labels),
             flow=None if self.flow is None else image_maps.resized(self.flow, width, height),
-        )
-
-    @staticmethod
-    def _nearest(values: Tensor | None, width: int, height: int) -> Tensor | None:
-        return (
-            None
-            if values is None
-            else _nearest(values, image_maps.nearest_positions(width, height))
         )
 
 
@@ -178,8 +176,7 @@ class ImageLoader:
         self._small: dict[int, Image] = {}
         self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
-        self._cameras: dict[int, Cameras] = {}
-        self._cameras_there: dict[int, Cameras] = {}  # on the GPU
+        self._cameras: dict[tuple[int, int, torch.device], Cameras] = {}
         self.corrected: Callable[[int, Cameras], Cameras] | None = None
         self._lock = Lock()
         with images_up_to(options.max_megapixels):
@@ -206,7 +203,6 @@ class ImageLoader:
             self._small_bytes = 0
             self._device = device
             self._gpu_room = math.inf if memory is None else GPU_FRACTION * memory[0]
-            self._cameras_there = {}
 
     @property
     def times(self) -> tuple[float | None, ...]:
@@ -222,13 +218,17 @@ class ImageLoader:
         return self._with_camera(index, self._as_stored(index))
 
     def _with_camera(self, index: int, image: Image) -> Image:
+        index %= len(self._views)
         if self.corrected is not None:
-            image = replace(image, cameras=self.corrected(index % len(self._views), image.cameras))
-        if self.device.type == "cpu":
+            image = replace(image, cameras=self.corrected(index, image.cameras))
+        if self._device == CPU:
             return image
         if self.corrected is None:
-            image = replace(image, cameras=self._sent(index % len(self._views), image.cameras))
-        return image.to(self.device)
+            key = (index, image.cameras.width, self._device)  # sent once
+            if key not in self._cameras:
+                self._cameras[key] = image.cameras.to(device=self._device)
+            image = replace(image, cameras=self._cameras[key])
+        return image.to(self._device)
 
     def _as_stored(self, index: int) -> Image:
         view = self._views[index]
@@ -251,29 +251,19 @@ class ImageLoader:
 
     def _camera(self, index: int, width: int, height: int) -> Cameras:
         """Return the camera of a view, on the CPU; it is made once."""
-        found = self._cameras.get(index)
-        if found is None or (found.width, found.height) != (width, height):
-            found = self._cameras[index] = _camera_of(self._views[index], width, height)
-        return found
-
-    def _sent(self, index: int, cameras: Cameras) -> Cameras:
-        """Return the camera of an image on the GPU, to which it is sent once."""
-        found = self._cameras_there.get(index)
-        if found is None or (found.width, found.height) != (cameras.width, cameras.height):
-            found = self._cameras_there[index] = cameras.to(device=self.device)
-        return found
+        key = (index, width, CPU)
+        if key not in self._cameras:
+            self._cameras[key] = _camera_of(self._views[index], width, height)
+        return self._cameras[key]
 
     def cameras(self) -> list[Cameras]:
         """Return the cameras of all images as they are by now, one each; no image is read."""
-        stored = [
+        found = [
             _camera_of(view, *size) for view, size in zip(self._views, self.sizes, strict=True)
         ]
-        found = (
-            stored
-            if self.corrected is None
-            else [self.corrected(i, x) for i, x in enumerate(stored)]
-        )
-        return [x.to(device=self.device) for x in found]
+        if self.corrected is not None:
+            found = [self.corrected(i, cameras) for i, cameras in enumerate(found)]
+        return [cameras.to(device=self.device) for cameras in found]
 
     def shrunk(self, index: int, factor: int) -> Image:
         """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is
@@ -330,16 +320,6 @@ class ImageLoader:
     def sizes(self) -> list[tuple[int, int]]:
         """Width and height of the images, in px, without decoding any."""
         return [view_size(view, self._options) for view in self._views]
-
-    @property
-    def keeps_all(self) -> bool:
-        """Whether the cache has room for all images, as far as their sizes tell."""
-        return self._bytes_of_all() <= self._options.cache_mb * 1e6
-
-    @property
-    def keeps_all_on_gpu(self) -> bool:
-        """Whether a GPU has room for all images, as far as their sizes tell."""
-        return self._bytes_of_all() <= self._gpu_room
 
     @property
     def bytes_to_come(self) -> int:

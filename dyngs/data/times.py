@@ -12,7 +12,7 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -38,12 +38,6 @@ as (n - 1) / n."""
 SCATTERED = 0.5
 """Distance between cameras that follow each other in time, in medians of the distance of any two,
 from which time and viewpoint have nothing to do with each other."""
-MOST_STEPS, MOST_IMAGES, FEWEST_STEPS = 300, 4000, 2
-"""Time steps of several videos (those of the usual clips of ten seconds) and images of all
-together, at most, unless a number is given; and time steps at least."""
-# frames within this fraction of a frame's duration of a time step count as taken at it
-SAME_STEP = 0.2
-_MAX_NAMED = 5
 # longest over shortest gap of evenly spaced times, with allowance for rounding in the files
 _EVEN = 1.1
 _DIGITS = re.compile(r"(\d+)")
@@ -451,105 +445,24 @@ def sequence_warnings(splits: Splits) -> list[str]:
     """Return warnings of images with one camera, pose and time, and of cameras with different
     numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
-    return [*_repeated(views), *_frame_counts(views)]
-
-
-def _repeated(views: list[View]) -> list[str]:
     images: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
+    frames: defaultdict[int, set[Path]] = defaultdict(set)
     for view in views:
-        images[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(
-            view.image_path, view
-        )
+        frames[view.camera_id].add(view.image_path)
+        key = (view.camera_id, view.time, view.cam_from_world.round(9).tobytes())
+        images[key].setdefault(view.image_path, view)
+    warnings = []
     doubled = [list(same.values()) for same in images.values() if len(same) > 1]
-    if not doubled:
-        return []
-    first, second = doubled[0][:2]
-    return [
-        f"{sum(map(len, doubled))} images share camera, pose and time with another one, first {first.name} and "
-        f"{second.name} at time {first.time:g}; are their times right?"
-    ]
-
-
-def _frame_counts(views: list[View]) -> list[str]:
-    cameras: defaultdict[int, list[View]] = defaultdict(list)
-    for view in views:
-        cameras[view.camera_id].append(view)
-    counts = {camera: len({view.image_path for view in seen}) for camera, seen in cameras.items()}
-    if len(set(counts.values())) < 2 or max(counts.values()) < 2:
-        return []
-    usual = max(Counter(counts.values()).items(), key=lambda item: (item[1], item[0]))[0]
-    odd = [camera for camera in sorted(counts) if counts[camera] != usual]
-    labels = _camera_labels(cameras)
-    named = ", ".join(f"{labels[camera]} has {counts[camera]}" for camera in odd[:_MAX_NAMED])
-    more = f" ({len(odd) - _MAX_NAMED} more cameras differ)" if len(odd) > _MAX_NAMED else ""
-    return [f"cameras have different numbers of frames: {named} frames, others {usual}{more}"]
-
-
-def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
-    """Name cameras for messages: by the folder if a camera has one of its own, else by number."""
-    folders = {
-        camera: {view.name.rpartition("/")[0] for view in seen} for camera, seen in cameras.items()
-    }
-    firsts = {camera: min(names) for camera, names in folders.items()}
-    own = Counter(firsts.values())
-    return {
-        camera: firsts[camera]
-        if len(folders[camera]) == 1 and own[firsts[camera]] == 1 and firsts[camera]
-        else f"camera {camera}"
-        for camera in cameras
-    }
-
-
-@dataclass(frozen=True)
-class Taken:
-    """Frames taken of one video: their ``numbers`` (K,), ascending, and ``seconds`` (K,) in the
-    clock of all videos."""
-
-    numbers: np.ndarray
-    seconds: np.ndarray
-
-
-def taken_frames(
-    where: Path, clocks: Sequence[np.ndarray], rates: Sequence[float], most: int | None = None
-) -> tuple[list[Taken], str]:
-    """Return the frames of each video at the time steps that all of them show, and a line on how
-    many.
-
-    Time steps are frames of the video with the fewest per second. Of the others the nearest frame
-    is taken, at its own time if that differs. Raises DyngsError: no two time steps that all videos
-    show.
-
-    Args:
-        clocks: of each video the seconds (F,) of its frames, in one clock; ``rates``: frames per
-            second.
-        most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many
-            cameras.
-    """
-    first = max(clock[0] for clock in clocks)
-    last = min(clock[-1] for clock in clocks)
-    slowest = min(range(len(clocks)), key=lambda i: (rates[i], i))
-    slack = 0.5 / rates[slowest]
-    steps = clocks[slowest][(clocks[slowest] >= first - slack) & (clocks[slowest] <= last + slack)]
-    if len(steps) < FEWEST_STEPS:
-        raise DyngsError(
-            f"{where}: the videos share no two time steps: the last one begins at {first:.2f} s of one clock, the "
-            f"first one ends at {last:.2f} s; are all of them of one event?"
+    if doubled:
+        first, second = doubled[0][:2]
+        warnings.append(
+            f"{sum(map(len, doubled))} images share camera, pose and time with another one, first {first.name} and "
+            f"{second.name} at time {first.time:g}; are their times right?"
         )
-    limit = max(min(MOST_STEPS, MOST_IMAGES // len(clocks)), FEWEST_STEPS) if most is None else most
-    chosen = steps[evenly_spaced(len(steps), limit)]
-    taken = [
-        _nearest(clock, chosen, SAME_STEP / rate) for clock, rate in zip(clocks, rates, strict=True)
-    ]
-    line = f"{len(chosen)} time steps of {chosen[-1] - chosen[0]:.2f} s that all {len(clocks)} cameras show"
-    if len(chosen) < len(steps):
-        line += f", of {len(steps)} (--frames of `dyngs data sfm` chooses)"
-    return taken, line
-
-
-def _nearest(clock: np.ndarray, steps: np.ndarray, same: float) -> Taken:
-    after = np.clip(np.searchsorted(clock, steps), 1, max(len(clock) - 1, 1))
-    numbers = np.where(steps - clock[after - 1] <= clock[after] - steps, after - 1, after)
-    seconds = clock[numbers]
-    seconds = np.where(np.abs(seconds - steps) <= same, steps, seconds)
-    numbers, kept = np.unique(numbers, return_index=True)
-    return Taken(numbers, seconds[kept])
+    counts = {camera: len(paths) for camera, paths in frames.items()}
+    if len(set(counts.values())) > 1:
+        few = min(counts, key=lambda camera: counts[camera])
+        warnings.append(
+            f"cameras have different numbers of frames, from {counts[few]} (camera {few}) to {max(counts.values())}"
+        )
+    return warnings

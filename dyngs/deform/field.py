@@ -323,14 +323,13 @@ class Decoder:
 
 def head_sizes(options: FieldSection) -> Mapping[str, int]:
     """Return the number of outputs of each head of ``Offsets`` by name, in order."""
-    wanted = {
-        "means": (3, True),
-        "quats": (4, options.move_rotations),
-        "log_scales": (3, options.move_scales),
-        "logit_opacities": (1, options.move_opacities),
-        "colors": (3, options.move_colors),
+    heads = {
+        "rotations": ("quats", 4),
+        "scales": ("log_scales", 3),
+        "opacities": ("logit_opacities", 1),
+        "colors": ("colors", 3),
     }
-    return {name: size for name, (size, is_on) in wanted.items() if is_on}
+    return {"means": 3} | dict(heads[x] for x in heads if x in options.moves)
 
 
 def split_heads(outputs: Tensor, options: FieldSection) -> Offsets:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dyngs.core.state import Role
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
-from dyngs.deform.fixed_cameras.start import Moment
+from dyngs.deform.fixed_cameras.start import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
@@ -113,7 +113,7 @@ class FreeStart:
 
 
 def free_start(
-    still: Gaussians, moments: Sequence[Moment], others: Gaussians, num_times: int
+    still: Gaussians, moments: Sequence[TimedGaussians], others: Gaussians, num_times: int
 ) -> FreeStart:
     """Return copies of the M ``still`` Gaussians that move, the Gaussians of ``moments``, and
     ``others``.
@@ -125,7 +125,10 @@ def free_start(
     faint = still.replace(
         logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf)
     )
-    parts = [Moment((i + 0.5) / copies, faint, torch.zeros(3, device="cpu")) for i in range(copies)]
+    parts = [
+        TimedGaussians((i + 0.5) / copies, faint, torch.zeros(3, device="cpu"))
+        for i in range(copies)
+    ]
     rest = torch.linspace(0, 1, len(others), device="cpu")
     groups = [*parts, *moments]
     sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")

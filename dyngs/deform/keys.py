@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from dyngs.core.section import Fraction, Positive, SceneModel, Section
 
@@ -12,16 +12,29 @@ COPIES_OF_MOVING = 12_000
 """Copies over time of what moves in a static model, at most, that free primitives begin with."""
 
 
-class FieldSection(Section):
-    """Keys that all deformation fields share: which attributes change over time besides
-    positions."""
+Attribute = Literal["rotations", "scales", "opacities", "colors"]
 
-    move_rotations: bool = Field(default=True, description="rotations change over time")
-    move_scales: bool = Field(default=True, description="scales change over time")
-    move_opacities: bool = Field(
-        default=False, description="opacities change over time: things may appear and disappear"
+
+class FieldSection(Section):
+    """Key that deformation fields share."""
+
+    moves: tuple[Attribute, ...] = Field(
+        default=("rotations", "scales"),
+        description="what changes over time besides positions; with opacities things may appear and disappear",
     )
-    move_colors: bool = Field(default=False, description="base colours change over time")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_flags(cls, given: Any) -> Any:
+        """Read runs of earlier versions, which had a flag for each: ``move_rotations`` and so on."""
+        flags = (
+            {k: given[k] for k in given if k.startswith("move_")} if isinstance(given, dict) else {}
+        )
+        if not flags:
+            return given
+        usual = given.get("moves", cls.model_fields["moves"].default)
+        moves = [x for x in get_args(Attribute) if flags.get(f"move_{x}", x in usual)]
+        return {k: x for k, x in given.items() if k not in flags} | {"moves": moves}
 
 
 class HexplaneField(FieldSection):
@@ -39,11 +52,6 @@ class HexplaneField(FieldSection):
         default=(1, 2),
         min_length=1,
         description="one set of planes for each, with so many times that resolution",
-    )
-    time_resolution: int = Field(
-        default=0,
-        ge=0,
-        description="cells of the planes along t; 0: half the number of training times",
     )
     width: int = Field(default=64, ge=1, description="neurons per hidden layer of the decoder")
     depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")

@@ -43,7 +43,7 @@ class Hexplane(DeformationField):
     ) -> None:
         self.options, self.setup = options, setup
         tensors: dict[str, Tensor] = {}
-        rows = time_rows(options, setup.num_times)
+        rows = min(max(2, (setup.num_times + 1) // 2), MAX_KEY_TIMES)
         for level, multiplier in enumerate(options.levels):
             side = options.resolution * multiplier
             low, high = SPACE_RANGE
@@ -86,12 +86,6 @@ class Hexplane(DeformationField):
             high = min(math.ceil(seen[1] * last), last)
             planes[:, max(math.floor(soon[0] * last), 0) : low] = planes[:, low, None]
             planes[:, high + 1 : math.ceil(soon[1] * last) + 1] = planes[:, high, None]
-
-
-def time_rows(options: HexplaneField, num_times: int) -> int:
-    """Return the number of rows of the planes with time: as configured, or half as many as times, 2
-    at least."""
-    return options.time_resolution or min(max(2, (num_times + 1) // 2), MAX_KEY_TIMES)
 
 
 SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # Octaves of the positional encodings

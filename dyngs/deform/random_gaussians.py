@@ -24,13 +24,9 @@ def random_gaussians(
     unit = torch.rand((count, 3), generator=generator, device="cpu").to(center.device)
     places = center + half_size * (2 * unit - 1)
     spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
-    return Gaussians(
-        means=places,
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=gaussians.means.device).expand(count, 4),
-        log_scales=torch.full((count, 3), math.log(SCALE * spacing), device=gaussians.means.device),
-        logit_opacities=torch.full((count,), LOGIT, device=gaussians.means.device),
-        sh=torch.zeros(count, *gaussians.sh.shape[1:], device=gaussians.means.device),
-    )
+    base = places.new_zeros(count, 3)
+    terms = gaussians.sh.shape[1]
+    return Gaussians.isotropic(places, math.log(SCALE * spacing), LOGIT, base, terms)
 
 
 def with_gaussians(gaussians: Gaussians, added: Sequence[Gaussians]) -> EditResult:

@@ -130,7 +130,7 @@ class DynamicScene(GaussianScene):
             state["rows"] = StateTensor(self.moving, Role.SHARED)
         return state if self.masks is None else state | prefixed("masks", self.masks.state())
 
-    def _drawn_around(self, time: float) -> _Part:
+    def _drawn_around(self, time: float) -> _DrawnPart:
         """Return the Gaussians drawn around ``time``; without gradients, those of the last mask
         interval are kept."""
         interval = 0 if self.masks is None else self.masks.interval(time)
@@ -141,15 +141,15 @@ class DynamicScene(GaussianScene):
             self._derived[interval] = self._selected(self.gaussians, interval)
         return self._derived[interval]
 
-    def _selected(self, gaussians: Gaussians, interval: int) -> _Part:
+    def _selected(self, gaussians: Gaussians, interval: int) -> _DrawnPart:
         means = gaussians.means.index_select(0, self.moving)
         if self.masks is None:
             rows = None if len(self.moving) == len(self) else self.moving
-            return _Part(gaussians, self.filter_std, means, None, rows)
+            return _DrawnPart(gaussians, self.filter_std, means, None, rows)
         active = self.masks.active(interval)
         std = None if self.filter_std is None else self.filter_std[active]
         asked, rows = matched(self.moving, active, len(self))
-        return _Part(gaussians.picked(active), std, means, asked, rows)
+        return _DrawnPart(gaussians.picked(active), std, means, asked, rows)
 
 
 def field_scene_of(scene: Renderable) -> DynamicScene | None:
@@ -158,7 +158,7 @@ def field_scene_of(scene: Renderable) -> DynamicScene | None:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _DrawnPart:
     """Gaussians drawn around a time."""
 
     gaussians: Gaussians  # A canonical ones

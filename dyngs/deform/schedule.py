@@ -1,16 +1,37 @@
-"""The steps at which the phases of a moving scene begin."""
+"""The steps at which the phases of a moving scene begin, and the part of a clip that each step trains on.
+
+The window of times starts around the middle and grows until it is all. Motion over a whole clip may
+be far larger than the thing that moves. From the few images around one moment a sharp canonical form
+can be had, and a field that has followed it so far needs little to follow it a little farther.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
-from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians.schedule import Rates
 from dyngs.models.schedule import Length
 
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all
 times."""
+
+
+@dataclass(frozen=True)
+class DeformSchedule:
+    """The steps at which the phases of training begin."""
+
+    fine: int  # last step without motion
+    # opens, full: steps between which the window of times grows, to all of them
+    opens: int
+    full: int
+    decays: int  # step from which the field's rates fall
+    splits: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
+    rates: Rates
 
 
 def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
@@ -63,3 +84,73 @@ def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> fl
         return length.kept(old.fine)
     new = deform_schedule(model, Rates(length.steps))
     return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from
+
+
+MIN_VIEWS = 6
+MIDDLE = 0.5
+FRONTIER_VIEWS = 6
+"""Number of newest views, at the window's ends, that every other step trains on while the window
+grows."""
+
+
+@dataclass(frozen=True)
+class TimeWindow:
+    """The times that are trained on at each step."""
+
+    strays: tuple[float, ...]
+    first: float
+    begins: int
+    opens: int
+    full: int
+    _limits: dict[int, tuple[float, float]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    @staticmethod
+    def around_middle(
+        times: Sequence[float], first: float, begins: int, opens: int, full: int
+    ) -> TimeWindow:
+        return TimeWindow(
+            tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full
+        )
+
+    def num_views(self, step: int) -> int:
+        start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
+        progress = (step - self.opens) / max(self.full - self.opens, 1)
+        return start + int(min(max(progress, 0.0), 1.0) * (len(self.strays) - start))
+
+    def reach(self, step: int) -> float:
+        """Return the largest |time - 0.5| in the window at ``step``; 0.5 once it is full."""
+        count = self.num_views(step)
+        return MIDDLE if count == len(self.strays) else self.strays[count - 1]
+
+    def bounds(self, step: int) -> tuple[float, float]:
+        """Return the first and last time in the window at ``step``; [0, 1] once it is full."""
+        reach = self.reach(step)
+        return MIDDLE - reach, MIDDLE + reach
+
+    def holds(self, time: float, step: int) -> bool:
+        """Return whether ``time`` is trained on at ``step``; while it grows, every other step takes
+        only new times."""
+        # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
+        if step <= self.begins:
+            return True
+        if step not in self._limits:  # once, though all views ask
+            oldest = (
+                self.strays[max(self.num_views(step) - FRONTIER_VIEWS, 0)]
+                if self.tracks(step)
+                else 0.0
+            )
+            self._limits.clear()
+            self._limits[step] = oldest, self.reach(step)
+        oldest, newest = self._limits[step]
+        return oldest <= abs(time - MIDDLE) <= newest
+
+    def tracks(self, step: int) -> bool:
+        """Return whether ``step`` is for the newest views only: every other one while the window
+        grows."""
+        return (
+            self.opens < step < self.full
+            and step % 2 == 0
+            and self.num_views(step) < len(self.strays)
+        )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.bodies.paths import Shots, one_camera, shots_of
+from dyngs.deform.bodies.paths import FrameStack, frame_stack_of, one_camera
 from dyngs.deform.fixed_cameras.hulls import Footage, footage_of
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
@@ -92,7 +92,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
             footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used
         ]
 
-    def shots(still: Gaussians) -> Shots | None:
+    def shots(still: Gaussians) -> FrameStack | None:
         order = one_camera(views)
         limit = min(MAX_SHOTS, rates_of(config).steps // STEPS_PER_SHOT)
         if config.train.minutes is not None:
@@ -100,7 +100,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         if order is None or limit == 0 or len(set(images.sizes)) > 1:
             return None
         used = (images[order[i]] for i in evenly_spaced(len(order), limit))
-        return shots_of(used, still, options, background, shader)
+        return frame_stack_of(used, still, options, background, shader)
 
     return TrainingViews(
         training_times(capture),

@@ -16,8 +16,7 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, printable
 from dyngs.data.geometry import cam_from_opengl, checked_pose
-from dyngs.io.fields import first_few, is_number, numbers_of, read_json
-from dyngs.io.limits import require_at_most
+from dyngs.io.fields import first_few, is_number, numbers_of, read_json, require_at_most
 from dyngs.io.write import write_text
 
 _MAX_FRAMES = 100_000

@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ReportProgress, report_nothing, srgb_encoded
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
-from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.loader import ImageLoader
 from dyngs.export.camera_paths import CameraPath, pick_cameras
 from dyngs.export.video import VideoWriter

@@ -44,8 +44,7 @@ from dyngs.io.formats.splat_file import (
     offset_notes,
     unit_rotations,
 )
-from dyngs.io.temporary import remove_quietly, temporary_folder_beside
-from dyngs.io.write import atomic_file
+from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 

@@ -45,9 +45,6 @@ class DensifySchedule:
 class Densifier:
     """A strategy that changes the set of Gaussians during training; this one leaves it as it is."""
 
-    touches_all = False
-    """Every Gaussian receives a gradient in every step, seen or not."""
-
     def wants_signal(self, step: int) -> bool:
         """Return whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
         return False
@@ -297,8 +294,6 @@ class McmcDensifier(Densifier):
     Relocation keeps the composited appearance, so there is no threshold on gradients, no opacity
     reset, no pruning.
     """
-
-    touches_all = True
 
     def __init__(self, options: McmcStrategy, schedule: DensifySchedule, growth: float) -> None:
         self.options, self.schedule, self.growth = options, schedule, growth

@@ -24,7 +24,7 @@ from dyngs.gaussians.colour.training import (
     TrainingLooks,
 )
 from dyngs.gaussians.densify import Densifier
-from dyngs.gaussians.optimizer import GaussianOptimizer, Still
+from dyngs.gaussians.optimizer import FrozenMask, GaussianOptimizer
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rates_of
@@ -79,7 +79,7 @@ class SceneTraining(Generic[S]):
         None: of none."""
         return None
 
-    def still(self) -> Still | None:
+    def still(self) -> FrozenMask | None:
         """Return what stays as it is, whatever the images say."""
         return None
 
@@ -229,12 +229,9 @@ class GaussianModel(Model[GaussianScene]):
         generator = self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
         frozen = self.colours.frozen_rest()
-        dense = self.densifier.touches_all
         resting = self.training.resting(self._scene)
         still = self.training.still()
-        bad = self._optimizer.step(
-            step, lr_means, dense=dense, frozen_rest=frozen, resting=resting, still=still
-        )
+        bad = self._optimizer.step(step, lr_means, frozen_rest=frozen, resting=resting, still=still)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:

@@ -18,7 +18,7 @@ ADAM_EPS = 1e-15
 
 
 @dataclass(frozen=True)
-class Still:
+class FrozenMask:
     """What training leaves as it is: Gaussians (N,) bool, None: none; with ``shapes`` all but the
     colours of all."""
 
@@ -69,10 +69,9 @@ class GaussianOptimizer:
         step: int,
         lr_means: float,
         *,
-        dense: bool,
         frozen_rest: Tensor | None = None,
         resting: Tensor | None = None,
-        still: Still | None = None,
+        still: FrozenMask | None = None,
     ) -> Count:
         """Update the parameters, drop the gradients, and return the number of rows left out for bad
         gradients.
@@ -80,14 +79,12 @@ class GaussianOptimizer:
         Args:
             frozen_rest: (N,) bool, Gaussians of whose harmonics only the base colour is updated;
                 None: none.
-            dense: update all Gaussians; otherwise, if ``optim.sparse``, only those that received a
-                gradient: the others keep parameters and moments.
-            resting: (M,) indices of Gaussians that are only updated if they received one, dense or
-                not; None: none.
+            resting: (M,) indices of Gaussians that are only updated if they received a gradient;
+                None: none.
             still: what keeps parameters and moments whatever it receives.
         """
-        rows = None if dense or not self.options.sparse else self._rows_with_gradient()
-        if rows is None and resting is not None:
+        rows: Tensor | None = None
+        if resting is not None:
             rows = torch.ones(len(self.parameters), dtype=torch.bool, device=resting.device)
             rows[resting] = self._rows_with_gradient()[resting]
         if still is not None and still.rows is not None:

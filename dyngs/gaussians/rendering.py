@@ -287,17 +287,6 @@ def _project(
     return projection, per_view
 
 
-def _one_dtype(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    dtype = torch.float64 if gaussians.means.dtype == torch.float64 else torch.float32
-    if any(x.dtype != dtype for x in gaussians.tensors().values()):
-        gaussians = gaussians.replace(
-            **{name: x.to(dtype) for name, x in gaussians.tensors().items()}
-        )
-    if cameras.cam_from_world.dtype != dtype or cameras.intrinsics.dtype != dtype:
-        cameras = cameras.to(dtype=dtype)
-    return gaussians, cameras
-
-
 def _checked(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
 ) -> tuple[Gaussians, Cameras]:
@@ -306,7 +295,9 @@ def _checked(
     if cameras.cam_from_world.device != gaussians.means.device:
         devices = f"the cameras are on {cameras.cam_from_world.device}, the Gaussians on {gaussians.means.device}"
         raise DyngsError(f"{devices}; move one of them with .to(device=...)")
-    gaussians, cameras = _one_dtype(gaussians, cameras)
+    dtype = torch.float64 if gaussians.means.dtype == torch.float64 else torch.float32
+    gaussians = gaussians.to(dtype=dtype)
+    cameras = cameras.to(dtype=dtype)
     if options.nonfinite != "trust":
         check_views(cameras, background)
         gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.capture.first_points import AROUND_ORIGIN
+from dyngs.capture.initial_points import AROUND_ORIGIN
 from dyngs.config import (
     AutoColour,
     DefaultStrategy,
@@ -185,19 +185,10 @@ def _seen_together(views: Sequence[View], count: int, generator: torch.Generator
 
 
 def _isotropic(xyz: Tensor, base: Tensor, start: StartValues, sh_degree: int) -> Gaussians:
-    n = len(xyz)
     log_scale = 0.5 * mean_squared_neighbour_distance(xyz).log() + math.log(start.scale_factor)
-    sh = torch.zeros((n, num_sh_terms(sh_degree), 3), device="cpu")
-    sh[:, 0] = base.float()
-    return Gaussians(
-        means=xyz.float(),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0], device="cpu").repeat(n, 1),
-        log_scales=log_scale.float()[:, None].repeat(1, 3),
-        logit_opacities=torch.full(
-            (n,), math.log(start.opacity / (1 - start.opacity)), device="cpu"
-        ),
-        sh=sh,
-    )
+    logit = math.log(start.opacity / (1 - start.opacity))
+    sizes = log_scale.float()[:, None]
+    return Gaussians.isotropic(xyz.float(), sizes, logit, base.float(), num_sh_terms(sh_degree))
 
 
 def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.model import GaussianModel, SceneTraining
-from dyngs.gaussians.optimizer import Still
+from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
@@ -84,11 +84,11 @@ class StaticTraining(SceneTraining[StaticScene]):
         self,
         update: FilterUpdate,
         removal: SmallRemoval = SmallRemoval(),
-        still: Still | None = None,
+        still: FrozenMask | None = None,
     ) -> None:
         self._update, self._removal, self._still = update, removal, still
 
-    def still(self) -> Still | None:
+    def still(self) -> FrozenMask | None:
         return self._still
 
     def follow(self, edit: TopologyEdit) -> None:
@@ -121,10 +121,10 @@ class StaticTraining(SceneTraining[StaticScene]):
         return StaticScene.restored(gaussians, tensors)
 
 
-def _still(run: RunStart) -> Still | None:
+def _still(run: RunStart) -> FrozenMask | None:
     init = run.config.init
     rows = None if run.first is None else run.first.frozen
-    return Still(rows, init.trains == "colour") if isinstance(init, SceneInit) else None
+    return FrozenMask(rows, init.trains == "colour") if isinstance(init, SceneInit) else None
 
 
 def start(run: RunStart) -> GaussianModel:

@@ -25,7 +25,7 @@ STIFFNESS = 0.02
 
 
 @dataclass(frozen=True)
-class Seen:
+class DepthView:
     """What one camera sees."""
 
     camera: Cameras
@@ -43,7 +43,12 @@ class Mesh:
 
 
 def fused(
-    seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen_is_solid: bool = True
+    seen: Sequence[DepthView],
+    low: Tensor,
+    high: Tensor,
+    cells: int,
+    *,
+    unseen_is_solid: bool = True,
 ) -> Mesh | None:
     """Return the surface in the box from ``low`` to ``high`` (3,); None where there is none.
 
@@ -72,7 +77,7 @@ def fused(
     return Mesh(vertices * size + low.numpy(), np.ascontiguousarray(faces))
 
 
-def _averages(seen: Sequence[Seen], points: Tensor, size: float) -> tuple[Tensor, Tensor]:
+def _averages(seen: Sequence[DepthView], points: Tensor, size: float) -> tuple[Tensor, Tensor]:
     """Return (N,) mean distances of the views that see ``points`` (N, 3), -1 without any, and (N,)
     bool: there are."""
     total = torch.zeros(len(points), device="cpu")
@@ -92,7 +97,7 @@ def _known_cells(known: np.ndarray) -> np.ndarray:
     return minimum_filter(known, 2, mode="nearest")
 
 
-def _distances(one: Seen, points: Tensor, size: float) -> tuple[Tensor, Tensor]:
+def _distances(one: DepthView, points: Tensor, size: float) -> tuple[Tensor, Tensor]:
     """Return (N,) signed distances before what a view shows, in cells, at most 1, and (N,) bool,
     where that counts."""
     column, row, z, inside = _pixels(one.camera, points)
@@ -115,7 +120,7 @@ def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Te
     return torch.where(inside, column, 0).long(), torch.where(inside, row, 0).long(), z, inside
 
 
-def colours_of(seen: Sequence[Seen], points: Tensor, tolerance: float) -> Tensor:
+def colours_of(seen: Sequence[DepthView], points: Tensor, tolerance: float) -> Tensor:
     """Return (N, 3) mean colours of surface ``points`` (N, 3) in the views that show them; grey
     where none does.
 
@@ -238,14 +243,14 @@ def surface_of(
     return Surface(mesh.vertices, mesh.faces, colours.numpy())
 
 
-def seen_by(scene: GaussianScene, camera: Cameras, time: float | None = None) -> Seen:
+def seen_by(scene: GaussianScene, camera: Cameras, time: float | None = None) -> DepthView:
     """Return what one camera sees of a scene; colours are those of what is there, without the
     background."""
     options = replace(scene.options, depth="expected")
     drawn = scene.render(camera, time, options=options, background=torch.zeros(3, device="cpu"))
     assert drawn.depth is not None
     opacity = 1 - drawn.transmittance[0]
-    return Seen(
+    return DepthView(
         camera, drawn.depth[0], opacity, drawn.rgb[0] / opacity.clamp_min(OPAQUE)[..., None]
     )
 

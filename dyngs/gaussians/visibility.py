@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,8 +29,8 @@ class VisibilityMasks:
 
     @staticmethod
     def pack(times: tuple[float, ...], seen: Tensor) -> VisibilityMasks:
-        padded = torch.nn.functional.pad(seen, (0, -seen.shape[1] % BITS)).unflatten(1, (-1, BITS))
-        return VisibilityMasks(times, (padded * _places()).sum(2).to(torch.uint8), seen.shape[1])
+        bits = np.packbits(seen.cpu().numpy(), axis=1, bitorder="little")
+        return VisibilityMasks(times, torch.from_numpy(bits).to(seen.device), seen.shape[1])
 
     @property
     def seen(self) -> Tensor:
@@ -77,10 +78,6 @@ def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
     found = place[active]
     places = torch.nonzero(found >= 0)[:, 0]
     return found[places], places
-
-
-def _places() -> Tensor:
-    return 2 ** torch.arange(BITS, dtype=torch.int64, device="cpu")
 
 
 def _unpacked(bits: Tensor, count: int) -> Tensor:

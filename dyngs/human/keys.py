@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
-from dyngs.core.section import Fraction, Positive, SceneModel
+from dyngs.core.section import Positive, SceneModel
 
 NO_BODY = "has no body parameters, which model.kind=human needs; see docs/human.md"
 
@@ -43,40 +43,15 @@ class HumanModel(_OnTemplate):
         default=True,
         description="learn corrections of poses, skeleton and skinning weights with the Gaussians",
     )
-    refine_from: Fraction = Field(
-        default=0.1, description="fraction of the run after which these are learned"
-    )
     light: bool = Field(
         default=True,
         description="learn light that is fixed in the world: colours depend on where the surface faces (with "
         "colour.kind=sh, model.refine=true)",
     )
-    fine_limbs: bool = Field(
-        default=True,
-        description="four texels instead of one on hands and feet, if one is wider than two pixels of the images",
-    )
     fill_unseen: bool = Field(
         default=True,
         description="after the last step, fill what the images hardly show from the other side of the body and from "
         "around it",
-    )
-    offset_weight: float = Field(
-        default=2e-4, ge=0, description="weight of the squared distances from the scaffold, cm^2"
-    )
-    scale_weight: float = Field(
-        default=1e-2,
-        ge=0,
-        description="weight of the squared excess of log-scales over the texel's size",
-    )
-    rigidity: float = Field(
-        default=1e-2,
-        ge=0,
-        description="weight of the squared change, by posing, of distances between neighbours, cm^2",
-    )
-    smoothness: float = Field(
-        default=1e-3,
-        ge=0,
-        description="weight of the squared difference between neighbours' offsets, cm^2",
     )
 
     @property
@@ -103,29 +78,9 @@ class HumanPredictorModel(_OnTemplate):
         description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
         "multi-scaffold of GHG)",
     )
-    min_silhouette_fraction: Fraction = Field(
-        default=0.9,
-        description="Gaussians above the lowest scaffold must lie inside at least this fraction of the silhouettes "
-        "(visual hull); 0: all are kept",
-    )
     source_views: int = Field(
         default=3,
         ge=1,
         description="images of a person that it is predicted from, at most; every other training example has fewer",
-    )
-    source_sets: int = Field(
-        default=6,
-        ge=1,
-        description="different choices of source views per person in training; their maps are cached",
-    )
-    target_views: int = Field(
-        default=2,
-        ge=1,
-        description="images of one time step that a prediction is compared with in each step",
-    )
-    widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
-        default=(24, 32, 48, 64),
-        min_length=1,
-        description="channels of the U-Net at 1/2, 1/4, ... of the atlas's resolution",
     )
     lr: Positive = Field(default=2e-3, description="highest learning rate of AdamW (one cycle)")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.core.conventions import ReportProgress
 from dyngs.human.keys import NO_BODY, HumanModel
-from dyngs.models.kind import ExtendsTo, HasBody, HasGaussians, InMotion
+from dyngs.models.kind import HasBody, HasGaussians, InMotion
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,10 +17,9 @@ if TYPE_CHECKING:
     from dyngs.models.checkpoint import CheckpointInfo
     from dyngs.models.kind import Restore, Start
     from dyngs.models.renderable import Posable
-    from dyngs.models.schedule import Length
 
 
-class HumanKind(HasGaussians, HasBody, ExtendsTo):
+class HumanKind(HasGaussians, HasBody):
     """See the module. The body says how it moves, and poses are refined instead of cameras."""
 
     uses = HasGaussians.uses - {"init", "camera.refine", "train.robust", "train.priors"}
@@ -38,7 +37,7 @@ class HumanKind(HasGaussians, HasBody, ExtendsTo):
         report: ReportProgress,
     ) -> DataConfig:
         """Return the options of a capture with a body: found, and fitted to the silhouettes."""
-        from dyngs.capture.unposed import is_unposed
+        from dyngs.capture.sfm.unposed import is_unposed
         from dyngs.human.fit.fitted_capture import with_fitted_body
 
         if is_unposed(data):
@@ -66,9 +65,6 @@ class HumanKind(HasGaussians, HasBody, ExtendsTo):
         from dyngs.human.avatar.start import restore, start
 
         return start, restore
-
-    def extended(self, section: HumanModel, length: Length) -> HumanModel:
-        return section.model_copy(update={"refine_from": length.share(section.refine_from)})
 
 
 HUMAN = HumanKind(HumanModel)

@@ -12,8 +12,8 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from dyngs.core.errors import DyngsError, reading
-from dyngs.io.limits import require_at_most
-from dyngs.io.temporary import cache_folder, temporary_folder_beside
+from dyngs.io.fields import require_at_most
+from dyngs.io.write import cache_folder, temporary_folder_beside
 
 SUFFIXES = (".zip", ".r3d")
 """Endings of archives; the app Record3D calls its own .r3d."""
@@ -89,18 +89,15 @@ def _checked_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
             )
         if name.endswith("/") or any(part.startswith(_JUNK) for part in parts):
             continue
+        problem = ""
         if stat.S_ISLNK(info.external_attr >> 16):
-            raise DyngsError(
-                f"{path}: holds the link {name!r:.80}; pack the file that it leads to instead"
-            )
-        if info.flag_bits & 1:
-            raise DyngsError(
-                f"{path}: is encrypted; unpack it with its password and give the folder"
-            )
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise DyngsError(
-                f"{path}: is compressed by another method than deflate; unpack it and give the folder"
-            )
+            problem = f"holds the link {name!r:.80}; pack the file that it leads to instead"
+        elif info.flag_bits & 1:
+            problem = "is encrypted; unpack it with its password and give the folder"
+        elif info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            problem = "is compressed by another method than deflate; unpack it and give the folder"
+        if problem:
+            raise DyngsError(f"{path}: {problem}")
         found[name] = info
     total = sum(info.file_size for info in found.values())
     require_at_most(

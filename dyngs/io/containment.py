@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from dyngs.core.errors import DyngsError, require_regular
 
@@ -48,42 +49,36 @@ _max_megapixels: ContextVar[float] = ContextVar("max_megapixels", default=MAX_ME
 
 
 @contextmanager
-def staying_within(root: Path, follow_links: bool = False) -> Iterator[None]:
-    """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
-    ``follow_links``."""
-    token = _boundary.set(None if follow_links else _Boundary(root, os.path.realpath(root)))
+def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
+    token = variable.set(value)
     try:
         yield
     finally:
-        _boundary.reset(token)
+        variable.reset(token)
 
 
-@contextmanager
-def following_links_of_runs(allowed: bool) -> Iterator[None]:
+def staying_within(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
+    """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
+    ``follow_links``."""
+    return _set(_boundary, None if follow_links else _Boundary(root, os.path.realpath(root)))
+
+
+def following_links_of_runs(allowed: bool) -> AbstractContextManager[None]:
     """Set whether ``data.follow_links`` holds for runs that are opened in the block.
 
     The user decides this on the command line: the config.yaml of a run may be that of a stranger.
     """
-    token = _links_of_runs.set(allowed)
-    try:
-        yield
-    finally:
-        _links_of_runs.reset(token)
+    return _set(_links_of_runs, allowed)
+
+
+def images_up_to(megapixels: float) -> AbstractContextManager[None]:
+    """Set how many 1e6 pixels an image may have in the block, instead of ``MAX_MEGAPIXELS``."""
+    return _set(_max_megapixels, megapixels)
 
 
 def follows_links_of_runs() -> bool:
     """Return whether the innermost block of ``following_links_of_runs`` allows it."""
     return _links_of_runs.get()
-
-
-@contextmanager
-def images_up_to(megapixels: float) -> Iterator[None]:
-    """Set how many 1e6 pixels an image may have in the block, instead of ``MAX_MEGAPIXELS``."""
-    token = _max_megapixels.set(megapixels)
-    try:
-        yield
-    finally:
-        _max_megapixels.reset(token)
 
 
 def inside(path: Path) -> Path:

@@ -27,8 +27,8 @@ from pydantic import (
     ValidationError,
 )
 
-from dyngs.core.errors import DyngsError, require_regular
-from dyngs.io.limits import require_at_most
+from dyngs.core.errors import DyngsError, reading, require_regular
+from dyngs.io.fields import require_at_most
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -196,10 +196,9 @@ class GltfFile:
 
         Raises DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
         """
-        document = self.document
-        if index >= len(document.accessors):
+        if index >= len(self.document.accessors):
             raise self.error(f"accessor {index} is missing; export it again")
-        accessor = document.accessors[index]
+        accessor = self.document.accessors[index]
         if accessor.type != kind or accessor.componentType not in _TYPES:
             raise self.error(
                 f"accessor {index} must hold {kind}, not {accessor.type[:20]!r}; export it again"
@@ -271,31 +270,19 @@ class GltfFile:
                 raise self.error("an embedded buffer is not base64; export it again") from None
         name = unquote(uri)
         parts = PurePosixPath(name).parts
-        if (
-            not parts
-            or ".." in parts
-            or PurePosixPath(name).is_absolute()
-            or set(name) & {":", "\\", "\0"}
-        ):
-            raise self.error(f"its buffer {name[:60]!r} is not a file beside it; export it as .glb")
         beside = self.path.parent / name
-        if beside.exists() and not beside.is_file():
+        if not parts or parts[0] == "/" or ".." in parts or set(name) & {":", "\\", "\0"}:
+            raise self.error(f"its buffer {name[:60]!r} is not a file beside it; export it as .glb")
+        if not beside.is_file():
             raise self.error(f"its buffer {name[:60]!r} is not a file; export it as .glb")
-        try:
-            return beside.read_bytes()
-        except OSError as error:
-            raise self.error(
-                f"its buffer {name[:60]!r} cannot be read ({error.strerror})"
-            ) from error
+        return beside.read_bytes()
 
 
 def _chunks(path: Path) -> tuple[bytes, bytes]:
     """Return the JSON chunk and the binary chunk of a file."""
     require_regular(path)
-    try:
+    with reading(path):
         content = path.read_bytes()
-    except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from error
     if content[:4] != b"glTF":  # a .gltf
         return content.removeprefix(b"\xef\xbb\xbf"), b""
     found: dict[bytes, bytes] = {}
@@ -338,33 +325,21 @@ class GlbDocument:
             limits: whether the smallest and the largest number of each column are stated.
         """
         rows = values.reshape(len(values), -1)
-        component = next(
-            number for number, name in _TYPES.items() if name == f"{rows.dtype.kind}{rows.itemsize}"
-        )
-        accessor: dict[str, Any] = {
-            "bufferView": self._add(rows, rows.nbytes, use),
-            "componentType": component,
-        }
-        accessor |= {
-            "count": len(rows),
-            "type": {width: name for name, width in _WIDTHS.items()}[rows.shape[1]],
-        }
-        if limits:
-            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
-        self._accessors.append(accessor)
-        return len(self._accessors) - 1
+        view = self._add(rows, rows.nbytes, use)
+        return self._add_accessor(rows, {"bufferView": view}, limits)
 
     def add_placeholder(self, values: np.ndarray, limits: bool = False) -> int:
         """Add an accessor of float32 numbers (K, D) that an extension provides; return its
         index."""
-        kinds = {width: name for name, width in _WIDTHS.items()}
-        accessor: dict[str, Any] = {
-            "componentType": 5126,
-            "count": len(values),
-            "type": kinds[values.shape[1]],
-        }
+        return self._add_accessor(values, {}, limits)
+
+    def _add_accessor(self, rows: np.ndarray, accessor: dict[str, Any], limits: bool) -> int:
+        kind = f"{rows.dtype.kind}{rows.itemsize}"
+        accessor["componentType"] = next(n for n, name in _TYPES.items() if name == kind)
+        accessor["count"] = len(rows)
+        accessor["type"] = next(n for n, width in _WIDTHS.items() if width == rows.shape[1])
         if limits:
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         self._accessors.append(accessor)
         return len(self._accessors) - 1
 

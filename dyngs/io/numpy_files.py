@@ -13,8 +13,7 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError, reading
 from dyngs.io.containment import inside
-from dyngs.io.fields import entry
-from dyngs.io.limits import require_at_most
+from dyngs.io.fields import entry, require_at_most
 
 MOST_BYTES = 1 << 29
 """Limit on the arrays of one file, each number counted as at least 8 bytes; SMPL-X takes half of

@@ -11,9 +11,8 @@ from functools import cached_property
 from pathlib import Path
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.limits import read_limited
-from dyngs.io.temporary import remove_quietly, temporary_folder_beside
-from dyngs.io.write import require_replaceable, write_text
+from dyngs.io.fields import read_limited
+from dyngs.io.write import remove_quietly, require_replaceable, temporary_folder_beside, write_text
 
 SOURCES_NAME = "sources.json"
 """In a capture made of photos or videos: where these lie."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, reading
-from dyngs.io.limits import require_at_most
+from dyngs.io.fields import require_at_most
 from dyngs.io.numpy_files import array_header, require_text
 
 _MOST_ENTRIES = 1 << 20

@@ -17,8 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError, reason, require_regular
-from dyngs.io.temporary import remove_quietly, temporary_folder_beside
-from dyngs.io.write import atomic_file
+from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 
 
 @dataclass(frozen=True)

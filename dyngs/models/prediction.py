@@ -9,9 +9,10 @@ What is predicted is any ``Renderable``: Gaussians, an avatar, a field.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from functools import lru_cache
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -25,48 +26,73 @@ from dyngs.data.loader import Image
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.model import Model
 from dyngs.models.renderable import Renderable
-from dyngs.ops.device import CPU
+from dyngs.models.views import background_colour, evaluation_background
+from dyngs.ops.device import CPU, sent
 from dyngs.ops.loss import l1_ssim_loss
 
 N = TypeVar("N", bound=nn.Module)
+P = TypeVar("P")
 
 MAX_GRADIENT = 1.0  # Norm to which gradients are clipped
+MOST_OPEN = 64  # People whose captures are kept open
 
 
-class Predictor(Protocol):
-    """A trained network with the capture of one person."""
+class Predictor(ABC, Generic[N]):
+    """A trained network with the capture of one person.
+
+    Attributes:
+        views: that can be predicted from.
+        data: how the capture is read, with its body.
+    """
+
+    def __init__(self, config: Config, network: N, views: Sequence[View], data: DataConfig) -> None:
+        self.config, self.network, self.views, self.data = config, network, tuple(views), data
 
     @property
     def name(self) -> str:
         """Name of the capture, for messages."""
-        ...
+        return self.data.root.name
 
     @property
-    def views(self) -> tuple[View, ...]:
-        """Views that can be predicted from."""
-        ...
+    def background(self) -> Tensor:
+        """(3,) colour behind predictions."""
+        return evaluation_background(self.config.data.background, True)[1]
 
+    @abstractmethod
     def chosen(self, count: int) -> list[int]:
         """Return the indices of ``count`` of the views that suit a prediction."""
-        ...
 
     def adapt(self, views: Sequence[int], steps: int | None, report: ReportProgress) -> int:
         """Train the network for ``steps`` on these images alone, None: as many as usual; return how
         many these were."""
-        ...
+        if steps:
+            kind = self.config.model.kind
+            raise DyngsError(
+                f"--steps {steps}: {kind} is not trained on the images of one person; leave it out"
+            )
+        return 0
 
+    @abstractmethod
     def predict(self, views: Sequence[int]) -> Renderable:
         """Return the scene that these views show. Raises DyngsError: they do not suit, one line
         that says why."""
-        ...
 
+    @abstractmethod
     def run_config(self, views: Sequence[int]) -> Config:
         """Return the configuration of the run that the scene becomes, which training can refine."""
-        ...
 
+    def data_of_moment(self, time: float | None, times: Collection[float]) -> DataConfig:
+        """Return the options of the time step of the capture, at ``times``, that is nearest to
+        ``time``; None: as given."""
+        moments = sorted(set(times))
+        if time is None or len(moments) < 2:
+            return self.data
+        row = min(range(len(moments)), key=lambda i: abs(moments[i] - time))
+        return self.data.model_copy(update={"frames": f"{row}:{row + 1}"})
+
+    @abstractmethod
     def begin(self, model: Model[Any], scene: Renderable, config: Config) -> None:
         """Let training of ``model``, of that ``config``, begin with ``scene``."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -91,10 +117,22 @@ class Learner(ABC, Generic[N]):
         background: "white", "black" or "random".
     """
 
-    network: N
-    lr: float
-    names: Sequence[str]
-    background: str
+    def __init__(
+        self,
+        config: Config,
+        network: N,
+        names: Sequence[str],
+        lr: float,
+        device: torch.device = CPU,
+    ) -> None:
+        self.config, self.network, self.names, self.device = config, network, names, device
+        self.lr = lr
+        chosen = config.data.background
+        self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
+
+    def drawn_background(self, generator: torch.Generator) -> Tensor:
+        """Return the colour (3,) behind an example."""
+        return sent(background_colour(self.background, generator), self.device)
 
     @abstractmethod
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
@@ -116,14 +154,16 @@ def random_index(count: int, generator: torch.Generator) -> int:
     return int(torch.randint(count, (1,), generator=generator, device="cpu"))
 
 
-def of_moment(data: DataConfig, time: float | None, times: Collection[float]) -> DataConfig:
-    """Return the options with the time step of a capture at ``times`` that is nearest to ``time``;
-    None: as given."""
-    moments = sorted(set(times))
-    if time is None or len(moments) < 2:
-        return data
-    row = min(range(len(moments)), key=lambda i: abs(moments[i] - time))
-    return data.model_copy(update={"frames": f"{row}:{row + 1}"})
+def kept_open(
+    open_person: Callable[[DataConfig], P], people: Sequence[DataConfig]
+) -> Callable[[int], P]:
+    """Return a function that opens the captures of people, of which the last ones stay open.
+
+    The first one is opened at once, so that captures of another kind fail before training.
+    """
+    opened = lru_cache(MOST_OPEN)(lambda person: open_person(people[person]))
+    opened(0)
+    return opened
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:

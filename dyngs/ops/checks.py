@@ -36,15 +36,21 @@ def check_number(name: str, value: object, low: float, high: float = LARGEST) ->
         raise DyngsError(f"{name} must be a number of at least {low:g}{upto}, got {value!r}")
 
 
-def check_tensors(op: str, tensors: Mapping[str, tuple[Tensor, tuple[int, ...]]]) -> None:
-    """Raise an error unless the ``tensors`` of ``op`` have these shapes, are floating point and on
-    one device."""
+def check_tensors(
+    op: str,
+    tensors: Mapping[str, tuple[Tensor, tuple[int, ...]]],
+    dtype: torch.dtype | None = None,
+) -> None:
+    """Raise an error unless the ``tensors`` of ``op`` have these shapes, one device, and ``dtype``
+    (None: floating point)."""
     first, device = next((name, x.device) for name, (x, _) in tensors.items())
     for name, (x, shape) in tensors.items():
         if tuple(x.shape) != shape:
             raise DyngsError(f"{op}: {name} must be {shape}, got {tuple(x.shape)}")
-        if not x.is_floating_point() or x.device != device:
+        fits = x.is_floating_point() if dtype is None else x.dtype == dtype
+        if not fits or x.device != device:
             wanted = f"floating point on {device} like the {first}"
+            wanted = wanted if dtype is None else f"{dtype} on {device}"
             raise DyngsError(f"{op}: {name} must be {wanted}, got {x.dtype} on {x.device}")
 
 

@@ -117,27 +117,9 @@ def why_no_gpu() -> str | None:
     if torch.version.cuda is None:
         return f"this torch ({torch.__version__}) is built without CUDA: {_TORCH}"
     if not torch.cuda.is_available():
-        return _why_torch_has_none()
+        return "torch finds no GPU: see `nvidia-smi`, and CUDA_VISIBLE_DEVICES if it is set"
     if not has_cuda_core():
         return f"dyngs was built without its kernels for GPUs: {_BUILD}"
-    return _why_kernels_fail()
-
-
-def _why_torch_has_none() -> str:
-    try:
-        torch.cuda.init()
-    except Exception as error:
-        # of torch: RuntimeError, or an AssertionError where it was built otherwise
-        found = str(error).splitlines()[0].rstrip(".").partition(" Please ")[0].rstrip(".")
-        if "too old" in found:
-            return f"{found}: update the driver of the GPU, or {_TORCH.replace('CUDA', 'an older CUDA')}"
-        if "no NVIDIA driver" in found.lower() or "no nvidia driver" in found.lower():
-            return "no driver of NVIDIA is there: install it"
-        return f"torch finds no GPU ({found}): see `nvidia-smi`"
-    return "torch finds no GPU: see `nvidia-smi`, and CUDA_VISIBLE_DEVICES if it is set"
-
-
-def _why_kernels_fail() -> str | None:
     try:
         kernels = cuda_core()
     except DyngsError as error:
@@ -147,10 +129,10 @@ def _why_kernels_fail() -> str | None:
     if driver < built // 1000 * 1000:  # CUDA's minor versions are compatible
         versions = f"the kernels were built with CUDA {_said(built)}, but the driver knows {_said(driver)} at most"
         return f"{versions}: update the driver, or build dyngs with an older nvcc"
-    capability = torch.cuda.get_device_capability()
-    if capability < OLDEST:
-        found, least = (f"{x[0]}.{x[1]}" for x in (capability, OLDEST))
-        return f"{torch.cuda.get_device_name()} has compute capability {found}, and {least} is needed: use another GPU"
+    if torch.cuda.get_device_capability() < OLDEST:
+        return (
+            f"{torch.cuda.get_device_name()} is older than compute capability 7.5: use another GPU"
+        )
     return None
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
+from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Backward, differentiable, empty_like, launch
 
@@ -89,17 +90,12 @@ def hash_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
     coordinate that is no finite number gives features of NaN. The same bits on any number of
     threads. Raises DyngsError: shapes or dtypes that do not fit.
     """
-    if coords.ndim != 2 or coords.shape[1] != 3:
-        raise DyngsError(f"hash grid: points must be (M, 3), got {tuple(coords.shape)}")
-    if table.ndim != 2 or len(table) != levels.num_rows or table.shape[1] not in WIDTHS:
-        raise DyngsError(
-            f"hash grid: the table must be ({levels.num_rows}, F) with F of 1, 2, 4 or 8, got {tuple(table.shape)}"
-        )
-    if coords.dtype != table.dtype or coords.device != table.device:
-        raise DyngsError(
-            f"hash grid: points must be {table.dtype} on {table.device} like the table, got {coords.dtype} on "
-            f"{coords.device}"
-        )
+    features = table.shape[1] if table.ndim == 2 else 0
+    if features not in WIDTHS:
+        raise DyngsError(f"hash grid: 1, 2, 4 or 8 features of a row, got {tuple(table.shape)}")
+    points = coords, (len(coords), 3)
+    wanted = {"table": (table, (levels.num_rows, features)), "points": points}
+    check_tensors("hash grid", wanted, table.dtype)
     if coords.requires_grad and torch.is_grad_enabled():
         raise DyngsError("hash grid: there is no gradient by the points; detach them")
     return hash_grid_op(

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 import platform
 import sys
-import threading
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -130,76 +129,51 @@ _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=N
 def num_threads() -> int:
     """Return the number of threads of the kernels: of ``kernel_threads``, else torch's; after a
     fork see ``Fork``."""
-    wanted = _kernel_threads.get() or torch.get_num_threads()
-    return _fork.allowed(wanted) if _fork.lost_threads else wanted
+    return _fork.allowed(_kernel_threads.get() or torch.get_num_threads())
 
 
 class Fork:
     """Handling of the threads of OpenMP in a process made by ``os.fork``.
 
     The child has the parent's list of waiting threads, but not the threads: the next parallel loop
-    would wait without end. Where the parent had started any, the child runs kernels and torch's
-    operators on one thread, and says so once.
+    would wait without end. Where kernels of the parent had started any, the child runs kernels and
+    torch's operators on one thread, and says so once.
     """
 
     def __init__(self) -> None:
+        self.started_threads = False
         self.lost_threads = False
         self._told = False
-        self._before = _native_threads()
-        self._team = False
-
-    def remember(self) -> None:
-        """Note whether threads run, which then stay; called in the parent just before it forks."""
-        self._team = self.lost_threads or self._team or _native_threads() > self._before
-
-    def go_on(self) -> None:
-        """Count the threads that are not of OpenMP; called in the parent just after a fork, which
-        ends OpenBLAS's."""
-        if not self._team:
-            self._before = _native_threads()
 
     def begin_child(self) -> None:
         """Set the number of threads; called in the child just after the fork."""
-        self._before = _native_threads()
-        self.lost_threads = self._team
+        self.lost_threads = self.started_threads
         self._told = False
         if self.lost_threads:
             self._told = (_kernel_threads.get() or torch.get_num_threads()) == 1
             torch.set_num_threads(1)
 
     def allowed(self, wanted: int) -> int:
-        """Return 1, with one warning where more were wanted or would have been before the fork."""
+        """Return ``wanted``; where threads were lost 1, with one warning where more were wanted or
+        would have been before the fork."""
+        self.started_threads = self.started_threads or wanted > 1
+        if not self.lost_threads:
+            return wanted
         if not self._told and torch.utils.data.get_worker_info() is None:
             self._told = True
-            reason = (
-                "this process was forked from one that had started threads, which it has not got"
-            )
-            remedy = "start processes with multiprocessing's 'spawn' method to use more"
             warnings.warn(
-                f"dyngs and torch run on one thread: {reason}; {remedy}",
+                "dyngs and torch run on one thread: this process was forked from one that had "
+                "started threads, which it has not got; start processes with multiprocessing's "
+                "'spawn' method to use more",
                 RuntimeWarning,
                 stacklevel=2,
             )
         return min(wanted, 1)
 
 
-def _native_threads() -> int:
-    """Return the number of threads of this process that Python did not start; those of OpenMP stay
-    once started.
-
-    0 without Linux's /proc: elsewhere processes are not forked, or the OpenMP library starts anew.
-    """
-    try:
-        return len(os.listdir("/proc/self/task")) - threading.active_count()
-    except OSError:
-        return 0
-
-
 _fork = Fork()
 if sys.platform != "win32":
-    os.register_at_fork(
-        before=_fork.remember, after_in_parent=_fork.go_on, after_in_child=_fork.begin_child
-    )
+    os.register_at_fork(after_in_child=_fork.begin_child)
 
 
 @contextmanager

@@ -326,9 +326,8 @@ def blend_patches(
     """
     count, (views, height, width) = len(places.ids), places.rows.shape
     checked = {"means": (means, (count, 2)), "colours": (colours, (count, colours.shape[-1]))}
-    check_tensors("patches", checked | {"crossings": (crossings, (views, 2, height, width))})
-    if not means.dtype == colours.dtype == crossings.dtype:
-        raise DyngsError("patches: means, colours and crossings of one dtype")
+    checked |= {"crossings": (crossings, (views, 2, height, width))}
+    check_tensors("patches", checked, means.dtype)
     return blend_patches_op(
         means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids
     )

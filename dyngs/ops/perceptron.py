@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from dyngs.core.errors import DyngsError
+from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import core_for, num_threads
 from dyngs.ops.registration import Backward, differentiable, empty_like, has_kernel, launch
 
@@ -125,26 +126,12 @@ def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> lis
             f"perceptron: skip={skip} must name one of the layers 1 to {len(layers) - 1}, or be None"
         )
     widths = [x.shape[1]]
+    wanted = {"inputs": (x, tuple(x.shape))}
     for i, layer in enumerate(layers):
-        weight = layer.weight
-        bias = layer.bias
         features = widths[-1] + (widths[0] if i == skip else 0)
-        if weight.ndim != 2 or weight.shape[0] == 0 or weight.shape[1] != features:
-            raise DyngsError(
-                f"perceptron: the weight of layer {i} must be (out, {features}), got {tuple(weight.shape)}"
-            )
-        if bias.shape != weight.shape[:1]:
-            raise DyngsError(
-                f"perceptron: the bias of layer {i} must be ({weight.shape[0]},), got {tuple(bias.shape)}"
-            )
-        for tensor in (x, weight, bias):
-            if not tensor.is_floating_point():
-                raise DyngsError(
-                    f"perceptron: inputs and layers must be floating point, got {tensor.dtype}"
-                )
-            if tensor.device != x.device:
-                raise DyngsError(
-                    f"perceptron: the inputs are on {x.device}, but layer {i} on {tensor.device}"
-                )
-        widths.append(weight.shape[0])
+        width = max(len(layer.weight), 1)
+        wanted[f"weight of layer {i}"] = layer.weight, (width, features)
+        wanted[f"bias of layer {i}"] = layer.bias, (width,)
+        widths.append(width)
+    check_tensors("perceptron", wanted)
     return widths

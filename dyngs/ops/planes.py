@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
+from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, empty_like, launch, register
-
-MAX_POINTS = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -142,16 +141,13 @@ def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel])
     dtypes that do not fit each other, no levels, or a time that is no number.
     """
     _check_levels(levels)
-    if coords.ndim != 2 or coords.shape[1] != 3 or len(coords) > MAX_POINTS:
-        raise DyngsError(
-            f"hexplane: coordinates must be (M, 3) with M < 2^31, got {tuple(coords.shape)}"
-        )
     first = levels[0].space
-    if coords.dtype != first.dtype or coords.device != first.device:
-        raise DyngsError(
-            f"hexplane: coordinates must be {first.dtype} on {first.device} like the planes, "
-            f"got {coords.dtype} on {coords.device}"
-        )
+    shape = len(coords) if coords.ndim else 0, 3
+    check_tensors(
+        "hexplane",
+        {"planes": (first, tuple(first.shape)), "coordinates": (coords, shape)},
+        first.dtype,
+    )
     if math.isnan(time):
         raise DyngsError("hexplane: the time must be a number in [0, 1], got NaN")
     return hexplane_op(coords, _tensors(levels), time)[0]
@@ -179,30 +175,15 @@ def _check_levels(levels: Sequence[PlaneLevel]) -> None:
         raise DyngsError("planes: at least one level is needed")
     first = levels[0].space
     if first.dtype not in (torch.float32, torch.float64) or first.ndim != 4:
-        raise DyngsError(
-            f"planes: need (3, R, R, C) in float32 or float64, got {tuple(first.shape)} {first.dtype}"
-        )
-    channels = first.shape[3]
-    for number, level in enumerate(levels):
-        space = tuple(level.space.shape)
-        time = tuple(level.time.shape)
-        size = space[1] if len(space) > 1 else 0
-        times = time[1] if len(time) > 1 else 0
-        if (
-            space != (3, size, size, channels)
-            or time != (3, times, size, channels)
-            or size * times * channels == 0
-        ):
-            raise DyngsError(
-                f"planes: level {number} must have space (3, R, R, {channels}) and time (3, T, R, {channels}), "
-                f"none empty, got {space} and {time}"
-            )
-        if {(x.dtype, x.device) for x in (level.space, level.time)} != {
-            (first.dtype, first.device)
-        }:
-            raise DyngsError(
-                f"planes: level {number} must be {first.dtype} on {first.device} like the first"
-            )
+        got = f"{tuple(first.shape)} {first.dtype}"
+        raise DyngsError(f"planes: need (3, R, R, C) in float32 or float64, got {got}")
+    wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {}
+    for i, level in enumerate(levels):
+        size, times = (max([*x.shape[1:2], 1]) for x in (level.space, level.time))
+        channels = max(first.shape[3], 1)
+        wanted[f"space of level {i}"] = level.space, (3, size, size, channels)
+        wanted[f"time of level {i}"] = level.time, (3, times, size, channels)
+    check_tensors("planes", wanted, first.dtype)
 
 
 def _tensors(levels: Sequence[PlaneLevel]) -> list[Tensor]:

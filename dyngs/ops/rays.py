@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
+from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Backward, differentiable, empty_like, launch, register
 
@@ -284,13 +285,8 @@ def composite(
     DyngsError: shapes or dtypes that do not fit.
     """
     count = len(samples)
-    if densities.shape != (count,) or colours.shape != (count, 3):
-        raise DyngsError(
-            f"composite: densities must be ({count},) and colours ({count}, 3), got {tuple(densities.shape)} and "
-            f"{tuple(colours.shape)}"
-        )
-    if not densities.dtype == colours.dtype == samples.starts.dtype:
-        raise DyngsError("composite: densities, colours and samples must be of one dtype")
+    wanted = {"densities": (densities, (count,)), "colours": (colours, (count, 3))}
+    check_tensors("composite", wanted, samples.starts.dtype)
     given = (
         densities.contiguous(),
         colours.contiguous(),

@@ -107,15 +107,13 @@ def _check(
         else (values, (nodes, -1)),
     }
     check_tensors("blend_skinning", expected)
-    if followed.dtype != torch.int64 or followed.device != points.device:
-        wanted = f"int64 on {points.device} like the points"
-        raise DyngsError(
-            f"blend_skinning: followed must be {wanted}, got {followed.dtype} on {followed.device}"
-        )
-    if followed.ndim != 2 or len(followed) != len(points) or followed.shape[1] == 0:
-        raise DyngsError(
-            f"blend_skinning: followed must be ({len(points)}, B) with B at least 1, got {tuple(followed.shape)}"
-        )
+    count = len(points)
+    shape = tuple(followed.shape)
+    fits = followed.dtype == torch.int64 and followed.device == points.device
+    if not fits or len(shape) != 2 or shape[0] != count or shape[1] == 0:
+        wanted = f"({count}, B) int64 on {points.device} with B at least 1"
+        got = f"{shape} {followed.dtype} on {followed.device}"
+        raise DyngsError(f"blend_skinning: followed must be {wanted}, got {got}")
 
 
 def _add_offsets(

@@ -21,9 +21,7 @@ from dyngs.core.errors import DyngsError, printable
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
-from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.avatar.corrections import new_corrections
-from dyngs.human.avatar.posing import TERMS, PoseBlendShapes, Skeleton
+from dyngs.human.avatar.posing import TERMS, Anchors, PoseBlendShapes, Skeleton, new_corrections
 from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
 from dyngs.human.body.body_reader import template_path
 from dyngs.human.keys import HumanModel

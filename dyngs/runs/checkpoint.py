@@ -24,7 +24,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, as_word, reading
 from dyngs.data.capture import View
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.io.limits import read_limited
+from dyngs.io.fields import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo

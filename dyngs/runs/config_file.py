@@ -9,7 +9,7 @@ from pathlib import Path
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
-from dyngs.io.temporary import remove_quietly, temporary_folder_beside
+from dyngs.io.write import remove_quietly, temporary_folder_beside
 
 BODY_FOLDER = "body"
 """In a run folder: the fit that ``data.body`` named when the run began."""

@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError, as_word
 from dyngs.data.read import read_capture
 from dyngs.io.lock import LOCK_NAME, writing
 from dyngs.io.outputs import new_folder
-from dyngs.io.temporary import remove_leftovers
+from dyngs.io.write import remove_leftovers
 from dyngs.models.kind import Predicts, capability
 from dyngs.runs.capture_record import RECORD_NAME, changed_files
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of

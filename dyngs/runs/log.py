@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.limits import read_limited
+from dyngs.io.fields import read_limited
 from dyngs.io.write import write_text
 from dyngs.training.events import Evaluated, Event, StepDone
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from pydantic import Field, TypeAdapter
 
-from dyngs.api.scene_file import num_bytes_exact
 from dyngs.api.train import num_cores
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import load_lpips, psnr, ssim
@@ -210,6 +209,9 @@ class Bench:
                 write_image(self.image_path(subject.slug, len(views)), rendered.cpu().numpy())
                 views.append((image.name, score))
         trained = load_run(subject.run_dir)
+        mb = state_megabytes(drawing.scene)
+        if has_only_scene_file(folder):
+            mb = 1e-6 * (folder / SCENE_FILE).stat().st_size
         memory = None
         if self.has_memory and drawing.background.device.type == "cpu":
             few = _some(loader, MEMORY_VIEWS)
@@ -223,7 +225,7 @@ class Bench:
                 for key in ("psnr", "ssim", "lpips", "psnr_foreground", "psnr_moving")
             },
             gaussians=_count(drawing.scene),
-            mb=megabytes_on_disk(folder),
+            mb=mb,
             memory_mb=memory,
             steps=trained.step,
             seconds=trained.seconds_train,
@@ -271,12 +273,10 @@ def quartiles(values: np.ndarray) -> Quartiles:
     return Quartiles(float(median), float(low), float(high))
 
 
-def megabytes_on_disk(folder: Path) -> float:
-    """Return the size of the .dyngs file, or of what rendering needs of a checkpoint, in 1e6
-    bytes."""
-    if has_only_scene_file(folder):
-        return 1e-6 * (folder / SCENE_FILE).stat().st_size
-    return 1e-6 * num_bytes_exact(load_run(folder).renderable)
+def state_megabytes(scene: Renderable) -> float:
+    """Return the size of all that drawing needs, 1e6 bytes."""
+    stored = [x.tensor for x in scene.drawing_state().values()]
+    return 1e-6 * sum(x.numel() * x.element_size() for x in stored)
 
 
 def _count(scene: Renderable) -> int:

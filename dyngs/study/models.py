@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from dyngs.api.budget.size import has_file
-from dyngs.capture.unposed import is_unposed
+from dyngs.capture.sfm.unposed import is_unposed
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import find_preset, load_config, load_resolved
 from dyngs.core.errors import DyngsError, as_word, printable, show
@@ -54,7 +54,6 @@ MARKS = tuple((i / 12) ** 2 for i in range(1, 12))
 """Fractions of a run after which views are drawn, and at its end: more in the beginning, when
 quality rises fast."""
 _OURS = ("data.root", "run.", "train.minutes", "budget.")
-_LEAST_CONTRAST = 2 / 255
 _CURVE = TypeAdapter(tuple[CurvePoint, ...])
 
 
@@ -185,19 +184,11 @@ def comparable(data: DataConfig, split: str) -> Capture:
             f"`dyngs data sfm {as_word(data.root)} OUT`"
         )
     capture = read_capture(data)
-    held_out = split_views(capture, split)
+    split_views(capture, split)  # refuses a split without views
     if len(capture.splits["train"]) < 2:
         raise DyngsError(
             f"{data.root}: has one picture to train on, which shows nothing of what lies behind; add more"
         )
-    _, background = evaluation_background(data.background, capture.has_alpha)
-    for views in (capture.splits["train"], held_out):
-        loader = ImageLoader(views, data)
-        shown = (loader[i].composite(background) for i in evenly_spaced(len(loader), 8))
-        if all(float((x.amax((0, 1)) - x.amin((0, 1))).max()) < _LEAST_CONTRAST for x in shown):
-            raise DyngsError(
-                f"{data.root}: its pictures are of one colour, so there is nothing to compare"
-            )
     return capture
 
 

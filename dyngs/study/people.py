@@ -27,13 +27,14 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
-from dyngs.human.predict.gps.pairs import angle, around
+from dyngs.human.predict.gps.rectification import angle, around
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import load_run
 from dyngs.runs.folder import require_empty
+from dyngs.study.measure import state_megabytes
 from dyngs.study.report import Table, csv_text, markdown_table
 
 STEM = "comparison"
@@ -222,8 +223,7 @@ def _scores(
 ) -> Iterator[Score]:
     """Yield those of one person, and write the pictures."""
     scene, seconds, training = made
-    stored = [x.tensor for x in scene.drawing_state().values()]
-    megabytes = sum(x.numel() * x.element_size() for x in stored) / 1e6
+    megabytes = state_megabytes(scene)
     boxes(scene, images[0])  # what is found out once is not part of a picture's time
     for image in (images[i] for i in range(len(images))):
         start = time.process_time()

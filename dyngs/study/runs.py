@@ -17,7 +17,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, printable, reading
 from dyngs.io.child import home_of_dyngs
 from dyngs.io.containment import following_links_of_runs, follows_links_of_runs
-from dyngs.io.limits import read_limited
+from dyngs.io.fields import read_limited
 from dyngs.io.write import write_text
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Listener

@@ -72,19 +72,16 @@ class Variant:
     @property
     def name(self) -> str:
         words = (
-            f"{k}={value:g}" if isinstance(value, float) else f"{k}={value}"
-            for k, value in self.changes.items()
+            f"{k}={x:g}" if isinstance(x, float) else f"{k}={x}" for k, x in self.changes.items()
         )
         return " ".join(words) or "as it is"
 
     @property
     def slug(self) -> str:
         """File name, different for different variants."""
-        exact = (
-            f"{k}-{value!r}" if isinstance(value, float) else f"{k}-{value}"
-            for k, value in self.changes.items()
+        return (
+            "_".join(f"{k}-{x!r}".replace("'", "") for k, x in self.changes.items()) or "as_it_is"
         )
-        return "_".join(exact) or "as_it_is"
 
     @property
     def settings(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from dyngs.capture.first_points import with_first_points
+from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.inspection.problems import before_training
 from dyngs.config import Config, ModelSection, PointsInit, RandomInit
 from dyngs.core.errors import DyngsError, reading, warn

@@ -41,8 +41,17 @@ class Gate:
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return "a page of another site asks for it"
         if self.token is None:
-            return None if is_loopback(_name_of(host)) else "only for requests to localhost"
-        given = (*parse_qs(urlsplit(path).query).get("token", ()), _cookie(headers))
+            try:
+                name = urlsplit(f"//{host}").hostname or ""
+            except ValueError:
+                name = ""
+            return None if is_loopback(name) else "only for requests to localhost"
+        try:
+            cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+        except CookieError:
+            cookie = None
+        given = parse_qs(urlsplit(path).query).get("token", [])
+        given = given if cookie is None else [*given, cookie.value]
         if any(hmac.compare_digest(word.encode(), self.token.encode()) for word in given):
             return None
         return "the token is missing or wrong; open the link that `dyngs view` printed"
@@ -77,35 +86,26 @@ def link_to(host: str, port: int, token: str | None = None) -> str:
         host = socket.gethostname() or "localhost"
     elif host == "127.0.0.1":
         host = "localhost"
-    return (
-        f"http://{f'[{host}]' if ':' in host else host}:{port}/{f'?token={token}' if token else ''}"
-    )
+    name = f"[{host}]" if ":" in host else host
+    return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
 
 
 def free_port(host: str, port: int | None) -> int:
     """Return the port to listen on: ``port``; None: 8080, or the next that is free. Raises
     DyngsError."""
-    for candidate in [port] if port is not None else [*range(DEFAULT_PORT, DEFAULT_PORT + 50), 0]:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for candidate in range(DEFAULT_PORT, DEFAULT_PORT + 50) if port is None else [port]:
         try:
-            return _bound(host, candidate)
+            socket.create_server((host, candidate), family=family).close()
+            return candidate
         except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                if port is None:
-                    continue
-                raise port_taken(port) from error
-            if error.errno == errno.EACCES:
+            if error.errno != errno.EADDRINUSE:
                 raise DyngsError(
-                    f"--port {port}: not allowed for this user; choose one above 1023"
+                    f"--host {host}, port {candidate}: cannot listen there ({error.strerror or error})"
                 ) from error
-            raise DyngsError(
-                f"--host {host}: cannot listen there ({error.strerror or error})"
-            ) from error
-    raise AssertionError("the last candidate is never taken")
-
-
-def port_taken(port: int) -> DyngsError:
-    """Return the error for a port that another program listens on."""
-    return DyngsError(f"--port {port}: taken; choose another, or leave it out to get a free one")
+    raise DyngsError(
+        f"--port {port or DEFAULT_PORT}: taken; choose another, or leave it out to get a free one"
+    )
 
 
 @contextmanager
@@ -137,30 +137,3 @@ def guarded(gate: Gate) -> Iterator[None]:
         yield
     finally:
         server.serve = original
-
-
-def _bound(host: str, port: int) -> int:
-    """Return the port of a socket that could be bound. Raises OSError where it could not."""
-    family, _, _, _, address = socket.getaddrinfo(
-        host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-    )[0]
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind(address)
-        return probe.getsockname()[1]
-
-
-def _name_of(host: str) -> str:
-    """Return the name in a header ``Host``, without its port."""
-    try:
-        return (urlsplit(f"//{host}").hostname or "").lower()
-    except ValueError:
-        return ""
-
-
-def _cookie(headers: Mapping[str, str]) -> str:
-    try:
-        found = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
-    except CookieError:
-        return ""
-    return "" if found is None else found.value

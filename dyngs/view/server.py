@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -11,25 +12,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, printable
 from dyngs.runs.opened import Opened
-from dyngs.view.cameras import fitting_fov, look_point, pose_of
-from dyngs.view.captured_views import viewpoint_of, views_of
-from dyngs.view.gate import free_port, gate_for, guarded, link_to, port_taken
-from dyngs.view.markdown import as_text
-from dyngs.view.pace import Pace
-from dyngs.view.render_thread import Drawer
-from dyngs.view.session import Eye, Sent, Session
+from dyngs.view.gate import free_port, gate_for, guarded, link_to
+from dyngs.view.session import Drawer, Eye, Pace, Sent, Session
 from dyngs.view.source import Source
+from dyngs.view.views import fitting_fov, look_point, pose_of, viewpoint_of, views_of
 
 if TYPE_CHECKING:
     import viser
 
-MOVING_QUALITY, STILL_QUALITY = 75, 95
-"""JPEG qualities."""
 _STATUS_EVERY = 0.5
 """Seconds between two changes of the line about the images, and of the time slider while it
 plays."""
+_PUNCTUATION = re.compile(r"([!-/:-@\[-`{-~])")
+_IN_LINKS = re.compile(r"(?=://|@)|(?<=www)(?=\.)", re.IGNORECASE)
+"""Where addresses are recognised even if their punctuation is escaped."""
 
 
 @dataclass(frozen=True)
@@ -64,33 +62,43 @@ class Browsing:
         self.time_slider: viser.GuiSliderHandle | None = None
         self.on_move: Callable[[], None] = lambda: None
         self.num_sent = 0
-        self._told_at, self._since_told = 0.0, 0
+        self._told_at = 0.0
+        self._told_count = 0
         self._has_refused = False
 
     def send(self, sent: Sent) -> None:
         """Pass an image to the browser."""
-        quality = STILL_QUALITY if sent.is_refined else MOVING_QUALITY
+        quality = 95 if sent.is_refined else 75
         self.client.scene.set_background_image(sent.image, format="jpeg", jpeg_quality=quality)
         self.num_sent += 1
-        self._since_told += 1
         now = time.monotonic()
         if now - self._told_at >= _STATUS_EVERY or sent.is_refined:
             self._tell(sent, now)
         self.client.flush()
 
+    def _tell(self, sent: Sent, now: float) -> None:
+        height, width = sent.image.shape[:2]
+        rate = (self.num_sent - self._told_count) / max(now - self._told_at, 1e-6)
+        shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
+        view = self.session.shown_view
+        if view is not None:
+            shown += f", truth: {as_text(views_of(self.session.opened).names[view])}"
+        if self.status is not None:
+            self.status.content = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}"
+        if self.time_slider is not None and self.session.timeline.playing:
+            self.time_slider.value = round(self.session.time, 3)
+        self._told_at = now
+        self._told_count = self.num_sent
+
     def camera_moved(self) -> None:
         """Take over the camera of the browser."""
         camera = self.client.camera
-        size = _window(camera)
-        eye = Eye(
-            tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size
-        )
-        if self.session.move(eye):
+        wxyz, position = tuple(camera.wxyz.tolist()), tuple(camera.position.tolist())
+        if self.session.move(Eye(wxyz, position, float(camera.fov), _window(camera))):
             self.on_move()
         elif not self._has_refused:
             self._has_refused = True
-            notify(
-                self.client,
+            self.notify(
                 "Camera ignored",
                 "The browser sent a camera that cannot exist; the last one stays.",
             )
@@ -106,25 +114,25 @@ class Browsing:
             width, height = _window(handle)
             handle.fov = fitting_fov(camera, width / height)
             handle.position = position
-            handle.look_at = look_point(camera, begin.center, begin.extent)
+            handle.look_at = look_point(camera, begin)
             handle.wxyz = wxyz
         self.camera_moved()
 
-    def _tell(self, sent: Sent, now: float) -> None:
-        height, width = sent.image.shape[:2]
-        rate = self._since_told / max(now - self._told_at, 1e-6)
-        shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
-        view = self.session.shown_view
-        truth = (
-            "" if view is None else f", truth: {as_text(views_of(self.session.opened).names[view])}"
-        )
-        if self.status is not None:
-            self.status.content = (
-                f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}{truth}"
-            )
-        if self.time_slider is not None and self.session.timeline.playing:
-            self.time_slider.value = round(self.session.time, 3)
-        self._told_at, self._since_told = now, 0
+    def notify(self, title: str, body: str) -> None:
+        """Show a message for some seconds."""
+        self.client.add_notification(title, body, auto_close_seconds=12.0)
+
+
+def _window(camera: viser.CameraHandle) -> tuple[int, int]:
+    """Return width and height of the window of a browser, px: at least 16, also of one that has
+    none yet."""
+    return max(16, int(camera.image_width)), max(16, int(camera.image_height))
+
+
+def as_text(text: str) -> str:
+    """Return Markdown that shows ``text`` of others letter by letter: no HTML, which viser would
+    render with its scripts, no links, images or emphasis."""
+    return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", printable(text)))
 
 
 class Viewer:
@@ -140,26 +148,18 @@ class Viewer:
 
     def __init__(self, source: Source, first: Opened, serving: Serving = Serving()) -> None:
         require_viser()
+        import viser
+
         self.source, self.first, self.serving = source, first, serving
         self.drawer = Drawer(self._tell_error)
         self._browsing: dict[int, Browsing] = {}
         self._lock = threading.Lock()
         gate = gate_for(serving.host)
-        self._token = gate.token
         port = free_port(serving.host, serving.port)
-        import viser
-
         with guarded(gate), quiet():
             self.server = viser.ViserServer(host=serving.host, port=port, verbose=False)
-        if serving.port is not None and self.server.get_port() != serving.port:
-            self.server.stop()
-            raise port_taken(serving.port)
+        self.link = link_to(serving.host, self.server.get_port(), gate.token)
         self._prepare()
-
-    @property
-    def link(self) -> str:
-        """Address of the page, with the token if there is one."""
-        return link_to(self.serving.host, self.server.get_port(), self._token)
 
     @property
     def browsing(self) -> tuple[Browsing, ...]:
@@ -187,24 +187,19 @@ class Viewer:
         from viser import _messages
 
         server = self.server
-        first = self.first
         for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
             # it would pass the page through a host of others
             server._websock_server.unregister_handler(kind)
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         server.gui.main_panel.dock_right()  # next to the image, not over it
-        begin = viewpoint_of(first)
-        _, position = pose_of(begin.start)
+        begin = viewpoint_of(self.first)
+        start = begin.start
         server.scene.set_up_direction(tuple(begin.up))
         camera = server.initial_camera
-        camera.position, camera.look_at = (
-            position,
-            look_point(begin.start, begin.center, begin.extent),
-        )
-        camera.up, camera.fov = (
-            begin.up,
-            fitting_fov(begin.start, begin.start.width / begin.start.height),
-        )
+        _, camera.position = pose_of(start)
+        camera.look_at = look_point(start, begin)
+        camera.up = begin.up
+        camera.fov = fitting_fov(start, start.width / start.height)
         camera.near = 1e-3 * begin.extent
         camera.far = 1e3 * begin.extent
 
@@ -214,7 +209,7 @@ class Viewer:
         browsing = Browsing(client, self.first, Pace(self.serving.target, self.serving.longest))
         with self._lock:
             self._browsing[client.client_id] = browsing
-        Controls(browsing, self.source, self.serving)
+        Controls(browsing, self.source, self.serving.motions)
 
         async def moved(_: viser.CameraHandle) -> None:
             browsing.camera_moved()
@@ -234,18 +229,7 @@ class Viewer:
     def _tell_error(self, session: Session, message: str) -> None:
         for browsing in self.browsing:
             if browsing.session is session:
-                notify(browsing.client, "Error", message)
-
-
-def _window(camera: viser.CameraHandle) -> tuple[int, int]:
-    """Return width and height of the window of a browser, px: at least 16, also of one that has
-    none yet."""
-    return max(16, int(camera.image_width)), max(16, int(camera.image_height))
-
-
-def notify(client: viser.ClientHandle, title: str, body: str) -> None:
-    """Show a message in a browser for some seconds."""
-    client.add_notification(title, body, auto_close_seconds=12.0)
+                browsing.notify("Error", message)
 
 
 def require_viser() -> None:

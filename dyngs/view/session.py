@@ -1,28 +1,58 @@
-"""What one browser looks at, and which image it gets next. Knows neither viser nor threads of its
-own."""
+"""What one browser looks at, which image it gets next and how large, and the thread that draws for
+all browsers. Knows no viser."""
 
 from __future__ import annotations
 
+import json
+import logging
 import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras, world_pose
 from dyngs.runs.opened import Opened
-from dyngs.view.cameras import camera_at, in_window, nearest_camera
-from dyngs.view.captured_views import viewpoint_of, views_of
 from dyngs.view.layers import Layer, Part, Shot, draw
-from dyngs.view.pace import STILL_AFTER, Pace, size_within
-from dyngs.view.recording import Recording
+from dyngs.view.views import camera_at, nearest_view, views_of
 
+_LOG = logging.getLogger(__name__)
+STILL_AFTER = 0.2
+"""Seconds without change after which the image is refined."""
 _SHORTEST = 1 / 30
 """Seconds between two images at least."""
+_SMALLEST_AREA = 320 * 240
+"""Pixels of an image at least: where Gaussians take all the time, a smaller one would hardly come
+sooner."""
+
+
+class Pace:
+    """Number of pixels that can be drawn within ``target`` seconds, by how long the last images
+    took.
+
+    Refined images may take ``longest`` seconds. ``area``: pixels of an image while something moves.
+    ``largest``: most pixels of a refined image.
+    """
+
+    def __init__(self, target: float = 1 / 14, longest: float = math.inf) -> None:
+        self._target, self._longest = target, longest
+        self.area = float(_SMALLEST_AREA)
+        self.largest = math.inf
+
+    def observe(self, pixels: float, seconds: float) -> None:
+        """Note how long an image took while something moves."""
+        seconds = max(seconds, 1e-9)
+        factor = min(max(self._target / seconds, 0.5), 2.0)
+        self.area = max(pixels * math.sqrt(factor), _SMALLEST_AREA)
+        self.largest = max(pixels * self._longest / seconds, self.area)
 
 
 @dataclass(frozen=True)
@@ -39,12 +69,8 @@ class Eye:
     def is_possible(self) -> bool:
         """Whether there is such a camera: browsers may send anything."""
         numbers = (*self.wxyz, *self.position, self.fov)
-        return (
-            all(map(math.isfinite, numbers))
-            and math.hypot(*self.wxyz) > 1e-6
-            and self.fov > 0
-            and min(self.size) > 0
-        )
+        has_direction = all(map(math.isfinite, numbers)) and math.hypot(*self.wxyz) > 1e-6
+        return has_direction and self.fov > 0 and min(self.size) > 0
 
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
         """Return the camera for images of ``size``; None: that of the window."""
@@ -73,17 +99,12 @@ class Timeline:
         passed = self.time + max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
         return passed % 1.0 if self.loops and passed > 1 else min(passed, 1.0)
 
-    def is_over(self, clock: float) -> bool:
-        """Return whether it plays without a loop and has reached the end."""
-        return self.playing and not self.loops and self.at(clock) >= 1.0
-
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
         """Return the timeline with other attributes; the time does not jump, but who plays from the
         end begins at 0."""
-        now = replace(self, time=self.at(clock), since=clock)
-        if changes.get("playing") and now.time >= 1.0:
-            now = replace(now, time=0.0)
-        return replace(now, **changes)  # type: ignore[arg-type]
+        now = self.at(clock)
+        now = 0.0 if changes.get("playing") and now >= 1.0 else now
+        return replace(self, time=now, since=clock, **changes)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -103,6 +124,73 @@ class Display:
     view: int | None = None
     divide: float = 0.5
     longest: int = 1600
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """One camera, the time of the scene it shows, and the seconds until the next one."""
+
+    camera: Cameras
+    time: float | None
+    seconds: float = 1.0
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Keyframes of a camera path in their order; ``loops``: the camera returns to the first one at
+    the end."""
+
+    keyframes: tuple[Keyframe, ...] = ()
+    loops: bool = False
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    @property
+    def duration(self) -> float:
+        """Seconds of the path; those after the last keyframe count only in a loop."""
+        return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
+
+    def keys(self) -> Keyframes:
+        """Return at least one keyframe as the interpolation takes them."""
+        cameras = [key.camera for key in self.keyframes]
+        poses, matrices = (
+            torch.cat(x).double().cpu().numpy()
+            for x in zip(*((c.cam_from_world, c.intrinsics) for c in cameras), strict=True)
+        )
+        starts = np.cumsum([0.0, *(key.seconds for key in self.keyframes[:-1])])
+        times = [key.time for key in self.keyframes if key.time is not None]
+        has_times = len(times) == len(self)
+        period = self.duration if self.loops and len(self) > 1 else None
+        return Keyframes(poses, matrices, starts, np.array(times) if has_times else None, period)
+
+    def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
+        """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
+        coordinates of the capture; focal lengths follow the height, px."""
+        width, height = size
+        keys: list[dict[str, Any]] = []
+        for key, start in zip(self.keyframes, self.keys().seconds.tolist(), strict=True):
+            camera = opened.frame.cameras(key.camera)
+            pose = camera.cam_from_world[0].double().cpu().numpy()
+            focal = float(camera.intrinsics[0, 1, 1]) * height / camera.height
+            entry: dict[str, Any] = {"at": start, "fl_x": focal}
+            entry["cam_from_world"] = world_pose(pose, opened.world_offset).tolist()
+            keys.append(entry if key.time is None else entry | {"time": key.time})
+        document = {"width": width, "height": height, "fps": fps, "loop": self.loops}
+        if self.loops:
+            document["seconds"] = self.duration
+        return json.dumps({**document, "keyframes": keys}, indent=1) + "\n"
+
+    def at(self, seconds: float) -> tuple[Cameras, float | None]:
+        """Return the camera and the time of the scene after ``seconds`` of the path, of at least
+        one keyframe."""
+        first = self.keyframes[0].camera
+        made = interpolate_keyframes(self.keys(), np.array([seconds]))
+        pose, matrix = (
+            first.cam_from_world.new_tensor(x) for x in (made.cam_from_world, made.intrinsics)
+        )
+        camera = replace(first, cam_from_world=pose, intrinsics=matrix)
+        return camera, None if made.times is None else float(made.times[0])
 
 
 @dataclass(frozen=True)
@@ -132,12 +220,11 @@ class Session:
     ) -> None:
         self._lock = threading.RLock()
         self._send, self._clock = send, clock
-        self._pace = pace or Pace(1 / 14)
+        self._pace = pace or Pace()
         self._jobs: deque[tuple[str | None, Callable[[], None]]] = deque()
         self._changed_at = self._drawn_at = -1e9
         self._is_stale = True
-        self._drawn_area: float | None = None
-        self._is_refined = False
+        self._refined_area = 0.0  # pixels of the image that is shown, if it is of what is there now
         self._preview: tuple[Recording, float] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
@@ -145,17 +232,16 @@ class Session:
         self.eye: Eye | None = None
         self.timeline = Timeline(seconds=opened.seconds)
         self.closed = False
+        self.failure: str | None = None
 
     def move(self, eye: Eye) -> bool:
         """Look from ``eye`` from now on; return False, and go on as before, where there is no such
         camera."""
         if not eye.is_possible:
             return False
-        with self._lock:
-            if eye == self.eye:
-                return True
+        if eye != self.eye:
             self.eye = eye
-        self._note_change()
+            self._note_change()
         return True
 
     def change(self, **changes: Any) -> None:
@@ -165,10 +251,9 @@ class Session:
         self._note_change()
 
     def set_time(self, time: float) -> None:
+        now = min(max(time, 0.0), 1.0)
         with self._lock:
-            self.timeline = replace(
-                self.timeline, time=min(max(time, 0.0), 1.0), since=self._clock()
-            )
+            self.timeline = replace(self.timeline, time=now, since=self._clock())
         self._note_change()
 
     def change_timeline(self, **changes: bool | float) -> None:
@@ -181,15 +266,14 @@ class Session:
     def show(self, opened: Opened) -> None:
         """Look at another scene, at the same time."""
         with self._lock:
-            self.opened = opened
-            self.timeline = self.timeline.changed(self._clock(), seconds=opened.seconds)
             if self.look.view is not None and self.look.view >= len(views_of(opened)):
                 self.look = replace(self.look, view=None)
+            self.opened = opened
+            self.timeline = self.timeline.changed(self._clock(), seconds=opened.seconds)
         self._note_change()
 
     def preview(self, recording: Recording) -> None:
-        with self._lock:
-            self._preview = (recording, self._clock()) if len(recording) else None
+        self._preview = (recording, self._clock()) if len(recording) else None
         self._note_change()
 
     def take(self, opened: Opened, *, refreshes: bool) -> None:
@@ -226,19 +310,10 @@ class Session:
             look = self.look
             eye = self.eye
             opened = self.opened
-        if (
-            eye is None
-            or not len(views_of(opened))
-            or not (look.comparing or look.layer == "error")
-        ):
+        has_truth = look.comparing or look.layer == "error"
+        if eye is None or not has_truth or not len(views_of(opened)):
             return None
-        if look.view is not None:
-            return look.view
-        shown = views_of(opened)
-        time = None if opened.renderable.is_static else self.time
-        return nearest_camera(
-            eye.camera(), time, shown.poses, shown.times, viewpoint_of(opened).extent
-        )
+        return nearest_view(opened, eye.camera(), self.time) if look.view is None else look.view
 
     def due(self) -> float | None:
         """Return in how many seconds something is to be drawn; 0: now, None: not before something
@@ -252,11 +327,7 @@ class Session:
             soonest = max(0.0, self._drawn_at + _SHORTEST - now)
             if self._is_moving or self._is_stale:
                 return soonest
-            if (
-                self._drawn_area is None
-                or not self._is_refined
-                or self._drawn_area < 0.99 * self._refined_area
-            ):
+            if self._refined_area < 0.99 * self._most_pixels:
                 return max(soonest, self._changed_at + STILL_AFTER - now)
             return None
 
@@ -270,29 +341,37 @@ class Session:
         with self._lock:
             if self.closed or self.eye is None:
                 return
-            is_moving = self._is_moving or self._clock() < self._changed_at + STILL_AFTER
-            area = self._pace.next_area(
-                int(self._refined_area), None if is_moving else self._drawn_area or 1.0
-            )
-            if self._is_stale and not is_moving:
-                area = max(area, self._drawn_area or 0.0)
+            start = self._clock()
+            is_moving = self._is_moving or start < self._changed_at + STILL_AFTER
+            area = self._pace.area
+            if not is_moving:  # in steps, so that a browser that moves again need not wait long
+                area = max(area, 6.0 * self._refined_area)
+            area = min(area, self._most_pixels)
+            width, height = self._full_size
+            scale = min(1.0, math.sqrt(area / (width * height)))
+            size = max(16, round(width * scale)), max(16, round(height * scale))
             opened = self.opened
             version = self._changed_at
             self._is_stale = False
-            self._drawn_area = self._full_area
-            self._is_refined = True  # if it fails, it is not tried again
-            self._drawn_at = start = self._clock()
-            shot = replace(self.shot(size_within(self._full_size, area)), is_moving=is_moving)
+            self._refined_area = math.inf  # if it fails, it is not tried again
+            self._drawn_at = start
+            shot = replace(self.shot(size), is_moving=is_moving)
         image = draw(opened, shot)
-        pixels = image.shape[0] * image.shape[1]
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
-        end = self._clock()
+        now = self._clock()
         with self._lock:
-            self._pace.observe(pixels, end - start, is_refined=not is_moving)
-            self._is_refined = not is_moving
-            self._drawn_area = area if version == self._changed_at else None
-            self._end_of_play()
+            if is_moving:
+                self._pace.observe(size[0] * size[1], now - start)
+            is_current = version == self._changed_at
+            # Also a full image is drawn once more when all is still: in better quality.
+            self._refined_area = area * (0.9 if is_moving else 1.0) if is_current else 0.0
+            timeline = self.timeline
+            preview = self._preview
+        if timeline.playing and not timeline.loops and timeline.at(now) >= 1.0:
+            self.change_timeline(playing=False)
+        if preview is not None and now - preview[1] > preview[0].duration:
+            self.preview(Recording())
 
     def shot(self, size: tuple[int, int] | None = None) -> Shot:
         """Return what is shown now as an image of ``size``; None: that of the window."""
@@ -300,21 +379,20 @@ class Session:
             if self.eye is None:
                 raise ValueError("there is no camera yet")
             size = size or self._full_size
-            camera = self.eye.camera(size)
             time = self.time
-            view = self.shown_view
-            if self._preview is not None:
+            if self._preview is None:
+                camera = self.eye.camera(size)
+                view = self.shown_view
+            else:
                 recording, since = self._preview
                 camera, recorded = recording.at(self._clock() - since)
-                camera = in_window(camera, size)
+                camera = resize_cameras(camera, *size)
                 view = None
                 time = time if recorded is None else recorded
             look = self.look
-            opened = self.opened
+            shown = None if self.opened.renderable.is_static else time
         layer = "colour" if look.layer == "error" and view is None else look.layer
-        shown = None if opened.renderable.is_static else time
-        divide = look.divide if look.comparing else 1.0
-        return Shot(camera, shown, layer, look.part, view, divide)
+        return Shot(camera, shown, layer, look.part, view, look.divide if look.comparing else 1.0)
 
     @property
     def _is_moving(self) -> bool:
@@ -323,33 +401,114 @@ class Session:
 
     @property
     def _full_size(self) -> tuple[int, int]:
-        size = (640, 480) if self.eye is None else self.eye.size
-        scale = min(1.0, self.look.longest / max(size))
-        return max(16, round(size[0] * scale)), max(16, round(size[1] * scale))
+        width, height = (640, 480) if self.eye is None else self.eye.size
+        scale = min(1.0, self.look.longest / max(width, height))
+        return max(16, round(width * scale)), max(16, round(height * scale))
 
     @property
-    def _full_area(self) -> float:
-        return float(math.prod(self._full_size))
-
-    @property
-    def _refined_area(self) -> float:
+    def _most_pixels(self) -> float:
         """Pixels of the image that is shown when all is still."""
-        return min(self._full_area, self._pace.largest)
-
-    def _end_of_play(self) -> None:
-        now = self._clock()
-        stops = self.timeline.is_over(now)
-        if stops:
-            self.timeline = self.timeline.changed(now, playing=False)
-            self.on_play(False)
-        if self._preview is not None and now - self._preview[1] > self._preview[0].duration:
-            self._preview, stops = None, True
-        if stops:
-            self._changed_at, self._is_stale = now, True
+        return min(math.prod(self._full_size), self._pace.largest)
 
     def _note_change(self) -> None:
         with self._lock:
             self._changed_at = self._clock()
             self._is_stale = True
-            self._drawn_area = None
+            self._refined_area = 0.0
         self.on_change()
+
+
+class Drawer:
+    """The one thread that draws for all browsers: whoever waits longest is next, and gets the
+    newest state.
+
+    ``on_error`` is told what went wrong for one session, the others go on.
+    """
+
+    def __init__(self, on_error: Callable[[Session, str], None]) -> None:
+        self._on_error = on_error
+        self._changed = threading.Condition()
+        self._sessions: list[Session] = []
+        self._thread: threading.Thread | None = None
+        self._is_stopped = False
+
+    @property
+    def sessions(self) -> tuple[Session, ...]:
+        with self._changed:
+            return tuple(self._sessions)
+
+    def add(self, session: Session) -> None:
+        session.on_change = self._wake
+        with self._changed:
+            self._sessions.append(session)
+        self._wake()
+
+    def remove(self, session: Session) -> None:
+        session.close()
+        with self._changed:
+            if session in self._sessions:
+                self._sessions.remove(session)
+
+    def draw_one(self) -> bool:
+        """Do what is due for one session; return whether anything was."""
+        session, wait = self._next()
+        if session is None or wait > 0:
+            return False
+        with self._changed:
+            if session in self._sessions:  # served: last in the row
+                self._sessions.remove(session)
+                self._sessions.append(session)
+        try:
+            session.draw_next()
+        except Exception as error:  # a fault of one session must not end the images of all
+            self._fail(session, error)
+        else:
+            session.failure = None
+        return True
+
+    def start(self) -> None:
+        """Draw in a thread of its own."""
+        self._thread = threading.Thread(
+            target=copy_context().run, args=(self._run,), name="dyngs-view", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, after the image that it is at."""
+        self._is_stopped = True
+        self._wake()
+        if self._thread is not None:
+            self._thread.join(timeout=10)
+
+    def _run(self) -> None:
+        while not self._is_stopped:
+            if not self.draw_one():
+                _, wait = self._next()
+                with self._changed:
+                    if not self._is_stopped:
+                        self._changed.wait(wait)
+
+    def _next(self) -> tuple[Session | None, float]:
+        """Return the session that is due first, among equals that served longest ago, and when:
+        within 0.5 s."""
+        best: tuple[Session | None, float] = (None, 0.5)
+        for session in self.sessions:
+            wait = session.due()
+            if wait is not None and wait < best[1]:
+                best = (session, wait)
+        return best
+
+    def _fail(self, session: Session, error: Exception) -> None:
+        """Say what went wrong, once in a row: what is played fails many times a second."""
+        is_known = isinstance(error, DyngsError)
+        message = str(error) if is_known else f"{type(error).__name__}: {error}"
+        if session.closed or session.failure == message:
+            return
+        session.failure = message
+        self._on_error(session, message)
+        if not is_known:
+            _LOG.error("the viewer failed to draw", exc_info=error)
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -64,8 +65,7 @@ class PeopleNetwork:
             out = Path(folder) / "run"
             made = predict(self.run, self.people[person].root, out, images or self.num_images)
             opened = open_to_view(out, person, up)
-        said = f"predicted from {', '.join(made.views)} in {made.seconds:.1f} s"
-        return opened.noted(said)
+        return opened.noted(f"predicted from {', '.join(made.views)} in {made.seconds:.1f} s")
 
 
 def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
@@ -76,22 +76,15 @@ def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
     """
     config = network_config(run)
     num_views = require_network(config, run).num_views(config.model)
-    data = (
-        config.data
-        if capture is None
-        else config.data.model_copy(update={"root": capture.absolute()})
-    )
-    if capture is not None and _is_capture(data):
-        return PeopleNetwork(run, {capture.absolute().name: data}, num_views)
-    return PeopleNetwork(run, {one.root.name: one for one in captures_in(data)}, num_views)
-
-
-def _is_capture(data: DataConfig) -> bool:
-    try:
-        read_capture(data)
-    except DyngsError:
-        return False
-    return True
+    data = config.data
+    captures = []
+    if capture is not None:
+        data = data.model_copy(update={"root": capture.absolute()})
+        with suppress(DyngsError):
+            read_capture(data)
+            captures = [data]
+    people = {one.root.name: one for one in captures or captures_in(data)}
+    return PeopleNetwork(run, people, num_views)
 
 
 @dataclass(frozen=True)
@@ -128,34 +121,34 @@ def open_source(
         raise DyngsError(
             f"{path}: no such run, file or folder; give what `dyngs train` or `dyngs export` wrote"
         )
-    if is_network(path):
-        network = open_network(path, capture)
+    if _is_run(path) and _predicts(path):
         if most is not None:
             raise DyngsError(
                 f"{path} is a network of people; levels of detail are for still scenes"
             )
-        return Source(
-            tuple(network.people), lambda name: network.predict(name, up=up).to(device), network
-        )
+        network = open_network(path, capture)
+        people = tuple(network.people)
+        return Source(people, lambda name: network.predict(name, up=up).to(device), network)
     if capture is not None:
         raise DyngsError(
             f"--capture goes with the run of a network of people, {path} is none; leave it out"
         )
-
-    def shown(opened: Opened) -> Opened:
-        return opened.to(device) if most is None else coarser(opened.to(device), most)
-
     if not path.is_dir() or _is_run(path) or format_to_read(path) is not None:
-        name = path.name or str(path)
-        return Source((name,), lambda _: shown(open_to_view(path, name, up, data_root)))
-    if data_root is not None:
+        runs = {path.name or str(path): path}
+    elif data_root is not None:
         raise DyngsError(f"data.root= goes with one run, {path} is none; leave it out")
-    runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
+    else:
+        runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
     if not runs:
         known = command_for(path)
         instead = f"{known}; then " if known else ""
         raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
-    return Source(tuple(runs), lambda name: shown(open_to_view(runs[name], name, up)))
+
+    def load(name: str) -> Opened:
+        opened = open_to_view(runs[name], name, up, data_root).to(device)
+        return opened if most is None else coarser(opened, most)
+
+    return Source(tuple(runs), load)
 
 
 def open_to_view(
@@ -173,8 +166,7 @@ def open_to_view(
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
     opened = replace(open_scene(path, nonfinite="skip", data_root=data_root), name=name)
-    if up is not None:
-        opened = replace(opened, stated_up=up)
+    opened = replace(opened, stated_up=up or opened.stated_up)
     if opened.captured is not None and opened.missing is not None:
         opened = opened.noted(
             f"without the capture, so no cameras and no truth: {opened.missing}; if it was moved, add data.root=FOLDER"
@@ -187,21 +179,15 @@ def first_of(source: Source) -> Opened:
     failed: list[DyngsError] = []
     for name in source.names:
         try:
-            opened = source.load(name)
+            return source.load(name).noted(*(f"left out: {error}" for error in failed))
         except DyngsError as error:
             failed.append(error)
-            continue
-        for error in failed:
-            opened = opened.noted(f"left out: {error}")
-        return opened
     raise failed[0]
 
 
-def is_network(path: Path) -> bool:
-    """Return whether ``path`` is the run of a network that predicts people."""
-    if not (path.is_dir() and _is_run(path)):
-        return False
-    return capability(load_resolved(path).model, Predicts) is not None
+def _predicts(run: Path) -> bool:
+    """Return whether a run holds a network that predicts people."""
+    return capability(load_resolved(run).model, Predicts) is not None
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -210,7 +196,7 @@ def runs_in(folder: Path) -> list[Path]:
     found: list[Path] = []
     level = [folder]
     for _ in range(_DEEPEST):
-        below = sorted(child for parent in level for child in _folders(parent))
+        below = [child for parent in level for child in _folders(parent)]
         found += [child for child in below if _is_run(child) and _has_scene(child)]
         level = [child for child in below if not _is_run(child)]
     return sorted(found)[:_MOST_RUNS]
@@ -223,15 +209,13 @@ def _is_run(folder: Path) -> bool:
 def _has_scene(run: Path) -> bool:
     try:
         has_any = (run / SCENE_FILE).is_file() or bool(checkpoint_paths(run))
-        return has_any and not is_network(run)
+        return has_any and not _predicts(run)
     except (DyngsError, OSError):
         return False
 
 
 def _folders(parent: Path) -> list[Path]:
     try:
-        return [
-            child for child in parent.iterdir() if child.is_dir() and not child.name.startswith(".")
-        ]
+        return [x for x in parent.iterdir() if x.is_dir() and not x.name.startswith(".")]
     except OSError:
         return []

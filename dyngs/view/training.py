@@ -21,11 +21,11 @@ from dyngs.models.views import background_colour
 from dyngs.runs.opened import Captured, Opened, cameras_for_paths
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.captured_views import captured_views
 from dyngs.view.gate import free_port
-from dyngs.view.render_thread import Drawer
 from dyngs.view.server import Serving, Viewer, require_viser
+from dyngs.view.session import Drawer
 from dyngs.view.source import Source
+from dyngs.view.views import captured_views
 
 FRACTION = 0.2
 """Most of the time of training that images for browsers may take."""
@@ -65,10 +65,8 @@ class DrawnBetweenSteps:
             self._refreshed_at = start
         with torch.no_grad():
             for session in sessions:
-                session.take(
-                    session.opened.showing(_shell(scene, session.opened.background)),
-                    refreshes=refreshes,
-                )
+                shell = _shell(scene, session.opened.background)
+                session.take(session.opened.showing(shell), refreshes=refreshes)
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break

@@ -137,7 +137,7 @@ def test_what_was_requested_is_not_questioned(
     moving: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried = scored(monkeypatch, lambda _: 20.0 + len(tried))
-    keys = ("colour.kind=sh", "model.deform.move_opacities=false", "camera.refine=never")
+    keys = ("colour.kind=sh", "model.deform.moves=[rotations]", "camera.refine=never")
     _, found = decided(preset(moving, LONG, *keys))
     assert [choice.setting for choice in found] == ["model.kind=dynamic"]
     assert decided(preset(moving, "model.choose=false"))[1] == []
@@ -371,7 +371,7 @@ def test_never_worse_than_static(
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
     monkeypatch.setattr(module, "TRIAL_STEPS", steps)
     config = preset(
-        root, "train.steps=20_000", *keys, "colour.kind=sh", "model.deform.move_opacities=false"
+        root, "train.steps=20_000", *keys, "colour.kind=sh", "model.deform.moves=[rotations]"
     )
     best, (choice,) = decided(config)
     assert choice.taken is moves, choice

@@ -14,13 +14,15 @@ from moving_scene import write_moving_run
 from dyngs.api.edit import Edits, edit_scene
 from dyngs.core.errors import DyngsError
 from dyngs.export.cameras import write_cameras
+from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.edit.frame import Frame
 from dyngs.export.splat_files import AS_THEY_ARE, splats_at, tracks_of, write_run_splats, writing_of
 from dyngs.gaussians.rendering import render, splat_options
 from dyngs.io.formats.formats import read_splats
 from dyngs.io.formats.similarity import Similarity
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import Opened, open_run
+from dyngs.runs.opened import open_run
+from dyngs.view.session import Keyframe, Recording
 
 EDITS = Edits(frame=Frame(up=(0.0, 0.6, 0.8), origin=(0.5, 0.25, 0.0), scale=3.0))
 
@@ -81,6 +83,20 @@ def test_files_have_the_up_of_their_format_and_can_be_undone(tmp_path: Path) -> 
     assert writing_of(opened, "-y", up="keep")[0] == replace(AS_THEY_ARE, up="z")
 
 
+def test_paths_are_in_the_frame_that_people_see(tmp_path: Path) -> None:
+    """A path that the viewer saves has its cameras where they are in the frame, and comes back as
+    it was recorded."""
+    opened = open_run(edited(write_moving_run(tmp_path)))
+    (camera,) = training_cameras(opened.capture.splits["train"][:1], opened.config.data)
+    text = Recording((Keyframe(camera, 0.0),)).document((16, 16), 30.0, opened)
+    (tmp_path / "path.json").write_text(text)
+    pose = np.array(json.loads(text)["keyframes"][0]["cam_from_world"])
+    centre = -pose[:3, :3].T @ pose[:3, 3]
+    np.testing.assert_allclose(centre, opened.world.points(camera.centers[0].numpy()), atol=1e-5)
+    back = choose_path(opened, PathOptions(str(tmp_path / "path.json"))).cameras
+    torch.testing.assert_close(back.cam_from_world[0], camera.cam_from_world[0], rtol=0, atol=1e-5)
+
+
 def test_edits_add_up_and_are_undone_to_the_bytes(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, offset=(100.0, 0.0, 0.0))
     once = edited(run, replace(EDITS, frame=replace(EDITS.frame, origin=(100.5, 0.25, 0.0))))
@@ -102,22 +118,3 @@ def test_edits_add_up_and_are_undone_to_the_bytes(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="the frame of this run was not edited"):
         edited(back, Edits(undo=True), "more")
     assert not (tmp_path / "more").exists()
-
-
-def test_what_is_no_run(tmp_path: Path) -> None:
-    run = write_moving_run(tmp_path)
-    file = write_run_splats(open_run(run), tmp_path / "a.ply").path
-    for source, edits, said in (
-        (file, EDITS, "a name without a suffix is a run of its own"),
-        (run, Edits(merge=(file,)), "without --merge and --time"),
-        (run, Edits(time=0.5), "without --merge and --time"),
-    ):
-        with pytest.raises(DyngsError, match=said):
-            edit_scene(source, tmp_path / "new", edits, tell=silent)
-        assert not (tmp_path / "new").exists()
-    taken = edited(run)
-    with pytest.raises(DyngsError, match="exists already"):
-        edited(run)
-    with pytest.raises(DyngsError, match="exists already"):
-        edit_scene(run, run, EDITS, tell=silent)
-    assert isinstance(open_run(taken), Opened)

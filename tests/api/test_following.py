@@ -45,7 +45,7 @@ def _moving(capture: Path, run: Path, batch: int) -> Config:
 def _person(capture: Path, run: Path, batch: int) -> Config:
     return Config(
         data=DataConfig(root=capture),
-        model=HumanModel(resolution=16, sh_degree=0, refine_from=0.2, fit=False),
+        model=HumanModel(resolution=16, sh_degree=0, fit=False),
         strategy=BUSY.model_copy(update={"grow": False, "prune_opacity": 0.09}),
         train=TrainConfig(steps=8, batch_size=batch),
         run=RunConfig(dir=run, threads=1),

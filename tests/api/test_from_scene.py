@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.api.from_scene import first_of, settled
+from dyngs.api.from_scene import settled
 from moving_scene import write_moving_run
 
 from dyngs.api.edit import Edits, edit_scene
+from dyngs.api.first_scene import first_of
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, FixedStrategy
@@ -23,7 +24,7 @@ from dyngs.export.edit.frame import Frame
 from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.densify import Densifier
-from dyngs.gaussians.optimizer import Still
+from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.runs.opened import open_run
 from dyngs.training.new_trainer import assemble
 
@@ -106,8 +107,6 @@ def test_it_begins_where_the_scene_was(kind: str, capture: Path, run: Path, tmp_
 class Wild(Densifier):
     """Doubles every Gaussian beside itself, makes all fainter, and shakes them, in every step."""
 
-    touches_all = True
-
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         source = torch.arange(len(parameters)).repeat(2)
         edit = TopologyEdit(source, torch.arange(len(source)) >= len(parameters))
@@ -179,7 +178,7 @@ def test_what_stays_is_not_part_of_a_change() -> None:
     means = torch.arange(12.0).reshape(n, 3)
     sh = torch.ones(n, 1, 3)
     old = Gaussians(means, torch.ones(n, 4), torch.zeros(n, 3), torch.arange(4.0), sh)
-    still = Still(torch.tensor([False, True, False, True]))
+    still = FrozenMask(torch.tensor([False, True, False, True]))
     source = torch.tensor([0, 1, 1, 2, 2])
     edit = TopologyEdit(source, torch.tensor([False, False, True, False, True]))
     result = EditResult(edit, {"means": -means[source]})

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import torch
-from dyngs.api.pair_scores import explained_pixels
+
+from dyngs.api.choose import explained_pixels
 
 
 def test_half_is_explained_and_neither_image_is_favoured() -> None:

@@ -138,7 +138,7 @@ def test_where_nothing_can_go_the_run_stays_as_it_is(
 
 
 def _spoil(trainer: object, cut: object, scores: object) -> None:
-    from dyngs.compress.cut import Cut, apply_cut
+    from dyngs.compress.search import Cut, apply_cut
 
     apply_cut(trainer, cut, scores)  # pyright: ignore[reportArgumentType]
     if cut != Cut():

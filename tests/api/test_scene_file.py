@@ -11,7 +11,7 @@ import torch
 from moving_scene import write_moving_run
 
 from dyngs.api.scene_file import write_scene_file
-from dyngs.compress.precision import Precision
+from dyngs.compress.measure import Precision
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import prefixed, tensors_of
 from dyngs.gaussians.visibility import VisibilityMasks

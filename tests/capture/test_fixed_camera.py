@@ -4,12 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hdr_clips import BT2020, HLG, encoded, patches, write_clip
 
-from dyngs.capture.fixed_camera import FOCAL, is_plain_clip, read_fixed_camera, zoomed
+from dyngs.capture.fixed_camera import FOCAL, read_fixed_camera, zoomed
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.images.images import read_image
 from dyngs.io.write import write_image
 
 
@@ -28,15 +26,6 @@ def test_frames_are_in_order_with_one_camera(tmp_path: Path) -> None:
     assert views[3].intrinsics.tolist() == [[FOCAL * 16, 0, 8], [0, FOCAL * 16, 6], [0, 0, 1]]
     assert not capture.has_alpha
     assert "guessed" in capture.warnings[0]
-
-
-def test_hdr_is_tone_mapped_in_the_cache_with_a_note(tmp_path: Path) -> None:
-    write_clip(tmp_path / "a.mp4", encoded(patches(), BT2020, HLG), (BT2020, HLG, BT2020))
-    for _ in range(2):  # decoded, and found in the cache
-        capture = read_fixed_camera(DataConfig(root=tmp_path / "a.mp4"))
-        image = read_image(capture.splits["train"][1].image_path).numpy()
-        assert np.sqrt(np.mean((image - 255 * patches()) ** 2)) < 2.5
-        assert "1 video: HLG is tone-mapped to SDR" in capture.warnings[1]
 
 
 def test_frames_are_chosen_by_number_or_evenly(
@@ -64,23 +53,6 @@ def test_masks_are_named_as_images(tmp_path: Path) -> None:
     assert shown.path.name == "f1.png"
     with pytest.raises(DyngsError, match="no such folder of masks"):
         read_fixed_camera(DataConfig(root=root), tmp_path / "none")
-
-
-def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
-    root = frames(tmp_path / "c", 2)
-    write_image(root / "g.png", np.zeros((5, 6, 3), np.uint8))
-    with pytest.raises(DyngsError, match="has another size than f0"):
-        read_fixed_camera(DataConfig(root=root))
-
-
-def test_what_is_a_clip(tmp_path: Path) -> None:
-    assert is_plain_clip(frames(tmp_path / "c", 1))
-    assert not is_plain_clip(tmp_path)
-    assert not is_plain_clip(tmp_path / "missing.mp4")
-    (tmp_path / "a.mp4").touch()
-    assert is_plain_clip(tmp_path / "a.mp4")
-    with pytest.raises(DyngsError):
-        read_fixed_camera(DataConfig(root=tmp_path / "a.mp4"))
 
 
 def test_a_zoomed_camera_stands_back(tmp_path: Path) -> None:

@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.capture import first_points, plane_sweep
-from dyngs.capture.first_points import with_first_points
+from dyngs.capture import initial_points
+from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.plane_sweep import (
-    MIN_NEIGHBOURS,
-    NEIGHBOURS,
     dense_points,
-    neighbours,
     points_of_depth_maps,
 )
 from dyngs.config import DataConfig, PointsInit
-from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.geometry import projected
+from dyngs.data.capture import Capture, View
 from dyngs.io.write import write_image
 
 WIDTH, HEIGHT, FOCAL, SLOPE, DISTANCE = 64, 48, 66.0, 0.3, 4.0
@@ -117,22 +113,12 @@ def test_depth_maps_in_another_unit_have_none(tmp_path: Path) -> None:
     assert points_of_depth_maps(plain, options, 1000) is None
 
 
-def test_a_still_capture_without_points_begins_with_those_of_its_depth_maps(tmp_path: Path) -> None:
-    capture = Capture(tmp_path, "polycam", {"train": tuple(_views(tmp_path))})
-    begun, lines = with_first_points(
-        capture, DataConfig(root=tmp_path), PointsInit(num_random=2000, dense=0)
-    )
-    assert lines == ["2,000 first points are from the depth maps"]
-    assert begun.points is not None
-    assert np.abs(begun.points.xyz[:, 2] - SLOPE * begun.points.xyz[:, 0]).max() < 1e-4
-
-
 def test_a_still_capture_without_any_points_is_swept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Random candidates say how deep to look; pixels without texture take the depth of their
     neighbours."""
-    monkeypatch.setattr(first_points, "triangulated_points", lambda *_: None)
+    monkeypatch.setattr(initial_points, "triangulated_points", lambda *_: None)
     views = [replace(view, depth_path=None) for view in _views(tmp_path)]
     capture = Capture(tmp_path, "nerfstudio", {"train": tuple(views)})
     begun, lines = with_first_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
@@ -155,19 +141,6 @@ def test_a_still_capture_without_any_points_is_swept(
     )
 
 
-def test_points_beside_the_images_do_not_say_how_deep_to_look(tmp_path: Path) -> None:
-    views = _views(tmp_path)
-    options = DataConfig(root=tmp_path)
-    # as near as cameras
-    beside = np.stack([np.full(60, 50.0), _ACROSS, np.linspace(-1, 1, 60) - DISTANCE], axis=1)
-    expected, found = (
-        dense_points(views, options, x, 1000) for x in (SPARSE, np.concatenate([SPARSE, beside]))
-    )
-    assert expected is not None
-    assert found is not None
-    assert np.array_equal(found.xyz, expected.xyz)
-
-
 def test_any_number_of_threads_finds_the_same_points(tmp_path: Path) -> None:
     views = _views(tmp_path, 4)
     options = DataConfig(root=tmp_path)
@@ -185,23 +158,6 @@ def test_any_number_of_threads_finds_the_same_points(tmp_path: Path) -> None:
         x is not None and np.array_equal(x.xyz, first.xyz) and np.array_equal(x.rgb, first.rgb)
         for x in found
     )
-
-
-def test_pixels_that_do_not_count_give_no_points(tmp_path: Path) -> None:
-    views = _views(tmp_path)
-    mask = np.ones((HEIGHT, WIDTH, 1), np.float32)
-    mask[:, : WIDTH // 2] = 0
-    write_image(tmp_path / "mask.png", mask)
-    masked = [replace(view, mask_path=tmp_path / "mask.png") for view in views]
-    found = dense_points(masked, DataConfig(root=tmp_path), SPARSE, 100_000)
-    assert found is not None
-    right_half = np.stack(
-        [
-            (at[:, 0] >= 0.5 - 1 / WIDTH) & inside
-            for at, inside in (projected(found.xyz, v) for v in views)
-        ]
-    )
-    assert right_half.any(axis=0).all()
 
 
 @pytest.mark.parametrize(
@@ -230,34 +186,3 @@ def test_without_evidence_there_are_no_points(tmp_path: Path, fault: str) -> Non
     elif fault == "no points seen":
         sparse = SPARSE - (0, 0, 100)
     assert dense_points(views, DataConfig(root=tmp_path), sparse, 1000) is None
-
-
-def test_neighbours_see_the_same_from_a_useful_angle(tmp_path: Path) -> None:
-    views = _views(tmp_path, 9)
-    groups = neighbours(views, SPARSE)
-    assert len(groups) == 9
-    for first, *others in groups:
-        assert MIN_NEIGHBOURS <= len(others) <= NEIGHBOURS
-        # 8 and 16 degrees away are better than 24; the angle is to the points seen, not to the
-        # middle.
-        assert all(1 <= abs(first - i) <= 3 for i in others)
-        assert abs(first - others[0]) == 1 or abs(first - others[0]) == 2
-
-
-def test_dense_points_join_few_sparse_ones_of_still_captures_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    views = _views(tmp_path, 4)
-    options = DataConfig(root=tmp_path)
-    points = PointCloud(SPARSE, np.full(SPARSE.shape, 128, np.uint8))
-    capture = Capture(root=tmp_path, format="colmap", splits={"train": tuple(views)}, points=points)
-    joined, lines = with_first_points(capture, options, PointsInit(dense=1000))
-    assert joined.points is not None
-    assert len(joined.points.xyz) == len(SPARSE) + 1000
-    assert np.array_equal(joined.points.xyz[: len(SPARSE)], SPARSE)
-    assert lines == ["1,000 points of depth maps were added to 60 (init.dense)"]
-    monkeypatch.setattr(plane_sweep, "MAPS", 0)  # none can be found
-    for init in (PointsInit(dense=1000), PointsInit(), PointsInit(dense=120)):
-        same, lines = with_first_points(capture, options, init)
-        assert same.points is points
-        assert not lines

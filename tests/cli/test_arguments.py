@@ -152,7 +152,6 @@ def test_the_walk_finds_the_commands_that_write() -> None:
         "predict",
         "tradeoff",
         "data sfm",
-        "bench rasterize",
     }
 
 

@@ -251,9 +251,7 @@ def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> No
     )
 
 
-@pytest.mark.parametrize(
-    "words", [["--matching", "sequential"], ["--mapper", "global"], ["--masks", "masks"]]
-)
+@pytest.mark.parametrize("words", [["--matching", "sequential"], ["--masks", "masks"]])
 def test_options_of_one_video_are_refused_for_several(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -160,10 +160,10 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--format html --times 0:1:3", "plays the whole clip"),
-        ("--format html --static", "shows the whole scene"),
-        ("--format html --up y", "--from-up names its axis"),
-        ("--format html --sh-degree 3", "the colours of the run"),
+        ("--format html --times 0:1:3", "--times does not go with"),
+        ("--format html --static", "--static does not go with"),
+        ("--format html --up y", "--up does not go with"),
+        ("--format html --sh-degree 3", "--sh-degree does not go with"),
         ("--format html --max-change 3", "goes with --format dyngs"),
         ("--format html --out page.pdf", "give --out page.html"),
         ("--format html --motion walk.bvh", "needs the run of a person"),

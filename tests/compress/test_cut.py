@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_fields import busy_config
 
-from dyngs.compress.cut import Cut, FieldSize, apply_cut, cut_config, field_size
+from dyngs.compress.search import Cut, FieldSize, apply_cut, cut_config, field_size
 from dyngs.config import Config
 from dyngs.deform.keys import DynamicModel
 from dyngs.models.checkpoint import Checkpoint
@@ -59,14 +59,6 @@ def test_everything_that_a_cut_says(trainer: Trainer) -> None:
     assert str(cut) == (
         "50.0% of the Gaussians, alphas below 0.02, all but 2 nodes of 1 pieces, harmonics worth 100 dB"
     )
-
-
-def test_nothing_is_taken_by_no_cut(trainer: Trainer, end: Checkpoint, config: Config) -> None:
-    apply_cut(trainer, Cut(), torch.zeros(len(trainer.model.scene)))
-    assert cut_config(config, Cut()) == config
-    assert str(Cut()) == "nothing"
-    for name, x in trainer.checkpoint().tensors.items():
-        assert torch.equal(x, end.tensors[name]), name
 
 
 def test_the_configuration_says_what_is_left(config: Config) -> None:

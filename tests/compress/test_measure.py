@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,6 @@ from dyngs.compress.measure import (
     coarsest_file,
     storage_plan,
 )
-from dyngs.compress.precision import assumed_precision
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import GaussianScene
@@ -51,13 +49,6 @@ def test_what_is_not_said_follows_the_errors_of_the_images(tmp_path: Path) -> No
     allowed = plan_of(write_moving_run(tmp_path)).precision.allowed
     assert allowed is not None
     assert 0.1 < allowed < 255 * (10 ** (0.025 / 10) - 1) ** 0.5
-
-
-def test_without_a_capture_steps_are_assumed(tmp_path: Path) -> None:
-    run_dir = write_moving_run(tmp_path)
-    shutil.rmtree(tmp_path / "capture")
-    plan = plan_of(run_dir)
-    assert plan == StoragePlan(assumed_precision(load_run(run_dir).scene.gaussians))
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")

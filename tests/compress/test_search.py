@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config
 
-from dyngs.compress.cut import Cut
 from dyngs.compress.search import (
     Candidate,
+    Cut,
     Search,
     SearchLimit,
     evenly_held_out,

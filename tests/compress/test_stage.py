@@ -8,15 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from moving_scene import camera, row_of_balls
 from tiny_fields import ALL_KINDS, busy_config, cloud, tiny_setup
 from torch import Tensor
 
 from dyngs.api.train import train
 from dyngs.compress.stage import (
     Importance,
-    ScoringViews,
-    importance,
     pruning,
     there_after,
 )
@@ -34,9 +31,6 @@ from dyngs.deform.free import FreePrimitives, FreeStart
 from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.static.keys import StaticModel
@@ -160,34 +154,6 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     grad = trainer.model.scene.gaussians.means.grad
     assert grad is not None
     assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
-
-
-BLACK = torch.zeros(3)
-
-
-def views(
-    scene: GaussianScene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
-) -> ScoringViews:
-    return ScoringViews(scene, [camera(), camera(40, 28)], times, RenderOptions(), BLACK)
-
-
-def test_what_is_hidden_or_transparent_is_worth_least() -> None:
-    """Of five balls the second lies behind a wall, the fourth is faint."""
-    balls = row_of_balls()
-    means = balls.means.clone()
-    log_scales = balls.log_scales.clone()
-    logits = balls.logit_opacities.clone()
-    means[0] = torch.tensor([-0.5, 0.0, -1.0])  # before the second, which is at x = -0.5
-    log_scales[0] = -1.0
-    logits[0] = 9.0
-    logits[3] = -4.0
-    scene = StaticScene(
-        gaussians=balls.replace(means=means, log_scales=log_scales, logit_opacities=logits)
-    )
-    found = importance(views(scene, (None,)), slopes=True)
-    assert found.slopes is not None
-    for scores in (found.contribution, found.variation, found.slopes):
-        assert set(scores.argsort()[:2].tolist()) == {1, 3}
 
 
 def constant(

@@ -274,7 +274,7 @@ configs = st.builds(
             levels=st.lists(st.integers(1, 9), min_size=1).map(tuple),
             lr_planes=rates,
         )
-        | st.builds(MlpField, lr=rates, move_scales=st.booleans())
+        | st.builds(MlpField, lr=rates, moves=st.just(("scales",)))
         | st.builds(ControlNodesField, rigidity=rates),
     ),
     init=st.builds(RandomInit, half_extent=st.just("auto") | st.floats(1e-30, 1e9)),

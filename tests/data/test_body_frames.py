@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,9 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import (
     about_pelvis,
     body_frames,
-    moved,
-    numbered,
-    read_body_file,
-    rows_of,
     with_fitted_body,
 )
-from dyngs.data.capture import BodyFrames, Capture, Splits, View
+from dyngs.data.capture import BodyFrames, Capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
@@ -84,33 +79,6 @@ def test_turns_about_the_origin_become_turns_about_the_pelvis(seed: int) -> None
         np.testing.assert_allclose(
             in_world(same, row, points, joints, weights), expected, atol=1e-11
         )
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 1000), st.booleans())
-def test_another_template_has_its_pelvis_where_the_fitted_body_had_it(
-    seed: int, turned: bool
-) -> None:
-    rng = np.random.default_rng(seed)
-    fitted, own = rng.normal(size=(2, 3))
-    body = replace(random_body(seed, turned=turned), pelvis=fitted)
-    other = about_pelvis(body, own)
-    turns = Rotation.from_rotvec(np.zeros((3, 3)) if body.turns is None else body.turns)
-    expected = body.scale[:, None] * turns.apply(fitted) + body.trans
-    np.testing.assert_allclose(other.scale[:, None] * own + other.trans, expected, atol=1e-12)
-    np.testing.assert_allclose(
-        about_pelvis(other, fitted).trans, about_pelvis(body, fitted).trans, atol=1e-12
-    )
-
-
-def test_nothing_to_turn_leaves_everything_and_moves_with_the_cameras() -> None:
-    body = random_body(0, turned=False)
-    same = about_pelvis(body, np.array([0.1, -0.2, 0.3]))
-    assert np.array_equal(same.poses, body.poses)
-    assert np.array_equal(same.trans, body.trans)
-    assert np.array_equal(
-        moved(body, np.array([1e6, -2.0, 3.0]), 0.5).trans, 0.5 * (body.trans - [1e6, -2.0, 3.0])
-    )
 
 
 def test_rows_in_any_order_and_shape() -> None:
@@ -185,21 +153,6 @@ def test_bad_parameters(change: dict[str, Any], line: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def view_of(frame: int | None) -> View:
-    return View(f"v{frame}", Path(f"{frame}.png"), np.eye(4), np.eye(3), 4, 3, frame=frame)
-
-
-def test_views_find_their_rows_by_frame() -> None:
-    body = replace(random_body(0), frames=(2, 5, 9))
-    assert rows_of(FILE, body, [view_of(9), view_of(2), view_of(9)]).tolist() == [2, 0, 2]
-    with pytest.raises(
-        DyngsError, match=r"2 frames that have images \(3, 4\).* 3 frames from 2 to 9"
-    ):
-        rows_of(FILE, body, [view_of(2), view_of(4), view_of(3), view_of(4)])
-    with pytest.raises(DyngsError, match=r"None\.png has no frame number"):
-        rows_of(FILE, body, [view_of(None)])
-
-
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     options = HumanOptions(size=16, num_frames=3, num_new=2, num_cameras=2, num_test=1, samples=1)
@@ -214,29 +167,6 @@ def write(path: Path, count: int = 3, **more: np.ndarray) -> Path:
         path, poses=np.zeros((count, 165)), trans=rows * np.ones(3), betas=np.zeros(44), **more
     )
     return path
-
-
-def test_rows_are_for_the_frames_that_the_file_names(tmp_path: Path) -> None:
-    body = read_body_file(write(tmp_path / "b.npz", frames=np.array([7, 3, 5])))
-    assert body.frames == (3, 5, 7)
-    assert body.trans[:, 0].tolist() == [1, 2, 0]
-    assert (body.shape_space, body.fitted_to) == ("smpl", "")
-    assert read_body_file(write(tmp_path / "c.npz")).frames == (0, 1, 2)
-
-
-def test_a_fit_says_which_template_it_is_of(tmp_path: Path) -> None:
-    body = read_body_file(
-        write(tmp_path / "b.npz", surface_model_type=np.array("smplx"), fitted_to=np.array("0a1b"))
-    )
-    assert (body.shape_space, body.fitted_to) == ("smpl", "0a1b")
-
-
-@pytest.mark.parametrize("frames", [np.zeros((3, 1), int), np.array([0.0, 1, 2]), np.array([1, 2])])
-def test_frames_that_are_no_numbers_of_the_rows_are_refused(
-    tmp_path: Path, frames: np.ndarray
-) -> None:
-    with pytest.raises(DyngsError, match=r"b\.npz: 'frames' must hold one whole number"):
-        read_body_file(write(tmp_path / "b.npz", frames=frames))
 
 
 def test_a_fit_replaces_the_bodies_of_a_capture(capture: Capture, tmp_path: Path) -> None:
@@ -259,13 +189,3 @@ def test_a_capture_is_read_with_the_fit_that_the_options_name(
     assert found.body["train"].trans[:, 0].tolist() == [0, 1, 2]
     with pytest.raises(DyngsError, match=r"body_train\.npz: no such file.* comes back by training"):
         read_capture(DataConfig(root=capture.root, body=tmp_path / "elsewhere"))
-
-
-def test_views_without_frames_are_numbered_by_time(capture: Capture) -> None:
-    splits: Splits = {
-        name: tuple(replace(view, frame=None) for view in capture.splits[name])
-        for name in ("train", "test")
-    }
-    for name, views in numbered(splits).items():
-        assert [view.frame for view in views] == [view.frame for view in capture.splits[name]]
-    assert numbered(capture.splits) is capture.splits

@@ -35,23 +35,6 @@ def loader(views: tuple[View, ...], **options: float) -> ImageLoader:
     return ImageLoader(views, DataConfig.model_validate({"root": ".", **options}))
 
 
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.7, 0.4)])
-def test_compositing_is_the_float_formula(tmp_path: Path, background: tuple[float, ...]) -> None:
-    image = loader(views_of(tmp_path))[1]
-    pixels = random_pixels(8, 12, 4, seed=1) / 255
-    wanted = pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:]) * background
-    np.testing.assert_allclose(image.composite(torch.tensor(background)).numpy(), wanted, atol=1e-6)
-
-
-def test_images_without_alpha_are_opaque(tmp_path: Path) -> None:
-    image = loader(views_of(tmp_path, channels=3))[0]
-    assert image.alpha is None
-    assert image.mask is None
-    np.testing.assert_allclose(
-        image.composite(torch.ones(3)), random_pixels(8, 12, 3) / 255, atol=1e-6
-    )
-
-
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1.0, 6.0), st.one_of(st.none(), st.integers(1, 20)))
 def test_downscaled_compositing_and_intrinsics(
@@ -206,60 +189,6 @@ def test_images_given_out_on_a_gpu_are_the_same(
         assert there.bytes_on_gpu == {None: 6 * 8 * 12 * 3, 0: 0}.get(free, int(2.5 * 8 * 12 * 4))
 
 
-def test_images_that_a_gpu_keeps_are_sent_once(tmp_path: Path) -> None:
-    images = loader(views_of(tmp_path, 3), cache_mb=1)
-    images[0]
-    assert images.cached_bytes > 0
-    with pretend_gpu() as gpu:
-        images.device = GPU
-        for _ in range(2):
-            for i in range(3):
-                images[i]
-        cameras = 2 * 3
-        assert gpu.waits == {"queued to the GPU": 3 + cameras}
-    assert images.cached_bytes == 0, "they are not kept twice"
-
-
-def test_a_damaged_image_is_reported_when_its_turn_comes(tmp_path: Path) -> None:
-    views = views_of(tmp_path, 3)
-    images = ImageLoader(views, DataConfig(root=Path()), decoding_threads=1)
-    views[2].image_path.unlink()
-    images.expect([1, 2])
-    assert images[1].name == "1"
-    with pytest.raises(DyngsError, match=r"2\.png"):
-        images[2]
-
-
-def test_length_iteration_and_last(tmp_path: Path) -> None:
-    images = loader(views_of(tmp_path))
-    assert len(images) == 3
-    assert [image.name for image in images] == ["0", "1", "2"]  # type: ignore[attr-defined]
-    assert images[-1].name == "2"
-
-
-def test_camera_and_time_are_the_view_s(tmp_path: Path) -> None:
-    pose = np.eye(4)
-    pose[:3, 3] = 1, 2, 3
-    image = loader((replace(views_of(tmp_path, 1)[0], cam_from_world=pose, time=0.25),))[0]
-    assert image.time == 0.25
-    assert image.cameras.cam_from_world.dtype == torch.float32
-    assert image.cameras.centers.tolist() == [[-1, -2, -3]]
-
-
-def test_times_are_known_without_decoding(tmp_path: Path) -> None:
-    """In the order of the views; None where a view has none."""
-    times = (0.75, None, 0.0)
-    views = tuple(
-        replace(view, time=time) for view, time in zip(views_of(tmp_path), times, strict=True)
-    )
-    images = loader(views)
-    for view in views:
-        view.image_path.unlink()
-    assert images.times == times
-    assert images.cached_bytes == 0
-    assert loader(()).times == ()
-
-
 def test_mask_follows_the_image(tmp_path: Path) -> None:
     """A small pixel counts only if all that it covers counts."""
     keep = np.full((8, 12, 1), 255, np.uint8)
@@ -275,15 +204,6 @@ def test_mask_follows_the_image(tmp_path: Path) -> None:
     assert set(small.unique().tolist()) == {0.0, 1.0}
 
 
-def test_undistorted_image_ignores_what_the_lens_did_not_see(tmp_path: Path) -> None:
-    view = replace(views_of(tmp_path, 1, 3)[0], lens=Lens("opencv", (3.0, 0.0, 0.0, 0.0)))
-    mask = loader((view,))[0].mask
-    assert mask is not None
-    assert (mask[0, 11], mask[4, 6]) == (0, 1)
-    gentle = replace(view, lens=Lens("opencv", (-0.01, 0.0, 0.0, 0.0)))
-    assert loader((gentle,))[0].mask is None
-
-
 def test_missing_images_are_found_at_once(tmp_path: Path) -> None:
     views = views_of(tmp_path, 5)
     for i in (1, 3):
@@ -292,20 +212,6 @@ def test_missing_images_are_found_at_once(tmp_path: Path) -> None:
         DyngsError,
         match=r"1\.png: no such file; restore it, or leave out .*data\.skip_missing=true",
     ):
-        loader(views)
-
-
-def test_missing_mask_counts_as_missing(tmp_path: Path) -> None:
-    view = replace(views_of(tmp_path, 1)[0], mask_path=tmp_path / "mask.png")
-    with pytest.raises(DyngsError, match=r"mask\.png"):
-        loader((view,))
-
-
-def test_truncated_image_is_found_before_training(tmp_path: Path) -> None:
-    views = views_of(tmp_path, 3, size=(64, 48))
-    path = tmp_path / "2.png"
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(DyngsError, match=r"2\.png: the image is truncated"):
         loader(views)
 
 
@@ -333,37 +239,3 @@ def test_silhouettes_become_alpha(tmp_path: Path) -> None:
     (tmp_path / "person.png").unlink()
     with pytest.raises(DyngsError, match=r"person\.png: no such file; restore it$"):
         loader(tuple(views))
-
-
-def test_a_image_on_another_device(tmp_path: Path) -> None:
-    """The device "meta" holds no numbers; it only shows that nothing is left behind."""
-    view = views_of(tmp_path)[0]
-    write_image(tmp_path / "mask.png", random_pixels(8, 12, 1))
-    moved = ImageLoader([replace(view, mask_path=tmp_path / "mask.png")])[0].to("meta").shrunk(2)
-    cameras = moved.cameras
-    background = torch.zeros(3, device="meta")
-    tensors = (
-        cameras.cam_from_world,
-        cameras.intrinsics,
-        moved.rgb_premultiplied,
-        moved.composite(background),
-    )
-    assert moved.alpha is not None
-    assert moved.mask is not None
-    assert {x.device.type for x in (*tensors, moved.alpha, moved.mask)} == {"meta"}
-
-
-def test_images_beyond_the_limit_are_refused_at_the_beginning(blender_root: Path) -> None:
-    views = views_of(blender_root)
-    with pytest.raises(
-        DyngsError, match=r"12x8 pixels are 9\.6e-05 megapixels, but data\.max_megapixels is 9e-05"
-    ):
-        ImageLoader(views, DataConfig(root=blender_root, max_megapixels=9e-5))
-    assert (
-        len(
-            ImageLoader(views, DataConfig(root=blender_root, max_megapixels=1e-4))[
-                0
-            ].rgb_premultiplied
-        )
-        == 8
-    )

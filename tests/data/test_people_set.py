@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError
 from dyngs.data.people_set import PEOPLE_FILE, captures_in
 
 
@@ -22,9 +19,3 @@ def test_people_are_in_folders_or_in_shards(tmp_path: Path) -> None:
     assert found(tmp_path) == ["s0", "s1"]
     (tmp_path / PEOPLE_FILE).write_text("{}")
     assert found(tmp_path) == ["s0/c", "s1/a", "s1/b"]
-
-
-def test_where_there_are_none_one_line_says_so(tmp_path: Path) -> None:
-    for root in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(DyngsError, match="holds no folders"):
-            captures_in(DataConfig(root=root))

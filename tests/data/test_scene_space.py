@@ -10,27 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
-from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import Capture, PointCloud, View, all_views
 from dyngs.data.geometry import (
     cam_from_opengl,
     camera_center,
     checked_pose,
-    inverse_rigid,
     pinhole_matrix,
-    projected,
-    times_seen,
 )
 from dyngs.data.scene_space import (
     FAR_PER_BASELINE,
-    SMALLEST_EXTENT,
     change_coordinates,
     depth_bounds,
-    extent_of,
     normalise_capture,
     outside_of_cube,
-    points_in_frusta,
 )
 
 
@@ -62,36 +54,6 @@ def test_bounds_follow_the_unit_of_the_world(scale: float) -> None:
     distance = scale * 4 * np.sqrt(1.25)
     assert near == pytest.approx(distance / 4)
     assert far == pytest.approx(FAR_PER_BASELINE * 8 * scale)
-
-
-def test_bounds_of_parallel_axes_and_of_one_place() -> None:
-    views = [circle()[0]] * 2
-    assert depth_bounds(views) == (0.25, FAR_PER_BASELINE)
-    pose = views[0].cam_from_world.copy()
-    pose[0, 3] += 3.0
-    parallel = [views[0], View("b", Path("b.png"), pose, views[0].intrinsics, 40, 30)]
-    assert depth_bounds(parallel) == (pytest.approx(0.75), pytest.approx(3 * FAR_PER_BASELINE))
-
-
-def test_candidates_lie_in_their_view_between_the_bounds() -> None:
-    views = circle((5.0, 0.0, 0.0))
-    near, far = depth_bounds(views)
-    xyz, seen = points_in_frusta(views, np.random.default_rng(0).random((500, 4)))
-    assert seen.min() >= 1
-    np.testing.assert_array_equal(seen, times_seen(xyz, views))
-    depths = np.stack(
-        [xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3] for view in views]
-    )
-    shown = np.stack([projected(xyz, view)[1] for view in views])
-    fits = shown & (depths > near * 0.999) & (depths < far * 1.001)
-    assert fits.any(axis=0).all()
-
-
-def test_places_in_a_image() -> None:
-    view = View("a", Path("a.png"), np.eye(4), pinhole_matrix(10.0, 10.0, 20.0, 15.0), 40, 30)
-    places, inside = projected(np.array([[0.0, 0, 1], [1, 0, 1], [0, 0, -1], [3, 0, 1]]), view)
-    np.testing.assert_allclose(places[:2], [[0.5, 0.5], [0.75, 0.5]])
-    assert inside.tolist() == [True, True, False, False]
 
 
 def capture_at(offset: np.ndarray, radius: float = 4.0, count: int = 6) -> Capture:
@@ -139,18 +101,6 @@ def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
     np.testing.assert_allclose(xyz, before.points.xyz, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-4, 300.0])
-def test_projection_does_not_change(scale: float) -> None:
-    before = scaled(capture_at(np.array([1e6, -2e6, 3e5])), scale)
-    after = normalise_capture(before)
-    assert before.points is not None
-    assert after.points is not None
-    for old, new in zip(before.splits["train"], after.splits["train"], strict=True):
-        wanted = before.points.xyz @ old.cam_from_world[:3, :3].T + old.cam_from_world[:3, 3]
-        found = after.points.xyz @ new.cam_from_world[:3, :3].T + new.cam_from_world[:3, 3]
-        np.testing.assert_allclose(found * after.world_scale, wanted, atol=1e-8 * scale)
-
-
 @pytest.mark.parametrize("scale", [2.0**-13, 2.0**-4, 2.0**10])
 @pytest.mark.parametrize("offset", [0.0, 5e7])
 def test_power_of_two_scale_gives_the_same_scene_coordinates(scale: float, offset: float) -> None:
@@ -166,30 +116,6 @@ def test_power_of_two_scale_gives_the_same_scene_coordinates(scale: float, offse
     np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
 
 
-@pytest.mark.parametrize("scale", [1e-6, 0.05, 0.7, 1.0, 1e5])
-def test_extent_of_a_normalised_scene(scale: float) -> None:
-    capture = normalise_capture(scaled(capture_at(np.zeros(3)), scale))
-    centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
-    assert SMALLEST_EXTENT <= extent_of(centers) < 2 * SMALLEST_EXTENT
-
-
-@pytest.mark.parametrize(
-    ("distance", "radius", "moves"), [(5.0, 4.0, False), (350, 4.0, False), (900, 4.0, True)]
-)
-def test_only_far_scenes_move(distance: float, radius: float, moves: bool) -> None:
-    capture = capture_at(np.array([distance, 0, 0]), radius)
-    assert normalise_capture(capture).world_offset.any() == moves
-
-
-def test_small_capture_at_utm_coordinates_without_points() -> None:
-    """Cameras 20 cm apart, 4,600 km from the origin: in float32 they would coincide."""
-    capture = capture_at(np.array([5e5, 4.6e6, 100.0]), radius=0.2).replace(points=None)
-    capture = normalise_capture(capture)
-    centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
-    assert SMALLEST_EXTENT <= extent_of(centers) < 2 * SMALLEST_EXTENT
-    assert np.abs(centers).max() < 10 * SMALLEST_EXTENT
-
-
 @pytest.mark.parametrize("jitter", [0.0, 1e-9])
 def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
     """All centres coincide, so nothing tells a length; random points around the origin must stay in
@@ -203,66 +129,9 @@ def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
     assert normalise_capture(capture) is capture
 
 
-def test_fixed_camera_gets_its_unit_from_the_points() -> None:
-    before = scaled(capture_at(np.zeros(3)), 1e-3)
-    view = before.splits["train"][0]
-    capture = normalise_capture(before.replace(splits={"train": (view,)}))
-    assert capture.points is not None
-    depth = np.median(
-        np.linalg.norm(
-            capture.points.xyz - camera_center(capture.splits["train"][0].cam_from_world)
-        )
-    )
-    assert 1 < depth < 20
-
-
-def test_capture_in_the_coordinates_of_its_files_and_back() -> None:
-    before = capture_at(np.array([3e4, 0.0, 0.0]), radius=0.01)
-    after = normalise_capture(before)
-    assert after.world_scale != 1
-    assert after.world_offset.any()
-    np.testing.assert_allclose(
-        file_centers(change_coordinates(after, 1.0, np.zeros(3))), file_centers(before), atol=1e-11
-    )
-    assert change_coordinates(after, after.world_scale, after.world_offset) is after
-
-
-def test_inverse_of_a_pose() -> None:
-    pose = opengl_pose(1.1)
-    np.testing.assert_allclose(inverse_rigid(pose) @ pose, np.eye(4), atol=1e-14)
-
-
 def test_checked_pose_reports_how_far_off_it_was() -> None:
     pose = opengl_pose(1.1)
     pose[:3, :3] *= 1 + 1e-4
     repaired, error = checked_pose(pose[:3], "here")
     assert error == pytest.approx(2e-4, rel=1e-3)
     np.testing.assert_allclose(repaired, opengl_pose(1.1), atol=1e-12)
-
-
-def test_infinite_position_is_an_error() -> None:
-    pose = opengl_pose(0.0)
-    pose[1, 3] = np.inf
-    with pytest.raises(DyngsError, match="here: the pose holds NaN"):
-        checked_pose(pose, "here")
-
-
-def test_bodies_move_and_scale_with_the_cameras() -> None:
-    body = body_frames(
-        Path("b"), [0], np.zeros((1, 72)), [[1e6, 2.0, 3.0]], np.zeros(10), scale=0.5
-    )
-    capture = Capture(Path("x"), "blender", {}).replace(body=of_one_clip(body))
-    moved = change_coordinates(capture, 0.5, np.array([1e6, 0.0, 0.0]))
-    assert moved.body is not None
-    assert moved.body["train"].trans.tolist() == [[0.0, 4.0, 6.0]]
-    assert moved.body["train"].scale.tolist() == [1.0]
-
-
-def test_unit_of_people_is_the_metre() -> None:
-    body = body_frames(
-        Path("b"), [0], np.zeros((1, 72)), [[0.1, 2.0, 3.0]], np.zeros(10), scale=1e-3
-    )
-    capture = normalise_capture(capture_at(np.zeros(3)).replace(body=of_one_clip(body)))
-    assert capture.world_scale == 2.0**-10
-    assert capture.body is not None
-    assert capture.body["train"].scale.tolist() == [1.024]

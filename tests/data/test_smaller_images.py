@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_captures import edit_json, opengl_pose, write_colmap, write_frames, write_image
+from tiny_captures import opengl_pose, write_colmap, write_frames, write_image
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
@@ -77,38 +77,6 @@ def test_smallest_copy_that_is_large_enough(
         else f"images_{factor} is read in place of images"
     )
     assert wanted in line
-
-
-def test_copies_that_are_incomplete_are_not_read(root: Path) -> None:
-    (root / "images_2/1.png").unlink()
-    # another photo of that name
-    write_image(root / "images_2/2.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    write_image(root / "images_2/3.png", np.zeros((WIDTH // 2, WIDTH // 2, 3), np.uint8))
-    capture, _ = read(root, downscale=2)
-    (line,) = capture.warnings
-    assert line.startswith(
-        "images_2, images_4, images_8: not read; data.downscale=2 reads images_2 if each image has its copy"
-    )
-    assert {view.image_path.parent.name for view in capture.splits["train"]} == {"images"}
-
-
-def test_masks_have_the_size_of_the_images(root: Path) -> None:
-    write_image(root / "mask.png", np.full((HEIGHT, WIDTH, 1), 255, np.uint8))
-    edit_json(root / "transforms.json", lambda c: c["frames"][0].update(mask_path="mask.png"))
-    capture, config = read(root, downscale=2)
-    assert "images_8: not read; data.downscale=2 reads images_2 if" in capture.warnings[0]
-    assert ImageLoader(capture.splits["train"], config)[0].mask is not None
-
-
-def test_copies_alone(root: Path) -> None:
-    for path in (root / "images").iterdir():
-        path.unlink()
-    (root / "images").rmdir()
-    (root / "images_2").rename(root / "images_3")  # the least shrunk ones, whatever their number
-    capture, config = read(root)
-    image = ImageLoader(capture.splits["train"], config)[0]
-    assert (image.cameras.width, image.cameras.height) == (32, 24)
-    np.testing.assert_allclose(image.cameras.intrinsics[0, 0, 0], 25.0)
 
 
 @pytest.mark.parametrize("is_absent", [False, True])

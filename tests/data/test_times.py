@@ -17,19 +17,14 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.times import (
     SECONDS_FILE,
-    Taken,
     clip_seconds,
-    distinct_times,
     hold_out_frames,
     number_cameras,
     parse_frames,
     read_seconds,
     select_frames,
-    sequence_warnings,
     span_in_files,
     split_by_camera,
-    still_if_constant,
-    taken_frames,
     times_by_name,
     unit_times,
     videos,
@@ -120,54 +115,6 @@ def test_span_and_seconds() -> None:
     assert span_in_files(train(view("a", None)), train(view("a", None))) is None
 
 
-def test_without_times() -> None:
-    splits = train(view("a", None), view("b", None))
-    assert unit_times(ROOT, splits) == (splits, [])
-    assert still_if_constant(splits) == (splits, [])
-    assert sequence_warnings(splits) == []
-
-
-@pytest.mark.parametrize("time", [0.0, 0.25, 7.0])
-def test_constant_times_are_a_still_scene(time: float) -> None:
-    splits, notes = unit_times(ROOT, train(view("a", time), view("b", time)))
-    assert notes == []
-    still, notes = still_if_constant(splits)
-    assert times_of(still) == [None, None]
-    assert notes == [f"all images have time {time:g}: treated as a static scene"]
-
-
-@pytest.mark.parametrize(("time", "kept"), [(0.25, 0.25), (1.0, 1.0), (7.0, 0.0)])
-def test_a_single_image_is_fine(time: float, kept: float) -> None:
-    splits, notes = unit_times(ROOT, train(view("a", time)))
-    splits, more = still_if_constant(splits)
-    assert (times_of(splits), notes, more) == ([kept], [], [])
-
-
-def test_images_that_differ_by_chance() -> None:
-    views = [view("a", 0.0), view("b", 0.5), view("c", 0.5), view("d", 1.0)]
-    (warning,) = sequence_warnings({"train": tuple(views[:2]), "test": tuple(views[2:])})
-    assert (
-        "2 images share camera, pose and time with another one, first b and c at time 0.5"
-        in warning
-    )
-
-
-def test_images_that_may_share_a_time() -> None:
-    """Other cameras, other poses of one camera, and the same file listed twice are no
-    repetitions."""
-    poses = [opengl_pose(angle) for angle in (0.0, 1.0)]
-    moving = [
-        view("a", 0.0, pose=poses[0]),
-        view("b", 0.0, pose=poses[1]),
-        view("c", 1.0, pose=poses[1]),
-    ]
-    assert sequence_warnings(train(*moving)) == []
-    several = [
-        view(f"{camera}/{time}", time, camera, poses[0]) for camera in (0, 1) for time in (0.0, 1.0)
-    ]
-    assert sequence_warnings({"train": tuple(several), "test": (several[0],)}) == []
-
-
 def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View, ...]]:
     """Cameras with so many frames each; the first one is for testing."""
     views = [
@@ -233,17 +180,6 @@ def test_cameras_that_keep_their_numbers(case: str) -> None:
         "beside": {"train": tuple(walk), "test": rig([9])["test"]},
     }[case]
     assert number_cameras(splits) is splits
-
-
-def test_different_numbers_of_frames() -> None:
-    assert sequence_warnings(rig([5, 5, 5])) == []
-    assert sequence_warnings(rig([1, 1, 1])) == []
-    (warning,) = sequence_warnings(rig([24, 24, 24, 22]))
-    assert warning == "cameras have different numbers of frames: cam03 has 22 frames, others 24"
-    (warning,) = sequence_warnings(rig([20, 24, 24, 22], folder="images/"))
-    assert "camera 0 has 20, camera 3 has 22 frames, others 24" in warning
-    (warning,) = sequence_warnings(rig([3] * 9 + list(range(4, 12))))
-    assert "(3 more cameras differ)" in warning
 
 
 def test_videos_are_those_of_fixed_cameras_or_of_the_one_that_moves() -> None:
@@ -324,11 +260,6 @@ def test_bad_slices(text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_step_zero() -> None:
-    with pytest.raises(DyngsError, match="step must not be 0"):
-        parse_frames("0:10:0")
-
-
 def test_times_are_counted_over_all_splits() -> None:
     """Uneven times keep their proportions; files rounded differently agree; order in the files does
     not matter."""
@@ -345,33 +276,6 @@ def test_times_are_counted_over_all_splits() -> None:
     assert kept["train"][1].time == kept["test"][0].time
 
 
-def test_a_hair_apart_is_one_time() -> None:
-    """Also where rounding to decimals would part them; the distance to the neighbour counts."""
-    times = [0.0, 0.5, 0.5000004, 0.5000008, 0.500003, 1.0]
-    assert list(distinct_times(splits(times, [])["train"]).values()) == [
-        0.0,
-        0.5,
-        0.5,
-        0.5,
-        0.500003,
-        1.0,
-    ]
-    assert len(select_frames(ROOT, splits(times, []), "1:2")["train"]) == 3
-
-
-def test_what_cannot_be_selected() -> None:
-    with pytest.raises(DyngsError, match=r"data\.frames=0:1 picks times, but the capture has none"):
-        select_frames(ROOT, {"train": (_at("a", None),)}, "0:1")
-    with pytest.raises(DyngsError, match="picks 1 of 2 times, none of them with training views"):
-        select_frames(ROOT, splits([0.0], [1.0]), "1:")
-
-
-def test_nothing_but_time_changes() -> None:
-    before = splits([0.0, 0.25, 0.5], [])["train"]
-    after = select_frames(ROOT, {"train": before}, ":2")["train"]
-    assert after == (before[0], replace(before[1], time=1.0))
-
-
 def filmed(camera: int, split: Split) -> dict[Split, tuple[View, ...]]:
     """A camera at five times."""
     views = (_at(f"c{camera}/{i}", i / 4) for i in range(5))
@@ -383,32 +287,6 @@ def test_held_out_frames_are_a_clip_of_their_own(frames: str) -> None:
     kept, held = hold_out_frames(ROOT, filmed(0, "train"), frames)
     assert [(v.name, v.time) for v in kept["train"]] == [("c0/0", 0), ("c0/1", 0.5), ("c0/2", 1)]
     assert [(v.name, v.time) for v in held] == [("c0/3", 0), ("c0/4", 1)]
-
-
-def test_held_out_frames_are_seen_from_the_test_cameras_if_there_are_any() -> None:
-    splits = filmed(0, "train") | filmed(1, "test")
-    kept, held = hold_out_frames(ROOT, splits, "1::2")
-    assert [v.name for v in held] == ["c1/1", "c1/3"]
-    assert [v.name for v in kept["train"]] == ["c0/0", "c0/2", "c0/4"]
-    assert [v.name for v in kept["test"]] == ["c1/0", "c1/2", "c1/4"]
-    mixed: dict[Split, tuple[View, ...]] = {
-        "train": splits["train"][:4],
-        "test": splits["train"][4:],
-    }
-    assert [v.name for v in hold_out_frames(ROOT, mixed, "3:")[1]] == ["c0/3", "c0/4"], "one camera"
-
-
-@pytest.mark.parametrize(
-    ("frames", "message"),
-    [
-        (":", "leaves no training views"),
-        ("9:", "picks none of the capture's 5 times"),
-        ("3", "data.pose_frames='3': write"),
-    ],
-)
-def test_frames_that_cannot_be_held_out(frames: str, message: str) -> None:
-    with pytest.raises(DyngsError, match=message):
-        hold_out_frames(ROOT, filmed(0, "train"), frames)
 
 
 def test_cameras_that_are_trained_on() -> None:
@@ -454,10 +332,6 @@ def test_other_names_are_in_natural_order() -> None:
     assert "shot1-a first" in line
 
 
-def test_the_same_number_twice_is_no_time() -> None:
-    assert _times("a_1", "b_1", "c_1")[0] == {"a_1": 0, "b_1": 1, "c_1": 2}
-
-
 def test_a_frame_rate_makes_seconds_of_numbers() -> None:
     splits: Splits = {"train": _views("frame_10", "frame_25", "frame_60")}
     timed, line = times_by_name(ROOT, splits, 25.0)
@@ -469,43 +343,3 @@ def test_a_frame_rate_makes_seconds_of_numbers() -> None:
 def test_what_has_no_order_is_one_line(names: tuple[str, ...]) -> None:
     with pytest.raises(DyngsError, match=r"data\.times=order"):
         _times(*names)
-
-
-def _taken(*clips: tuple[float, float, int], most: int | None = None) -> tuple[list[Taken], str]:
-    """The frames taken of videos, each with its start in seconds, frames per second, and number of
-    frames."""
-    clocks = [start + np.arange(count) / rate for start, rate, count in clips]
-    return taken_frames(Path("rig"), clocks, [rate for _, rate, _ in clips], most)
-
-
-def test_frames_of_one_time_step_have_one_time() -> None:
-    taken, line = _taken((0.0, 10, 30), (0.5, 10, 30))
-    assert list(taken[0].numbers) == list(range(5, 30))
-    assert list(taken[1].numbers) == list(range(25))
-    assert taken[0].seconds == pytest.approx(0.5 + np.arange(25) / 10)
-    assert np.array_equal(taken[0].seconds, taken[1].seconds)
-    assert "25 time steps of 2.40 s" in line
-
-
-def test_different_rates_share_the_time_steps_of_the_slower_one() -> None:
-    taken, _ = _taken((0.0, 50, 100), (0.0, 25, 50))
-    assert list(taken[0].numbers) == list(range(0, 100, 2))
-    assert list(taken[1].numbers) == list(range(50))
-
-
-def test_frames_between_time_steps_keep_their_own_time() -> None:
-    taken, _ = _taken((0.0, 10, 20), (0.04, 10, 20))
-    assert taken[1].seconds - taken[0].seconds == pytest.approx(np.full(20, 0.04))
-
-
-def test_the_number_of_time_steps_is_bounded_and_said() -> None:
-    films = ((0.0, 30, 3000), (0.0, 30, 3000))
-    taken, line = _taken(*films)
-    assert len(taken[0].numbers) == 300
-    assert "of 3000" in line
-    assert len(_taken(*films, most=12)[0][0].numbers) == 12
-
-
-def test_videos_of_different_events_are_refused() -> None:
-    with pytest.raises(DyngsError, match="share no two time steps"):
-        _taken((0.0, 10, 20), (5.0, 10, 20))

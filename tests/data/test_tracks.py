@@ -13,7 +13,6 @@ import pytest
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.tracks import (
-    TRACKS_FILE,
     TrueTracks,
     read_tracks,
     read_true_tracks,
@@ -36,35 +35,6 @@ def test_rows_are_found_by_the_names_of_views(tmp_path: Path) -> None:
     views = [View(f"train/{x}", tmp_path / x, np.eye(4), np.eye(3), 4, 4) for x in "cabd"]
     assert tracks.rows_of(views) == {"train/c": 2, "train/a": 0, "train/b": 1}
     assert tracks.xy[2, 1].tolist() == [10, 11]
-
-
-def test_positions_that_are_no_numbers_are_not_visible(tmp_path: Path) -> None:
-    xy = np.zeros((3, 2, 2))
-    xy[1, 0, 1] = np.nan
-    xy[2, 1, 0] = 1e30
-    tracks = read_tracks(write(tmp_path / "a.npz", xy=xy))
-    assert tracks.visible.tolist() == [[True, True], [False, True], [True, False]]
-    assert np.isfinite(tracks.xy).all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "word"),
-    [
-        ({"visible": np.ones((2, 2))}, r"visible \(F, P\)"),
-        ({"xy": np.ones((3, 2))}, r"xy \(F, P, 2\)"),
-        ({"names": np.arange(3)}, "of text"),
-        ({"names": np.array(["a", "b", "a"])}, "more than once"),
-        ({"names": None}, "names"),
-    ],
-)
-def test_arrays_that_do_not_fit(tmp_path: Path, changes: dict[str, Any], word: str) -> None:
-    with pytest.raises(DyngsError, match=rf"a\.npz.*{word}"):
-        read_tracks(write(tmp_path / "a.npz", **changes))
-
-
-def test_missing_tracks(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no such tracks"):
-        read_tracks(tmp_path / "a.npz")
 
 
 def some_tracks() -> TrueTracks:
@@ -109,9 +79,3 @@ def test_arrays_that_do_not_fit_together_are_refused(
     with pytest.raises(DyngsError, match=message) as refused:
         read_true_tracks(Capture(tmp_path, "blender", {}))
     assert "\n" not in str(refused.value)
-
-
-def test_damaged_files_are_refused(tmp_path: Path) -> None:
-    (tmp_path / TRACKS_FILE).write_bytes(b"no zip")
-    with pytest.raises(DyngsError, match=r"true_tracks\.npz"):
-        read_true_tracks(Capture(tmp_path, "blender", {}))

@@ -17,9 +17,9 @@ from dyngs.deform.networks import Hexplane
 
 def field_with_rows(rows: int) -> Hexplane:
     """Planes whose row i over time holds the number i everywhere."""
-    options = tiny_options("hexplane").model_copy(update={"time_resolution": rows})
+    options = tiny_options("hexplane")
     assert isinstance(options, HexplaneField)
-    field = Hexplane(options, tiny_setup(), torch.Generator().manual_seed(0))
+    field = Hexplane(options, tiny_setup(num_times=2 * rows), torch.Generator().manual_seed(0))
     for level in field.levels:
         level.time.data[:] = torch.arange(float(rows))[None, :, None, None]
     return field

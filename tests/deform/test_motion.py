@@ -12,7 +12,7 @@ from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
 from dyngs.deform.field import DeformationField, Offsets, deformed
-from dyngs.deform.motion import PX_PER_OPACITY, bake_, measure_motion
+from dyngs.deform.training import PX_PER_OPACITY, bake_, measure_motion
 from dyngs.gaussians.parameters import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import followed
 from torch import Tensor
 
-from dyngs.deform.control_nodes import FOLLOWED, Nodes, nodes_at, spread_out
+from dyngs.deform.control_nodes import Nodes, nodes_at, spread_out
 from dyngs.deform.field import Offsets
 
 
@@ -69,23 +68,3 @@ def test_points_spread_out_are_distinct_and_the_same_each_time(
     chosen = spread_out(x, count, NONE)
     assert torch.equal(chosen, spread_out(x, count, NONE))
     assert len({places[i] for i in chosen.tolist()}) == len(chosen) == min(count, len(set(places)))
-
-
-@pytest.mark.parametrize(
-    ("means", "num_nodes"),
-    [(points(5)[:1], 4), (points(5), 1), (points(1).expand(7, 3), 3), (points(3), 10)],
-    ids=["one Gaussian", "one node", "all coincide", "fewer Gaussians than nodes"],
-)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_few_nodes(means: Tensor, num_nodes: int, dtype: torch.dtype) -> None:
-    means = means.to(dtype)
-    nodes = place_nodes(means, num_nodes)
-    count = min(num_nodes, len({tuple(x) for x in means.tolist()}))
-    assert nodes.positions.shape == (count, 3)
-    assert nodes.positions.dtype == nodes.radii.dtype == dtype
-    assert nodes.followed.shape == (len(means), min(count, FOLLOWED))
-    assert (nodes.radii > 0).all()
-    moved = followed(
-        nodes, means, Offsets(torch.ones(count, 3, dtype=dtype), torch.zeros(count, 4, dtype=dtype))
-    )
-    torch.testing.assert_close(moved.means, torch.ones(len(means), 3, dtype=dtype))

@@ -9,16 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 from moving_scene import write_timed_capture
-from scenes import weights
 from tiny_fields import (
     ALL_KINDS,
     KINDS,
     busy_config,
     cloud,
-    stir,
     stirred_field,
     tiny_field,
-    tiny_options,
     write_tiny_capture,
 )
 from torch import Tensor
@@ -27,11 +24,9 @@ from dyngs.config import TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed
-from dyngs.deform.fields import new_field
+from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.networks import Hexplane
-from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit
 from dyngs.training.new_trainer import assemble, restored_scene
@@ -86,7 +81,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     two."""
     config = busy_config(timed(tmp_path / "capture", [0.0, 1.0, 0.0, 1.0, 1.0]), tmp_path, kind)
     assert isinstance(config.model, DynamicModel)
-    automatic = {"hexplane": {"time_resolution": 0}, "control_nodes": {"pieces": 0}}.get(kind, {})
+    automatic = {"control_nodes": {"pieces": 0}}.get(kind, {})
     model = config.model.model_copy(
         update={"deform": config.model.deform.model_copy(update=automatic)}
     )
@@ -146,32 +141,6 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     other = assemble(trainer.config)
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("flat", ["point", "line", "plane"])
-def test_boxes_without_volume(kind: str, flat: str) -> None:
-    """All means in one point, on a line, in a plane: the box has at least a thousandth of the
-    extent to each side."""
-    means = cloud().means.clone()
-    means[:, {"point": 0, "line": 1, "plane": 2}[flat] :] = 0.7
-    gaussians = cloud().replace(means=means, logit_opacities=torch.full((9,), 3.0))
-    center, half_size = box_of(gaussians, 2.0)
-    assert half_size.min() == pytest.approx(2e-3)
-    field = new_field(
-        tiny_options(kind),
-        FieldSetup(center, half_size, 10, 9, 2.0),
-        torch.Generator().manual_seed(0),
-    )
-    field.offsets(means, 0.3)
-    stir(field)
-    found = values(field.offsets(means, 0.3))
-    assert found.isfinite().all()
-    (found * weights(found)).sum().backward()
-    grads = [field.parameters[name].grad for name in field.parameters.values()]
-    assert all(x is None or x.isfinite().all() for x in grads)
-    if flat == "point" and kind != "control_nodes":
-        torch.testing.assert_close(found, found[:1].expand_as(found))
 
 
 # --- rotations

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.deform.time_window import FRONTIER_VIEWS, MIN_VIEWS, TimeWindow
+from dyngs.deform.schedule import FRONTIER_VIEWS, MIN_VIEWS, TimeWindow
 
 OPENS, FULL = 10, 50
 ODD_STEPS = (OPENS + 1, 21, 35, FULL - 1)

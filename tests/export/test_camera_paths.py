@@ -30,7 +30,7 @@ from dyngs.export.camera_paths import (
     with_times,
     write_path,
 )
-from dyngs.io.limits import VARIABLE
+from dyngs.io.fields import VARIABLE
 
 
 def written(folder: Path, document: object) -> Path:

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 
-from dyngs.core.errors import DyngsError
 from dyngs.export import sog_levels
 from dyngs.export.sog_levels import write_sog_levels
 from dyngs.gaussians import Gaussians
@@ -81,16 +80,3 @@ def test_leaves_are_alternatives_of_one_place(
             assert bool(((means >= low) & (means <= high)).all())
             shown[level] += len(means)
     assert tuple(shown) == counts
-
-
-def test_equal_scenes_give_equal_folders_and_nothing_is_replaced(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_sog_levels(tmp_path / name, scene())
-    parts = sorted(
-        path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file()
-    )
-    assert len(parts) == 1 + 3 * 8
-    for part in parts:
-        assert (tmp_path / "a" / part).read_bytes() == (tmp_path / "b" / part).read_bytes()
-    with pytest.raises(DyngsError, match="exists already"):
-        write_sog_levels(tmp_path / "a", scene())

@@ -90,6 +90,7 @@ def test_what_is_far_may_be_as_much_larger() -> None:
     # distances 60, which is the reach, and 50, five extents: not yet far
     center = torch.tensor([-60.0, 0.0, 0.0])
     for scale, score, step, source in (
+        (4.0, 0.0, 400, [0]),
         (5.9, 0.0, 400, [0]),
         (6.1, 0.0, 400, []),
         (0.59, 3e-4, 200, [0, 0, 1, 1]),
@@ -216,3 +217,14 @@ def test_bad_values_are_never_multiplied(bad: float) -> None:
         1.0,
     )
     assert plan.kept.tolist() == [False, True]
+
+
+def test_huge_ones_go_only_after_the_first_reset() -> None:
+    gaussians = _gaussians([1.1, 0.9], [0.5, 0.5])  # limit: 0.1 * extent = 1
+    for step, left in ((200, [0, 1]), (300, [0, 1]), (400, [1])):
+        densifier = _densifier()
+        _signal(densifier, [0.0, 0.0])
+        result = densifier.edit(step, gaussians, torch.Generator())
+        assert result is not None
+        assert result.edit is not None
+        assert result.edit.source.tolist() == left

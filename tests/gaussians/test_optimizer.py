@@ -51,25 +51,11 @@ def test_gaussians_that_rest_are_left_alone_where_they_are_not_seen() -> None:
     for step in (1, 2):
         before = _stored(optimizer)
         _set_gradients(optimizer, step, unseen=[1, 3] if step == 2 else [])
-        optimizer.step(step, 0.1, dense=True, resting=resting)
+        optimizer.step(step, 0.1, resting=resting)
     for name, x in _stored(optimizer).items():
         if "." in name and name.startswith(("gaussians", "exp_avg.")):
             changed = (x != before[name]).flatten(1).any(1) if x.ndim > 1 else x != before[name]
             assert changed.tolist() == [True, True, True, False, True], name
-
-
-def test_unseen_gaussians_are_left_alone_unless_dense() -> None:
-    start = _gaussians(5)
-    for sparse, dense, moves in ((True, False, False), (True, True, True), (False, False, True)):
-        optimizer = GaussianOptimizer(start, OptimConfig(sparse=sparse))
-        _set_gradients(optimizer, 1)
-        optimizer.step(1, 0.1, dense=dense)
-        before = _stored(optimizer)
-        _set_gradients(optimizer, 2, unseen=[1, 3])
-        optimizer.step(2, 0.1, dense=dense)
-        for name, x in _stored(optimizer).items():
-            changed = (x != before[name]).reshape(5, -1).any(1).tolist()
-            assert changed == [True, moves, True, moves, True], name
 
 
 def test_of_frozen_gaussians_only_the_base_colour_learns() -> None:
@@ -77,7 +63,7 @@ def test_of_frozen_gaussians_only_the_base_colour_learns() -> None:
     frozen = torch.tensor([False, True, True, False])
     before = optimizer.parameters.sh.detach().clone()
     _set_gradients(optimizer, 1)
-    optimizer.step(1, 0.1, dense=True, frozen_rest=frozen)
+    optimizer.step(1, 0.1, frozen_rest=frozen)
     changed = optimizer.parameters.sh.detach() != before
     assert changed[:, 0].all()
     assert changed[:, 1:].flatten(1).any(1).tolist() == [True, False, False, True]
@@ -89,7 +75,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
     neither."""
     optimizer = GaussianOptimizer(_gaussians(3), OptimConfig())
     _set_gradients(optimizer, 1)
-    optimizer.step(1, 0.1, dense=True)
+    optimizer.step(1, 0.1)
     before = _stored(optimizer)
     rows = torch.tensor(frozen)
     base = torch.full((3, 3), 0.7)
@@ -108,7 +94,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
     for each in (optimizer, other):
         for x in each.parameters.tensors().values():
             x.grad = torch.ones_like(x)
-        each.step(2, 0.1, dense=True, frozen_rest=rows)
+        each.step(2, 0.1, frozen_rest=rows)
         assert not each.parameters.sh[rows, 1:].any()
     assert torch.equal(optimizer.parameters.sh, other.parameters.sh)
 
@@ -116,7 +102,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
 def test_an_edit_moves_parameters_and_moments() -> None:
     optimizer = GaussianOptimizer(_gaussians(4), OptimConfig())
     _set_gradients(optimizer, 1)
-    optimizer.step(1, 0.1, dense=True)
+    optimizer.step(1, 0.1)
     before = _stored(optimizer)
     source = torch.tensor([0, 2, 2, 3])
     is_new = torch.tensor([False, False, True, True])

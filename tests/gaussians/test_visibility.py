@@ -38,3 +38,9 @@ def test_they_follow_the_gaussians() -> None:
     index = torch.tensor([18, 3, 3, 0])
     assert torch.equal(masks.select(index).seen, seen[:, index])
     assert masks.select(index).times == TIMES
+
+
+def test_active_is_what_either_end_sees() -> None:
+    masks, seen = some_masks()
+    for k in range(3):
+        assert torch.equal(masks.active(k), torch.nonzero(seen[k] | seen[k + 1])[:, 0])

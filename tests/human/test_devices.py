@@ -11,14 +11,15 @@ import torch
 from motion_files import random_motion
 from synthetic_bodies import model, write_npz
 
-from dyngs.human.avatar.anchors import skinning_weights, texel_gaussians
-from dyngs.human.avatar.neighbours import nearest_neighbours
+from dyngs.human.avatar.observations import nearest_neighbours
 from dyngs.human.avatar.posing import (
     Skeleton,
     frame_pose,
     pose_blend_shapes,
     pose_gaussians,
     rest_offsets,
+    skinning_weights,
+    texel_gaussians,
 )
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import read_body

@@ -15,7 +15,7 @@ from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import is_capture
 from dyngs.io.archive import unpacked
-from dyngs.io.temporary import cache_folder
+from dyngs.io.write import cache_folder
 
 
 @pytest.fixture
@@ -118,19 +118,6 @@ def test_bombs_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
     with pytest.raises(
         DyngsError, match=r"asks for 167,772,160 bytes, of which 134,217,728 are read at most.*=2$"
     ):
-        unpacked(file)
-    assert left() == []
-
-
-def test_no_more_is_written_than_an_archive_states(tmp_path: Path) -> None:
-    file = tmp_path / "liar.zip"
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as out:
-        out.writestr("zeros.png", bytes(2**22))
-    size = (2**22).to_bytes(4, "little")
-    content = file.read_bytes()
-    assert content.count(size) == 2
-    file.write_bytes(content.replace(size, (1000).to_bytes(4, "little")))
-    with pytest.raises(DyngsError, match=r"liar\.zip: cannot be read"):
         unpacked(file)
     assert left() == []
 

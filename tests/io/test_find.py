@@ -66,11 +66,6 @@ def test_names_that_differ_by_case_alone_are_not_mixed_up(tmp_path: Path) -> Non
     assert finder.find("a.PNG") == tmp_path / "a.PNG"  # one of two: neither is taken
 
 
-def test_a_backslash_may_be_a_part_of_a_name(tmp_path: Path) -> None:
-    image = touched(tmp_path / "cam0\\1.png")
-    assert FileFinder(tmp_path).find("cam0\\1.png") == image
-
-
 def test_missing_files_keep_their_place(tmp_path: Path) -> None:
     finder = FileFinder(tmp_path)
     assert finder.find("images\\1.png") == tmp_path / "images/1.png"

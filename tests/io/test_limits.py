@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.limits import VARIABLE, allowed, read_limited, require_at_most
+from dyngs.io.fields import VARIABLE, allowed, read_limited, require_at_most
 
 
 def test_what_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:

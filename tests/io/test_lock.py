@@ -64,25 +64,6 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
     assert not run.exists() or not list(run.iterdir())
 
 
-@pytest.mark.skipif(not hasattr(os, "O_NOFOLLOW"), reason="follows links")
-def test_a_lock_file_that_is_none_is_told_and_left(tmp_path: Path) -> None:
-    precious = tmp_path / "precious"
-    precious.write_text("mine")
-    for name, make in {
-        "link": lambda path: path.symlink_to(precious),
-        "folder": lambda path: path.mkdir(),
-        "pipe": lambda path: os.mkfifo(path),
-    }.items():
-        (tmp_path / name).mkdir()
-        make(tmp_path / name / LOCK_NAME)
-        with pytest.raises(DyngsError, match=LOCK_NAME), writing(tmp_path / name):
-            raise AssertionError
-        assert os.path.lexists(tmp_path / name / LOCK_NAME)
-    assert precious.read_text() == "mine"
-    with pytest.raises(DyngsError, match="not a folder"), writing(precious):
-        raise AssertionError
-
-
 def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
     """Also while the lock file is removed and made anew all the time."""
     code = HOLD.partition("\n")[0] + (

@@ -8,7 +8,6 @@ import os
 import pickle
 import struct
 import sys
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -357,21 +356,3 @@ def test_one_array_many_times(tmp_path: Path) -> None:
     path.write_bytes(raw + again + b"p3\n0(" + b"g3\n" * 2 + b"t.")
     found: Any = read_pickle(path)
     assert all(part is found[0] for part in found)
-
-
-@pytest.mark.parametrize("protocol", range(6))
-def test_what_writers_do_beside_lists_and_dictionaries(tmp_path: Path, protocol: int) -> None:
-    shared = {"a": [1, 2.5]}
-    tree = {
-        "ordered": OrderedDict([("z", 1), ("y", 2)]),
-        "shared": [shared, shared],
-        "numbers": [2**200, -(2**200), 0, 255, 256, -1, 2**31, 1e300, float("inf"), True, False],
-        "text": ["ä€😀\n\\", "", b"\x00\xff", b"", "\udc80"],
-        "keys": {None: 1, -(2**31) + 1: 2, False: 3, b"a": 4, np.int64(7): 5, np.str_("b"): 6},
-    }
-    path = tmp_path / "a.pkl"
-    path.write_bytes(pickle.dumps(tree, protocol))
-    found: Any = read_pickle(path)
-    assert found == tree
-    assert list(found["ordered"]) == list(tree["ordered"])
-    assert found["shared"][0] is found["shared"][1]

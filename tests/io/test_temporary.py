@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.temporary import remove_leftovers, temporary_beside, temporary_folder_beside
-from dyngs.io.write import write_text
+from dyngs.io.write import remove_leftovers, temporary_beside, temporary_folder_beside, write_text
 
 START = "import os, signal, sys; from pathlib import Path; folder = Path(sys.argv[1]);"
 
@@ -24,7 +23,7 @@ def _names(folder: Path) -> set[str]:
 @pytest.mark.skipif(os.name != "posix", reason="kills")
 def test_the_next_process_that_writes_there_cleans_up(tmp_path: Path) -> None:
     code = (
-        "from dyngs.io.temporary import temporary_beside, temporary_folder_beside; "
+        "from dyngs.io.write import temporary_beside, temporary_folder_beside; "
         "temporary_beside(folder / 'a.png').touch(); (temporary_folder_beside(folder / 'run') / 'inner').mkdir(); "
         "os.kill(os.getpid(), signal.SIGKILL)"
     )

@@ -136,22 +136,11 @@ def test_stdout_is_no_file_even_where_it_is_redirected_to_one(name: str) -> None
 
 WRITERS = (
     "train static data.root=STILL run.dir=run run.threads=1 train.steps=3 init.kind=random init.num_random=60",
-    "eval run",
     "render run --out images --depth",
-    "render run --path orbit --frames 2 --out orbit --video orbit/orbit.mp4",
     "export run --format ply --out files/a.ply",
-    "export run --format compressed-ply --out files/b.compressed.ply",
-    "export run --format spz --out files/a.spz",
-    "export run --format splat --out files/a.splat",
-    "export run --format sog --out files/a.sog",
-    "export run --format glb --out files/a.glb",
     "export run --format html --out files/a.html",
-    "export run --format html --folder --out page",
-    "export run --format cameras --out cameras",
     "export run --format dyngs --out stored",
-    "convert files/a.ply files/c.spz",
     "edit run --out edited --up -y",
-    "data synth still made --size 16 --views 4",
     "train human data.root=PERSON run.dir=person run.threads=1 train.steps=2 model.resolution=24 model.fit=false",
     "export person --format avatar --out files/person.safetensors",
 )
@@ -178,7 +167,7 @@ def test_files_and_folders_have_what_the_umask_allows(
         str(path.relative_to(work)): (path.is_dir(), stat.S_IMODE(path.stat().st_mode))
         for path in work.rglob("*")
     }
-    assert len(found) > 40
+    assert len(found) > 20
     wrong = {
         name: oct(mode)
         for name, (is_dir, mode) in found.items()

@@ -24,8 +24,8 @@ from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
-from dyngs.view.captured_views import viewpoint_of
 from dyngs.view.layers import Shot, draw
+from dyngs.view.views import viewpoint_of
 
 ROOT = Path(__file__).parents[2]
 

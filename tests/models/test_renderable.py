@@ -13,7 +13,6 @@ from camera_rings import ring_of
 from scene_kinds import KINDS, onlooker, scene_of_kind
 from small_triangles import bent
 from splat_scenes import cloud
-from tiny_field_people import NETWORKS, SIZES
 from torch import Tensor
 
 from dyngs.baselines.fields.keys import NerfModel, NgpModel
@@ -26,8 +25,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import Sides, StaticScene
-from dyngs.human.predict.fields.people import Body, Sources
-from dyngs.human.predict.fields.scene import SECTIONS, PredictedField, network_of
+from dyngs.human.predict.fields.people import PosedBody, Sources
+from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
 from dyngs.models.renderable import Renderable
 from dyngs.ops.rays import Space
 
@@ -52,12 +51,11 @@ def scene_of(kind: str) -> Renderable:
         eyes = [torch.tensor([4.0, 0.0, 1.5]), torch.tensor([-4.0, 0.0, 1.5])]
         return StaticScene(gaussians=Gaussians.joined(parts), sides=Sides.joined(parts, eyes))
     if kind in NETWORKS:
-        model = SECTIONS[kind].model_validate({"kind": kind} | SIZES | NETWORKS[kind])
         images = Sources(
             torch.ones(3, 4, 16, 16), torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3)
         )
-        body = Body(torch.zeros(4, 3), torch.zeros(3, 3), torch.zeros(1, 3, dtype=torch.long))
-        return PredictedField(model, network_of(model, generator), images, body, 1.0)
+        body = PosedBody(torch.zeros(4, 3), torch.zeros(3, 3), torch.zeros(1, 3, dtype=torch.long))
+        return PredictedField(NETWORKS[kind](generator), images, body, 1.0)
     return scene_of_kind(kind)
 
 

@@ -79,35 +79,6 @@ def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     assert findings()["GPU"] == "none"
 
 
-@pytest.mark.parametrize(
-    ("said", "line"),
-    [
-        (
-            "The NVIDIA driver on your system is too old (found version 11040). Please update your GPU driver",
-            r"too old \(found version 11040\): update the driver of the GPU, or install a torch for an older CUDA",
-        ),
-        (
-            "Found no NVIDIA driver on your system. Please check that you have one",
-            r"no driver of NVIDIA is there",
-        ),
-        ("something else\nand more", r"torch finds no GPU \(something else\): see `nvidia-smi`"),
-    ],
-)
-def test_a_torch_that_finds_no_gpu(machine: pytest.MonkeyPatch, said: str, line: str) -> None:
-    def fail() -> None:
-        raise RuntimeError(said)
-
-    machine.setattr(torch.cuda, "is_available", lambda: False)
-    machine.setattr(torch.cuda, "init", fail)
-    assert re.search(line, refused())
-
-
-def test_no_gpu_though_cuda_starts(machine: pytest.MonkeyPatch) -> None:
-    machine.setattr(torch.cuda, "is_available", lambda: False)
-    machine.setattr(torch.cuda, "init", lambda: None)
-    assert "CUDA_VISIBLE_DEVICES" in refused()
-
-
 def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
     assert (
@@ -137,7 +108,7 @@ def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
 
 def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.cuda, "get_device_capability", lambda: (7, 0))
-    assert re.search(r"GPU has compute capability 7\.0,? .*7\.5 is needed", refused())
+    assert re.search(r"GPU is older than compute capability 7\.5", refused())
 
 
 def test_auto_says_why_only_where_a_gpu_seems_to_be(machine: pytest.MonkeyPatch) -> None:

@@ -92,7 +92,7 @@ def test_what_does_not_fit_is_refused() -> None:
     coords = some(4)
     table = table_of(LEVELS, 2)
     for points, rows, message in (
-        (coords[:, :2], table, r"\(M, 3\)"),
+        (coords[:, :2], table, r"points must be \(4, 3\)"),
         (coords, table[1:], "table must be"),
         (coords, torch.cat([table, table[:, :1]], 1), "1, 2, 4 or 8"),
         (coords.float(), table, "float64"),

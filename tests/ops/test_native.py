@@ -206,26 +206,3 @@ def test_a_fork_of_a_process_with_threads_draws_on_one_and_says_so() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
 def test_a_fork_of_a_process_of_one_thread_may_start_some() -> None:
     assert drawn_after_forks(1) == ["True 1 4"] * 3
-
-
-@pytest.mark.parametrize(
-    "counted", [(1, 1, 0, 1), (1, 2, 1, 1)], ids=["drawn after a fork", "drawn before it"]
-)
-def test_threads_are_noticed_though_a_fork_ends_those_of_openblas(
-    counted: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Threads at the import, at a first fork, after it, and at a second one, before which one of
-    OpenMP is there."""
-    imported, at_first, after, at_second = counted
-    now = [imported]
-    monkeypatch.setattr(native, "_native_threads", lambda: now[-1])
-    monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
-    fork = native.Fork()
-    now.append(at_first)
-    fork.remember()
-    now.append(after)
-    fork.go_on()
-    now.append(at_second)
-    fork.remember()
-    fork.begin_child()
-    assert fork.lost_threads

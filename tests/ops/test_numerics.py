@@ -3,17 +3,12 @@ docs/numerics.md."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
-from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.projection import Projection
 from dyngs.ops.rasterization import TileEntries, bin_tiles, rasterize
 
@@ -24,36 +19,6 @@ WIDTH, HEIGHT = 64, 48
 
 # --- expected depth
 # ---------------------------------------------------------------------------------------------------
-
-
-def depth_of(opacity: float, dtype: torch.dtype, **options: float) -> tuple[Tensor, Tensor]:
-    """Expected depth of two balls of that opacity, at 3 and 4 units, and its gradient by their
-    means."""
-    means = torch.tensor([[0.1, 0, 3], [-0.1, 0.1, 4]], dtype=dtype, requires_grad=True)
-    logits = torch.full((2,), math.log(opacity) - math.log1p(-opacity), dtype=dtype)
-    quats = torch.ones(2, 4, dtype=dtype)
-    sh = torch.zeros(2, 1, 3, dtype=dtype)
-    gaussians = Gaussians(means, quats, torch.full((2, 3), -1.0, dtype=dtype), logits, sh)
-    intrinsics = torch.tensor([[[30.0, 0, 18], [0, 30, 14], [0, 0, 1]]], dtype=dtype)
-    cameras = Cameras(torch.eye(4, dtype=dtype)[None], intrinsics, 37, 29)
-    depth = render(
-        gaussians, cameras, RenderOptions(depth="expected", transmittance_min=0.0, **options)
-    ).depth
-    assert depth is not None
-    (slopes,) = torch.autograd.grad(depth.sum(), means)
-    return depth.detach(), slopes
-
-
-@pytest.mark.parametrize("opacity", [0.5, 1e-3, 1e-6, 1e-9, 1e-12])
-def test_expected_depth_of_what_is_hardly_there(isa: str, opacity: float) -> None:
-    """Divided by the sum of weights, which has all its digits, where 1 - transmittance has none
-    below 6e-8."""
-    depth, slopes = depth_of(opacity, torch.float32, alpha_min=0.0)
-    truth, true_slopes = depth_of(opacity, torch.float64, alpha_min=0.0)
-    # each pixel's weights have 2.5e-7 of the exponential and 2^-24 (30 px / 2 px)^2 / 2 of its
-    # argument
-    assert (depth - truth).abs().max() < 5e-5
-    assert ((slopes - true_slopes).abs() / true_slopes.abs().max()).max() < 1e-4
 
 
 # --- indices from callers

@@ -257,22 +257,28 @@ def test_penalty_can_be_differentiated_again() -> None:
     ("change", "message"),
     [
         (lambda c, x: (c, 0.5, []), "at least one level"),
-        (lambda c, x: (c[:, :2], 0.5, x), r"coordinates must be \(M, 3\)"),
+        (lambda c, x: (c[:, :2], 0.5, x), r"coordinates must be \(7, 3\)"),
         (lambda c, x: (c.double(), 0.5, x), "coordinates must be torch.float32"),
         (lambda c, x: (c, math.nan, x), "time must be a number"),
-        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space[:2], x[0].time)]), "level 0 must have space"),
+        (
+            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space[:2], x[0].time)]),
+            "space of level 0 must be",
+        ),
         (
             lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space, x[0].time)]),
-            "level 1 must have space",
+            "time of level 1 must be",
         ),
         (
             lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space[..., :4], x[1].time[..., :4])]),
-            "level 1 must have",
+            "space of level 1 must be",
         ),
-        (lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time[:, :0])]), "none empty"),
+        (
+            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time[:, :0])]),
+            "time of level 0 must be",
+        ),
         (
             lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time.double())]),
-            "level 0 must be torch.float32",
+            "time of level 0 must be torch.float32",
         ),
         (
             lambda c, x: (c, 0.5, [PlaneLevel(x[0].space.half(), x[0].time.half())]),

@@ -150,33 +150,6 @@ def test_a_reflection_gives_rotations_all_the_same() -> None:
     torch.testing.assert_close(covariances(found.quats, found.log_scales), wanted)
 
 
-@pytest.mark.parametrize(
-    "log_scales", [(-4.0, -4.0, -4.0), (-4.0, -4.0, -6.0), (0.0, -80.0, -80.0)]
-)
-@pytest.mark.parametrize(
-    "flattened", [(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (0, 0, 1), (0, 0, 0)]
-)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_maps_that_flatten(
-    log_scales: tuple[float, ...], flattened: tuple[int, ...], dtype: torch.dtype
-) -> None:
-    """As blends of opposite rotations do: discs, balls and needles are moved exactly, and all
-    gradients are finite."""
-    linear = rotation_matrices(normal(5, 4)) * torch.tensor(flattened)
-    given = [
-        linear,
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1),
-        torch.tensor([log_scales]).repeat(5, 1),
-    ]
-    given = [x.to(dtype).requires_grad_() for x in given]
-    found = moved_alone(*given)
-    wanted = linear @ covariances(*(x.detach().double() for x in given[1:])) @ linear.mT
-    moved = covariances(found.quats.detach().double(), found.log_scales.detach().double())
-    torch.testing.assert_close(moved, wanted, rtol=0, atol=100 * torch.finfo(dtype).eps)
-    ((found.quats.square() * torch.arange(4)).sum() + found.log_scales.sum()).backward()
-    assert all(x.grad is not None and bool(x.grad.isfinite().all()) for x in given)
-
-
 def test_the_gradient_of_a_ball_is_that_of_its_size() -> None:
     """Its rotation has no effect, and the three scales grow alike."""
     log_scales = torch.full((1, 3), -3.0, dtype=torch.float64, requires_grad=True)

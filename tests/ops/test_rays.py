@@ -200,7 +200,7 @@ def test_what_does_not_fit_is_refused() -> None:
     densities, colours, samples = some_samples([3])
     with pytest.raises(DyngsError, match="densities must be"):
         composite(densities[1:], colours, samples)
-    with pytest.raises(DyngsError, match="one dtype"):
+    with pytest.raises(DyngsError, match="densities must be torch"):
         composite(densities.float(), colours.float(), samples)
     with pytest.raises(DyngsError, match="cells must be"):
         march(

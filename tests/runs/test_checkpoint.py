@@ -33,7 +33,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.stored_tensors import drawable
+from dyngs.runs.stored_file import drawable
 from dyngs.static.keys import StaticModel
 from dyngs.training.new_trainer import restored_scene
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_stereo import STEREO, stereo_config
+from tiny_stereo import stereo_config
 
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.gps.surface import GpsNetwork
+from dyngs.human.predict.gps.stereo import GpsNetwork
 from dyngs.io.tensor_file import FileKind, write_tensors
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import load_weights
@@ -29,7 +29,7 @@ def config(tmp_path: Path) -> Config:
 
 
 def checkpoint(scale: float = 1.0) -> Checkpoint:
-    network = GpsNetwork(STEREO, torch.Generator().manual_seed(0))
+    network = GpsNetwork(torch.Generator().manual_seed(0))
     tensors = {f"model.network.{name}": scale * x for name, x in network.state_dict().items()}
     return Checkpoint(
         INFO, tensors | {"rng": torch.zeros(3), "optimizer.step.x": torch.tensor(1.0)}
@@ -46,7 +46,7 @@ def test_weights_are_those_of_the_run_to_float16(config: Config, tmp_path: Path)
     assert weights.tensors.keys() == {name for name in stored.tensors if name.startswith("model.")}
     for name, x in weights.tensors.items():
         torch.testing.assert_close(x, stored.tensors[name], rtol=1e-3, atol=1e-7)
-    load_weights(GpsNetwork(STEREO, torch.Generator()), weights)
+    load_weights(GpsNetwork(torch.Generator()), weights)
     assert str(tmp_path).encode() not in path.read_bytes()
     assert path.stat().st_size < 2.2 * sum(x.numel() for x in weights.tensors.values()) + 20_000
 
@@ -70,7 +70,7 @@ def test_other_files_are_refused(config: Config, tmp_path: Path) -> None:
     cases: list[tuple[str, dict[str, object]]] = [
         ("dyngs avatar", {}),
         ("dyngs network", {"model": {"kind": "static"}}),
-        ("dyngs network", {"model": {"kind": "gps", "widths": "many"}}),
+        ("dyngs network", {"model": {"kind": "gps", "person_px": "many"}}),
         ("dyngs network", {"model": {"kind": "human_predictor", "body": "/etc/passwd"}}),
     ]
     bad.write_bytes(half)

@@ -19,6 +19,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.runs.stored_file import (
+    COARSENESS,
     MAGIC,
     MAX_HEADER,
     compressed,
@@ -30,7 +31,6 @@ from dyngs.runs.stored_file import (
     unpacked,
     write_scene,
 )
-from dyngs.runs.stored_tensors import COARSENESS
 
 INFO = CheckpointInfo(7, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic")
 STEPS = {

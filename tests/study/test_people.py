@@ -15,7 +15,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
-from dyngs.human.predict.gps.pairs import angle
+from dyngs.human.predict.gps.rectification import angle
 from dyngs.study.people import PeopleBench, compare_people, task_of
 
 

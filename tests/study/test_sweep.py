@@ -156,14 +156,13 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(
 def test_another_field_moves_the_same(
     variant: Variant, kind: str, size: dict[str, int], run_dir: Path, tmp_path: Path
 ) -> None:
-    before = load_resolved(run_dir, ["model.deform.nodes=512", "model.deform.move_scales=false"])
+    before = load_resolved(run_dir, ["model.deform.nodes=512", "model.deform.moves=[rotations]"])
     save_config(before, tmp_path / "config.yaml")
     changed = load_resolved(tmp_path, field_changes(before, variant)).model
     assert isinstance(changed, DynamicModel)
     assert changed.deform.kind == kind
     assert {name: getattr(changed.deform, name) for name in size} == size
-    assert not changed.deform.move_scales
-    assert changed.deform.move_rotations
+    assert changed.deform.moves == ("rotations",)
 
 
 def test_free_primitives_are_tried_and_left(run_dir: Path, tmp_path: Path) -> None:

@@ -252,7 +252,7 @@ def test_a_gaussian_takes_what_is_forecast_within_the_band(
             case "human":
                 config = Config(
                     data=DataConfig(root=request.getfixturevalue("person")),
-                    model=HumanModel(resolution=16 + 16 * size, sh_degree=0, refine_from=0.0),
+                    model=HumanModel(resolution=16 + 16 * size, sh_degree=0),
                     strategy=FixedStrategy(),
                 )
             case _:

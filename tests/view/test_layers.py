@@ -1,21 +1,40 @@
+"""Images for the viewer, the views of a capture, and cameras of browsers."""
+
+from __future__ import annotations
+
+import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from moving_scene import MOVING_ROWS, camera, still_scene, write_moving_run
+from moving_scene import (
+    MOVING_ROWS,
+    TEST_TIMES,
+    TRAIN_TIMES,
+    camera,
+    row_of_balls,
+    write_moving_run,
+)
 from pretend_gpu import GPU, pretend_gpu
 from scene_kinds import scene_of_kind
 from splat_scenes import cloud
-from view_sessions import balls, opened_at
+from view_sessions import balls, looking_at_balls, opened_at
 
+from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
+from dyngs.data.aim import look_at
 from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.opened import Opened, open_run
-from dyngs.view.captured_views import views_of
+from dyngs.io.formats.formats import write_splats
+from dyngs.io.formats.splat_file import SplatFile
+from dyngs.runs.opened import Opened, open_run, open_scene
+from dyngs.view.controls import Frusta, distinct, frustum_size
 from dyngs.view.layers import (
     LAYERS,
     PARTS,
@@ -25,6 +44,18 @@ from dyngs.view.layers import (
     motion_colours,
     shows_filled,
     truth_in_window,
+)
+from dyngs.view.source import open_to_view
+from dyngs.view.views import (
+    Viewpoint,
+    camera_at,
+    fitting_fov,
+    has_timeline,
+    look_point,
+    nearest_view,
+    pose_of,
+    viewpoint_of,
+    views_of,
 )
 
 
@@ -38,15 +69,6 @@ def test_colours_are_those_of_dyngs_render() -> None:
     shown = draw(opened, Shot(camera(80, 56), 0.3))
     wanted = render_frame(opened.scene, camera(80, 56), 0.3).rgb
     assert np.abs(shown / 255.0 - wanted).max() <= 0.5 / 255 + 1e-6
-
-
-@pytest.mark.parametrize("layer", LAYERS)
-@pytest.mark.parametrize("part", PARTS)
-def test_every_layer_of_every_part_is_a_image(layer: str, part: str) -> None:
-    for opened in (balls(), opened_at(still_scene())):
-        shown = draw(opened, Shot(camera(), 0.5, layer, part))  # type: ignore[arg-type]
-        assert shown.shape == (14, 20, 3)
-        assert shown.dtype == np.uint8
 
 
 @pytest.mark.parametrize("layer", LAYERS)
@@ -78,9 +100,6 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
         assert np.array_equal(draw(opened, same), draw(whole, same))
     edited = opened.showing(opened.scene.select(torch.arange(1000)))
     assert np.array_equal(draw(edited, replace(shot, is_moving=True)), draw(edited, shot))
-
-
-def test_what_moves_has_no_levels() -> None:
     with pytest.raises(DyngsError, match="for still scenes"):
         coarser(balls(), 300)
 
@@ -167,3 +186,91 @@ def test_what_no_training_view_shows_of_a_person_is_marked() -> None:
     assert covered.any()
     assert (marked[covered] >= [240, 0, 240]).all()
     assert (marked[covered][:, 1] < 20).all(), "magenta"
+
+
+def looking(
+    eye: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, 0)
+) -> Cameras:
+    pose = np.linalg.inv(look_at(np.array(eye), np.array(target), np.array([0.0, 0, 1])))
+    return Cameras(torch.from_numpy(pose).float()[None], camera().intrinsics, 20, 14)
+
+
+def test_a_pose_goes_to_the_browser_and_back() -> None:
+    one = looking((1, 2, 3))
+    back = camera_at(*pose_of(one), 2 * math.atan(0.5 * 14 / 20), (20, 14))
+    assert torch.allclose(back.cam_from_world, one.cam_from_world, atol=1e-6)
+    assert torch.allclose(back.intrinsics, one.intrinsics)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 20 / 14, 3.0])
+def test_a_window_shows_the_whole_image(aspect: float) -> None:
+    half = math.tan(fitting_fov(camera(), aspect) / 2)
+    assert min(half - 0.5 * 14 / 20, half * aspect - 0.5) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-5])
+def test_the_point_to_orbit_lies_on_the_axis_as_deep_as_the_scene(unit: float) -> None:
+    one = looking((0, -4 * unit, 0))
+    begin = Viewpoint(one, np.array([unit, 0, unit]), 2 * unit, np.array([0, 0, 1.0]))
+    assert look_point(one, begin) / unit == pytest.approx([0, 0, 0], abs=1e-6)
+    behind = replace(begin, center=np.array([0.0, -9 * unit, 0]))
+    assert look_point(one, behind) / unit == pytest.approx([0, -3.8, 0], abs=1e-6)
+
+
+def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) -> None:
+    opened = open_scene(write_moving_run(tmp_path))
+    shown = views_of(opened)
+    for index in range(len(shown)):
+        time = shown.times[index] or 0.0
+        assert nearest_view(opened, shown.cameras[index], time) == index
+    assert set(shown.times) == {*TRAIN_TIMES, *TEST_TIMES}
+    assert has_timeline(opened)
+    begin = viewpoint_of(opened)
+    assert torch.equal(begin.start.cam_from_world, shown.cameras[0].cam_from_world)
+    assert views_of(replace(opened, as_captured=False)).images is None
+
+
+def test_a_run_without_its_capture_is_shown_all_the_same(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path, offset=(1.0, 2.0, 3.0))
+    shutil.rmtree(tmp_path / "capture")
+    opened = open_to_view(run, "run", "-y")
+    assert len(views_of(opened)) == 0
+    assert "without the capture" in opened.notes[0]
+    assert viewpoint_of(opened).up.tolist() == [0, -1, 0]
+
+
+def test_a_file_is_seen_from_where_all_of_it_is_in_view(tmp_path: Path) -> None:
+    write_splats(tmp_path / "balls.spz", SplatFile(row_of_balls(201)))
+    opened = open_to_view(tmp_path / "balls.spz", "balls")
+    start = viewpoint_of(opened).start
+    assert not has_timeline(opened)
+    places = start.cam_from_world[0, :3, :3] @ opened.scene.gaussians.means.T
+    shown = start.intrinsics[0] @ (places + start.cam_from_world[0, :3, 3:])
+    pixels = shown[:2] / shown[2]
+    assert bool((shown[2] > 0).all())
+    inside = (pixels >= 0).all(0) & (pixels[0] <= 960) & (pixels[1] <= 720)
+    assert float(inside.float().mean()) > 0.95
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9])
+def test_a_fixed_camera_has_one_frustum_of_a_size_that_fits(unit: float) -> None:
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[[1, 3], 0, 3] = unit
+    poses[5, 2, 3] = 2.0 * unit
+    assert distinct(poses) == [0, 1, 5]
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    assert frustum_size(poses, 4.0) == pytest.approx(0.2)  # one fixed camera
+    poses[:, 0, 3] = [-1, 1, -1, 1]
+    assert frustum_size(poses, 4.0) == pytest.approx(0.15)
+    assert frustum_size(100 * poses, 4.0) == pytest.approx(0.2)
+
+
+def test_a_frustum_that_the_camera_stands_in_is_hidden() -> None:
+    session, _ = looking_at_balls()
+    frusta = Frusta(SimpleNamespace(session=session))  # type: ignore[arg-type]
+    assert session.eye is not None
+    here, there = (SimpleNamespace(visible=True) for _ in range(2))
+    eye = np.array(session.eye.position)
+    frusta._handles = [(here, eye + 0.01, 0.2), (there, eye + 1.0, 0.2)]
+    frusta.hide_what_covers()
+    assert (here.visible, there.visible) == (False, True)

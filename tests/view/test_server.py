@@ -2,8 +2,12 @@
 
 import json
 import re
+import socket
+import string
 import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -19,10 +23,19 @@ from PIL import Image
 from view_sessions import balls
 
 from dyngs.cli import main
+from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import ssim
-from dyngs.view.pace import Pace
-from dyngs.view.recording import Keyframe, Recording
-from dyngs.view.server import Browsing, Serving, Viewer, notify
+from dyngs.view.gate import (
+    COOKIE,
+    Gate,
+    free_port,
+    gate_for,
+    guarded,
+    is_loopback,
+    link_to,
+)
+from dyngs.view.server import Browsing, Serving, Viewer, as_text, quiet
+from dyngs.view.session import Keyframe, Pace, Recording
 from dyngs.view.source import open_source
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
@@ -91,7 +104,7 @@ def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
     recording = Recording((Keyframe(session.eye.camera(), session.time),))
     folder.mkdir()
     path = folder / "path.json"
-    path.write_text(recording.document(session.eye.size, 30.0, session.opened.world_offset))
+    path.write_text(recording.document(session.eye.size, 30.0, session.opened))
     assert main(["render", str(run), "--path", str(path), "--out", str(folder / "out")]) == 0
     return np.asarray(Image.open(folder / "out" / "frame_0000.png").convert("RGB"))
 
@@ -233,7 +246,7 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
             (browsing,) = viewer.browsing
             if folder == run:
                 browsing.session.change(view=0, comparing=True)
-                notify(browsing.client, SCRIPT, FRAME)
+                browsing.notify(SCRIPT, FRAME)
             else:
                 page.click("text=Help")
             until(
@@ -257,3 +270,100 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
                 address for address in page.requests if "evil" in address or address.endswith("/x")
             ]
             page.close()
+
+
+def test_with_a_token_only_who_has_it_may() -> None:
+    gate = Gate("secret")
+    other = {"Host": "box:8080"}
+    assert gate.refusal("/?token=secret", other) is None
+    assert gate.refusal("/", other | {"Cookie": f"a=b; {COOKIE}=secret"}) is None
+    for path, headers in (
+        ("/", other),
+        ("/?token=", other),
+        ("/?token=wrong", other),
+        ("/?token=s\u00e9cret", other),
+        ("/", other | {"Cookie": f"{COOKIE}=wrong"}),
+        ("/?token=secret", other | {"Origin": "http://evil.example"}),
+    ):
+        assert gate.refusal(path, headers) is not None
+    assert "HttpOnly" in (gate.cookie("/?token=secret") or "")
+    assert gate.cookie("/") is None
+    assert Gate().cookie("/?token=x") is None
+
+
+def test_only_a_server_for_others_has_a_token() -> None:
+    assert [is_loopback(host) for host in ("localhost", "127.0.0.1", "::1")] == [True] * 3
+    assert [is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.7", "box")] == [False] * 4
+    assert gate_for("127.0.0.1").token is None
+    first = gate_for("0.0.0.0").token
+    second = gate_for("0.0.0.0").token
+    assert first is not None
+    assert len(first) >= 24
+    assert first != second
+
+
+def test_a_free_port_is_found_and_a_taken_one_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = other.getsockname()[1]
+        with pytest.raises(DyngsError, match=f"--port {taken}: taken"):
+            free_port("127.0.0.1", taken)
+        assert free_port("127.0.0.1", None) != taken
+    assert free_port("127.0.0.1", taken) == taken
+    with pytest.raises(DyngsError, match="--host"):
+        free_port("no.such.host.invalid", None)
+
+
+@pytest.mark.parametrize(
+    ("host", "more", "is_let_in"),
+    [
+        ("localhost:8080", {}, True),
+        ("[::1]:8080", {"Origin": "http://[::1]:8080"}, True),
+        ("127.0.0.2:8080", {}, True),
+        ("evil.example:8080", {}, False),  # a name that was made to point here
+        ("localhost:8080", {"Origin": "https://evil.example"}, False),  # opens a websocket
+        ("localhost:8080", {"Origin": "null"}, False),
+        ("", {}, False),
+    ],
+)
+def test_this_machine_may_open_the_page_and_pages_of_others_may_not(
+    host: str, more: dict[str, str], is_let_in: bool
+) -> None:
+    assert (Gate().refusal("/", {"Host": host} | more) is None) == is_let_in
+
+
+def test_the_server_asks_the_gate() -> None:
+    import viser
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    port = free_port("127.0.0.1", None)
+    with guarded(Gate("secret")), quiet():
+        server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    version = f"viser-v{viser.__version__}"
+    try:
+        page = link_to("127.0.0.1", server.get_port())
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(page, timeout=5)
+        assert refused.value.code == 403
+        answer = urllib.request.urlopen(f"{page}?token=secret", timeout=5)
+        assert answer.status == 200
+        cookie = {"Cookie": answer.headers["Set-Cookie"].partition(";")[0]}
+        socket_at = page.replace("http", "ws")
+        with pytest.raises(InvalidStatus):
+            connect(socket_at, subprotocols=[version])  # type: ignore[list-item]
+        with connect(socket_at, additional_headers=cookie, subprotocols=[version]) as opened_socket:  # type: ignore[list-item]
+            assert opened_socket.recv(timeout=5)
+    finally:
+        with quiet():
+            server.stop()
+    assert link_to("::1", 80) == "http://[::1]:80/"
+    assert link_to("box", 80, "secret") == "http://box:80/?token=secret"
+    assert link_to("0.0.0.0", 80, "secret").endswith(f"{socket.gethostname()}:80/?token=secret")
+
+
+@pytest.mark.parametrize("text", ["Größe 12", "a_b*c <i>x</i> [y](z) &lt;", string.punctuation])
+def test_every_mark_of_others_is_escaped_and_nothing_else(text: str) -> None:
+    shown = "".join(f"\\{c}" if c in string.punctuation else c for c in text)
+    assert as_text(text) == shown.replace("\\@", "\u200b\\@")
+    assert as_text("a\n\n<b>\x1b") == r"a \<b\>\\x1b"
+    assert as_text("http://x.y WWW.x") == "http\u200b\\:\\/\\/x\\.y WWW\u200b\\.x"

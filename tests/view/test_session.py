@@ -1,19 +1,40 @@
+"""What a browser sees when: sizes, times, recorded paths, turns of several browsers."""
+
+from __future__ import annotations
+
+import threading
+import time
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from moving_scene import Sliding, camera, moving_scene, still_scene
-from view_sessions import opened_at
+from view_sessions import looking_at_balls, opened_at
 
+from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
+from dyngs.export.camera_paths import read_path
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.runs.opened import Opened
 from dyngs.view import session
-from dyngs.view.cameras import camera_at, pose_of
 from dyngs.view.layers import Shot, draw
-from dyngs.view.pace import STILL_AFTER
-from dyngs.view.recording import Keyframe, Recording
-from dyngs.view.session import Eye, Sent, Session, Timeline
+from dyngs.view.session import (
+    STILL_AFTER,
+    Drawer,
+    Eye,
+    Keyframe,
+    Pace,
+    Recording,
+    Sent,
+    Session,
+    Timeline,
+)
+from dyngs.view.views import camera_at, pose_of
 
 
 class Clock:
@@ -47,43 +68,52 @@ class Looked:
             self.clock.now += 0.05
 
 
-def test_nothing_is_drawn_before_there_is_a_camera() -> None:
-    assert Looked().session.due() is None
+@pytest.mark.parametrize(
+    ("fixed", "per_pixel", "area"),
+    [(0.01, 1e-6, 60_000 / 0.7), (1e-4, 1e-9, 480_000), (0.0, 1.0, 320 * 240)],
+)
+def test_images_take_as_long_as_they_may(fixed: float, per_pixel: float, area: float) -> None:
+    pace = Pace(0.07 if area < 320 * 240 else fixed + per_pixel * area, longest=1.0)
+    for _ in range(40):
+        pixels = min(pace.area, 480_000)
+        pace.observe(pixels, fixed + per_pixel * pixels)
+    assert min(pace.area, 480_000) == pytest.approx(area, rel=0.05)
+    assert pace.largest == pytest.approx(
+        max(pixels / (fixed + per_pixel * pixels), pace.area), rel=0.05
+    )
 
 
-def test_small_while_moving_then_whole_and_then_nothing_until_something_changes() -> None:
-    looked = Looked()
-    looked.session.move(eye(size=(800, 600)))
-    looked.after(0)
-    first = looked.sent[0]
-    assert not first.is_refined
-    assert first.image.shape[0] < 600
-    due = looked.session.due()
-    assert due is not None
-    assert 0 < due <= STILL_AFTER
-    looked.after(due)
-    looked.after(0.1)
-    assert looked.sent[-1].is_refined
-    assert looked.sent[-1].image.shape == (600, 800, 3)
-    assert looked.session.due() is None
-    looked.session.move(eye(size=(800, 600)))  # the same
-    assert looked.session.due() is None
-    looked.session.change(layer="alpha")
-    assert looked.session.due() == 0.0
-
-
-def test_only_what_moves_may_be_coarser(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     shots: list[Shot] = []
     monkeypatch.setattr(
         session, "draw", lambda opened, shot: shots.append(shot) or draw(opened, shot)
     )
     looked = Looked()
-    looked.session.move(eye())
+    assert looked.session.due() is None  # there is no camera
+    looked.session.move(eye(size=(1200, 900)))
     looked.after(0)
-    looked.after(1)
-    looked.after(1)
+    first = looked.sent[0]
+    assert not first.is_refined
+    assert first.image.shape[0] < 900
+    due = looked.session.due()
+    assert due is not None
+    assert 0 < due <= STILL_AFTER
+    looked.after(due)
+    looked.after(0.1)
+    looked.after(0.1)
+    assert looked.sent[-1].is_refined
+    assert looked.sent[-1].image.shape == (900, 1200, 3)
+    refined = [sent.image.size for sent in looked.sent if sent.is_refined]
+    assert refined == sorted(set(refined))
+    assert len(refined) > 1, "in steps"
     assert [shot.is_moving for shot in shots] == [not sent.is_refined for sent in looked.sent]
-    assert {shot.is_moving for shot in shots} == {True, False}
+    assert looked.session.due() is None
+    looked.session.move(eye(size=(1200, 900)))  # the same
+    assert looked.session.due() is None
+    looked.session.change(layer="alpha")
+    assert looked.session.due() == 0.0
 
 
 @pytest.mark.parametrize(
@@ -96,12 +126,11 @@ def test_only_what_moves_may_be_coarser(monkeypatch: pytest.MonkeyPatch) -> None
         {"size": (0, 40)},
     ],
 )
-def test_cameras_that_cannot_be_are_ignored(change: dict) -> None:
+def test_cameras_that_cannot_be_are_ignored(change: dict[str, Any]) -> None:
     looked = Looked()
     assert not looked.session.move(replace(eye(), **change))
     assert looked.session.due() is None
     looked.session.move(eye())
-    looked.after(1)
     assert not looked.session.move(replace(eye(), **change))
     assert looked.session.eye == eye()
 
@@ -149,16 +178,14 @@ def test_a_preview_shows_the_recorded_cameras_and_then_the_browser_s_own() -> No
     looked = Looked()
     looked.session.move(eye())
     looked.after(1)
-    wxyz, _ = pose_of(camera())
-    far = camera_at(wxyz, (0, 0, -9), 0.7, (400, 300))
+    far = camera_at(pose_of(camera())[0], (0, 0, -9), 0.7, (400, 300))
     looked.session.preview(Recording((Keyframe(far, 0.5, 1.0), Keyframe(far, 0.5, 1.0))))
     shot = looked.session.shot()
     assert torch.allclose(shot.camera.cam_from_world, far.cam_from_world, atol=1e-6)
     assert shot.time == pytest.approx(0.5)
     looked.after(2)
-    assert torch.allclose(
-        looked.session.shot().camera.cam_from_world, eye().camera().cam_from_world
-    )
+    own = looked.session.shot().camera.cam_from_world
+    assert torch.allclose(own, eye().camera().cam_from_world)
 
 
 def test_an_error_is_not_drawn_again_until_something_changes(
@@ -166,32 +193,28 @@ def test_an_error_is_not_drawn_again_until_something_changes(
 ) -> None:
     looked = Looked()
     looked.session.move(eye())
-    monkeypatch.setattr("dyngs.view.session.draw", lambda *_: 1 / 0)
+    monkeypatch.setattr(session, "draw", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         looked.session.draw_next()
     looked.clock.now += 9
     assert looked.session.due() is None
 
 
-def test_of_jobs_of_a_kind_the_newest_is_done() -> None:
+def test_jobs_and_who_has_gone() -> None:
     looked = Looked()
     done = list[int]()
     looked.session.move(eye())
-    for number in (1, 2, 3):
+    for number in (1, 2, 3):  # of jobs of a kind the newest is done
         looked.session.ask(lambda number=number: done.append(number), "pose")
     looked.session.ask(lambda: done.append(4))
     looked.after(1)
     assert done == [3, 4]
-
-
-def test_who_has_gone_gets_nothing() -> None:
-    looked = Looked()
-    looked.session.move(eye())
+    count = len(looked.sent)
     looked.session.ask(lambda: pytest.fail("asked"))
     looked.session.close()
     assert looked.session.due() is None
     looked.session.draw_next()
-    assert looked.sent == []
+    assert len(looked.sent) == count
 
 
 def test_the_scene_in_training_is_drawn_again_as_large_as_it_was() -> None:
@@ -208,27 +231,106 @@ def test_the_scene_in_training_is_drawn_again_as_large_as_it_was() -> None:
     assert looked.sent[-1].image.shape == whole
 
 
-def test_time_passes_only_while_it_plays() -> None:
+def test_the_timeline() -> None:
     still = Timeline(time=0.5, since=10.0, seconds=4)
     assert still.at(99.0) == 0.5
     playing = still.changed(10.0, playing=True)
     assert playing.at(11.0) == pytest.approx(0.75)
     assert playing.changed(11.0, speed=2.0).at(11.25) == pytest.approx(0.875)
     assert playing.changed(11.0, playing=False).at(50.0) == pytest.approx(0.75)
-
-
-def test_a_loop_begins_again_and_no_loop_ends() -> None:
     loop = Timeline(seconds=2).changed(0.0, playing=True)
     assert loop.at(2.5) == pytest.approx(0.25)
-    assert not loop.is_over(2.5)
     once = loop.changed(0.0, loops=False)
     assert once.at(2.5) == 1.0
-    assert once.is_over(2.5)
     assert once.changed(3.0, playing=False).changed(5.0, playing=True).at(5.0) == 0.0
+    one = Session(opened(), lambda sent: None)
+    for chosen, shown in ((7.0, 1.0), (-7.0, 0.0)):
+        one.set_time(chosen)
+        assert one.time == shown
 
 
-def test_a_time_that_is_set_stays_within_the_recording() -> None:
-    session = Session(opened(), lambda sent: None)
-    for time, shown in ((7.0, 1.0), (-7.0, 0.0)):
-        session.set_time(time)
-        assert session.time == shown
+def at_depth(depth: float) -> Cameras:
+    one = camera(40, 28)
+    pose = one.cam_from_world.clone()
+    pose[0, 2, 3] = depth
+    return Cameras(pose, one.intrinsics, 40, 28)
+
+
+def placed(frame: Similarity = UNMOVED, offset: tuple[float, ...] = (10.0, -20.0, 5.0)) -> Any:
+    return SimpleNamespace(frame=frame, world_offset=np.array(offset))
+
+
+@pytest.mark.parametrize("loops", [False, True])
+def test_dyngs_render_reads_what_was_recorded_and_sees_what_was_previewed(
+    tmp_path: Path, loops: bool
+) -> None:
+    keys = (
+        Keyframe(at_depth(4), 0.0, 1.0),
+        Keyframe(at_depth(6), 0.5, 2.0),
+        Keyframe(at_depth(3), 1.0, 1.0),
+    )
+    recording = Recording(keys, loops)
+    assert recording.duration == (4.0 if loops else 3.0)
+    file = tmp_path / "path.json"
+    file.write_text(recording.document((20, 14), 10.0, placed()))
+    path = read_path(file, placed().world_offset)
+    cameras = path.cameras
+    assert (cameras.width, cameras.height, path.fps) == (20, 14, 10.0)
+    assert path.times is not None
+    assert len(path) == (40 if loops else 31)
+    for frame in (0, 7, 10, 25, len(path) - 1):
+        shown, moment = recording.at(frame / 10)
+        assert moment == pytest.approx(path.times[frame], abs=1e-6)
+        assert torch.allclose(cameras.cam_from_world[frame], shown.cam_from_world[0], atol=1e-4)
+        focal = float(shown.intrinsics[0, 1, 1]) / 2
+        assert float(cameras.intrinsics[frame, 1, 1]) == pytest.approx(focal)
+
+
+def test_a_path_through_a_moved_still_scene(tmp_path: Path) -> None:
+    turned = Similarity((0.5, 0.5, -0.5, 0.5), 2.0)
+    there = placed(turned.inverse(), (1.0, 2.0, 3.0))
+    file = tmp_path / "path.json"
+    file.write_text(Recording((Keyframe(at_depth(4), None),)).document((40, 28), 30.0, there))
+    path = read_path(file, there.world_offset)
+    assert path.times is None
+    seen = turned.cameras(path.cameras)
+    assert torch.allclose(seen.cam_from_world, at_depth(4).cam_from_world, atol=1e-6)
+
+
+def test_each_gets_a_turn_and_the_thread_ends() -> None:
+    before = threading.active_count()
+    drawer = Drawer(lambda session, message: None)
+    browsers = [looking_at_balls() for _ in range(3)]
+    drawer.start()
+    for one, _ in browsers:
+        drawer.add(one)
+        one.change_timeline(playing=True)
+    until = time.monotonic() + 30
+    while min(len(sent) for _, sent in browsers) < 3 and time.monotonic() < until:
+        time.sleep(0.01)
+    assert min(len(sent) for _, sent in browsers) >= 3
+    drawer.remove(browsers[0][0])
+    count = len(browsers[0][1])
+    time.sleep(0.2)
+    assert len(browsers[0][1]) <= count + 1  # the one that was being drawn
+    drawer.stop()
+    assert threading.active_count() == before
+
+
+def test_a_fault_of_one_is_told_once_and_the_others_go_on() -> None:
+    told: list[tuple[Session, str]] = []
+    drawer = Drawer(lambda session, message: told.append((session, message)))
+    (bad, _), (worse, _), (good, sent) = (looking_at_balls() for _ in range(3))
+
+    def fail(error: Exception) -> None:
+        raise error
+
+    for one in (bad, worse, good):
+        drawer.add(one)
+    for _ in range(20):
+        bad.ask(lambda: fail(DyngsError("no such file")))
+        worse.ask(lambda: fail(ZeroDivisionError("by nothing")))
+        drawer.draw_one()
+    assert set(told) == {(bad, "no such file"), (worse, "ZeroDivisionError: by nothing")}
+    assert len(told) == 2
+    assert sent

@@ -1,12 +1,37 @@
+"""What can be looked at: folders of runs, networks of people, people in motion, and training."""
+
+from __future__ import annotations
+
+import itertools
+import threading
 from pathlib import Path
 
 import pytest
+import torch
 from moving_scene import write_moving_run
+from pretend_gpu import GPU, pretend_gpu
+from scene_kinds import scene_of_kind
 from tiny_people import NET, people
+from view_sessions import looking_at_balls, opened_at
 
 import dyngs
 from dyngs.core.errors import DyngsError
-from dyngs.view.source import first_of, is_network, open_network, open_source
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.runs.opened import Opened
+from dyngs.training.events import Event, StepDone
+from dyngs.training.trainer import Trainer
+from dyngs.view.controls import (
+    AS_CAPTURED,
+    AT_REST,
+    BY_SLIDERS,
+    MAIN_JOINTS,
+    in_motion,
+    motion_files,
+)
+from dyngs.view.session import Drawer, Session
+from dyngs.view.source import first_of, open_network, open_source
+from dyngs.view.training import DrawnBetweenSteps, opened_training
 
 
 def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
@@ -23,7 +48,6 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     assert first.name == "b/run"
     assert "left out" in first.notes[0]
     assert open_source(tmp_path / "b" / "run").names == ("run",)
-    assert not is_network(tmp_path / "b" / "run")
 
 
 def test_levels_are_for_still_scenes(tmp_path: Path) -> None:
@@ -51,17 +75,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"run.dir={root / 'net'}",
         "train.steps=1",
     ]
-    options += [
-        f"model.{name}={getattr(NET, name)}"
-        for name in ("resolution", "source_views", "target_views")
-    ]
-    options += ["model.source_sets=1", "model.widths=[8, 8]", "run.threads=1"]
+    options += [f"model.{name}={getattr(NET, name)}" for name in ("resolution", "source_views")]
+    options += ["run.threads=1"]
     dyngs.train(dyngs.load_config("human_predictor", options))
     return root
 
 
 def test_a_person_is_predicted_from_the_images_that_are_picked(folder: Path) -> None:
-    assert is_network(folder / "net")
     source = open_source(folder / "net")
     assert source.network is not None
     person = source.names[0]
@@ -76,3 +96,128 @@ def test_one_person_may_be_given(folder: Path) -> None:
     assert list(open_network(folder / "net", one).people) == [one.name]
     with pytest.raises(DyngsError, match="--capture goes with"):
         open_source(folder / "people", capture=one)
+
+
+@pytest.fixture
+def opened() -> Opened:
+    return opened_at(scene_of_kind("human"), "person")
+
+
+def test_sliders_at_zero_are_the_rest_pose(opened: Opened) -> None:
+    rest = in_motion(opened, AT_REST, {}, {"neck": (90.0, 0, 0)})  # sliders do not count
+    zero = in_motion(opened, BY_SLIDERS, {}, {"neck": (0.0, 0, 0)})
+    assert rest.scene.is_static
+    assert torch.allclose(rest.scene.at(None).means, zero.scene.at(None).means, atol=1e-6)
+    assert in_motion(opened, AS_CAPTURED, {}, {}) is opened
+
+
+def test_a_person_on_a_gpu_is_posed_there(opened: Opened) -> None:
+    angles = {"pelvis": (0.0, 90.0, 0.0)}
+    expected = in_motion(opened, BY_SLIDERS, {}, angles).scene.at(None).means
+    rest = in_motion(opened, AT_REST, {}, {}).scene.at(None).means
+    assert float((expected - rest).norm(dim=1).max()) > 1e-3
+    with pretend_gpu():
+        posed_there = in_motion(opened.to(GPU), BY_SLIDERS, {}, angles).scene.at(None).means
+        assert posed_there.device == GPU
+        found = posed_there.cpu()
+    assert torch.equal(found, expected)
+
+
+def test_motion_files_are_found_by_suffix(tmp_path: Path) -> None:
+    for name in ("walk.npz", "b/run.BVH", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert list(motion_files(tmp_path)) == ["b/run.BVH", "walk.npz"]
+    assert list(motion_files(tmp_path / "walk.npz")) == ["walk.npz"]
+    assert motion_files(None) == {}
+    with pytest.raises(DyngsError, match="no such file"):
+        motion_files(tmp_path / "nothing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DyngsError, match="no motion files"):
+        motion_files(tmp_path / "empty")
+
+
+def test_a_motion_that_cannot_be_read_is_one_line(opened: Opened, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match=r"--motion .*walk\.npz"):
+        in_motion(opened, "walk.npz", {"walk.npz": tmp_path / "walk.npz"}, {})
+
+
+def test_every_body_has_the_main_joints() -> None:
+    for rows in SMPLX_ROWS.values():
+        assert {JOINT_NAMES.index(name) for name in MAIN_JOINTS} <= set(rows)
+
+
+class Onlooker:
+    """A browser without a browser: it looks at the training from the second step on, and never
+    keeps still."""
+
+    def __init__(self) -> None:
+        self.drawer = Drawer(lambda session, message: pytest.fail(message))
+        # an image is due after each step, however fast the machine is
+        ticks = itertools.count(step=100.0)
+        self.clock = lambda: next(ticks)
+        self.drawn = DrawnBetweenSteps(self.drawer, fraction=0.9, clock=self.clock)
+        self.seen: list[bytes] = []
+
+    def __call__(self, event: Event) -> None:
+        match event:
+            case StepDone():
+                trainer = event.loop.trainer
+                assert isinstance(trainer, Trainer)
+                if event.step == 2:
+                    first = opened_training(trainer)
+                    session = Session(
+                        first, lambda sent: self.seen.append(sent.image.tobytes()), clock=self.clock
+                    )
+                    self.drawer.add(session)
+                for session in self.drawer.sessions:
+                    session.change(divide=event.step / 1000)
+                    if session.eye is None:
+                        other, _ = looking_at_balls()
+                        assert other.eye is not None
+                        session.move(other.eye)
+                self.drawn.after_step(trainer.model.scene)
+
+
+@pytest.mark.parametrize("preset", ["static", "dynamic"])
+def test_training_gives_the_same_bytes_whoever_looks(
+    preset: str, tmp_path: Path, still: Path, moving: Path
+) -> None:
+    onlooker = Onlooker()
+    found = []
+    for name, listeners in (("alone", []), ("seen", [onlooker])):
+        overrides = [
+            f"data.root={still if preset == 'static' else moving}",
+            f"run.dir={tmp_path / name}",
+        ]
+        overrides += ["train.steps=12", "init.num_random=40", "run.threads=1"]
+        overrides += ["model.choose=false"] if preset == "dynamic" else []
+        folder = dyngs.train(dyngs.load_config(preset, overrides), listeners=listeners)
+        found.append(checkpoint_paths(folder)[-1].read_bytes())
+    assert found[0] == found[1]
+    assert len(set(onlooker.seen)) > 2
+
+
+def test_images_take_no_more_than_their_share() -> None:
+    threads = threading.active_count()
+    now = [0.0]
+    drawer = Drawer(lambda session, message: None)
+    session, sent = looking_at_balls()
+    scene = session.opened.scene
+
+    def clock() -> float:
+        now[0] += 0.01  # whatever is done takes a while
+        return now[0]
+
+    drawn = DrawnBetweenSteps(drawer, fraction=0.25, clock=clock)
+    assert drawn.after_step(scene) == 0.0
+    assert now == [0.0]  # without browsers not even the clock is read
+    drawer.add(session)
+    spent = 0.0
+    for _ in range(300):
+        now[0] += 0.01  # a step
+        session.change(divide=now[0] % 1)
+        spent += drawn.after_step(scene)
+    assert sent
+    assert 0.05 < spent / now[0] < 0.3
+    assert threading.active_count() < threads + 20, "not one for each image"

@@ -22,8 +22,7 @@ from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
-from dyngs.runs.stored_file import decoded, encoded, write_scene
-from dyngs.runs.stored_tensors import drawable, step_below
+from dyngs.runs.stored_file import decoded, drawable, encoded, step_below, write_scene
 from dyngs.training.new_trainer import restored_model
 from dyngs.training.trainer import Trainer
 

@@ -20,7 +20,15 @@ from dyngs.gaussians.colour.training import ColourTraining
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.start import densifier_of, first_gaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import Mesh, Seen, colours_of, fused, opaque_box, seen_by, simplified
+from dyngs.gaussians.surface import (
+    DepthView,
+    Mesh,
+    colours_of,
+    fused,
+    opaque_box,
+    seen_by,
+    simplified,
+)
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
@@ -57,7 +65,7 @@ def first_surface(run: RunStart, steps: int, most: int) -> FirstSurface:
     return _coloured(mesh, seen, float((high - low).max()) / cells)
 
 
-def _coloured(mesh: Mesh, seen: list[Seen], size: float) -> FirstSurface:
+def _coloured(mesh: Mesh, seen: list[DepthView], size: float) -> FirstSurface:
     vertices = torch.from_numpy(mesh.vertices).float()
     faces = torch.from_numpy(mesh.faces)
     return FirstSurface(vertices[faces], colours_of(seen, vertices, 2 * size)[faces])
@@ -103,7 +111,7 @@ def _divisor(width: int, height: int) -> int:
 
 
 @torch.no_grad()
-def _views(run: RunStart, model: GaussianModel) -> list[Seen]:
+def _views(run: RunStart, model: GaussianModel) -> list[DepthView]:
     scene = replace(model.scene, options=model.options)
     found = []
     for index in evenly_spaced(len(run.images), VIEWS):

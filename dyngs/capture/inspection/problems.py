@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading, reason
+from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
@@ -18,15 +17,10 @@ from dyngs.data.geometry import (
     focus_point,
     fraction_in_front,
     inverse_rigid,
-    matrix_fault,
-    pose_fault,
     projected,
 )
-from dyngs.data.images.images import SUFFIXES, read_header, read_image, read_mask
+from dyngs.data.images.images import read_header, read_image, read_mask
 from dyngs.data.times import distinct_times, evenly_spaced
-from dyngs.io.containment import staying_within
-from dyngs.io.fields import read_json_object
-from dyngs.io.find import FileFinder
 
 MAX_LINES_PER_KIND = 5  # problems of one kind that are listed; the others are counted
 MAX_VIEWS = 300  # views, chosen at random, in which points are looked for
@@ -43,34 +37,22 @@ UNSEEN_SIDE = 200.0
 def before_training(capture: Capture) -> list[str]:
     """Return one line for everything about a capture that is likely to spoil a training; only some
     masks are read."""
-    masks = described_masks(capture)
+    masks, problems = masks_of(capture)
     line = [] if masks is None else [f"masks of {masks}"]
-    found = [
-        *capture.warnings,
-        *line,
-        *mask_problems(capture),
-        *time_problems(capture),
-        *scene_problems(capture),
-    ]
+    found = [*capture.warnings, *line, *problems, *time_problems(capture), *scene_problems(capture)]
     return list(dict.fromkeys([*found, *body_problems(capture)]))
 
 
 def time_problems(capture: Capture) -> list[str]:
     """Return the problems of times and of who saw them: a moving scene must be seen from several
     sides."""
-    views = all_views(capture.splits)
-    timed = [view for view in views if view.time is not None]
-    outside = [view for view in timed if not 0 <= (view.time or 0.0) <= 1]
-    problems = listed(f"'{view.name}': the time {view.time} is outside [0, 1]" for view in outside)
-    if timed and len(timed) < len(views):
-        problems.append(f"{len(views) - len(timed)} of {len(views)} views have no time")
     if _is_still_monocular(capture):
-        count = len(set(distinct_times(timed).values()))
-        problems.append(
+        count = len(set(distinct_times(all_views(capture.splits)).values()))
+        return [
             f"one camera that does not move saw all {count} times: a moving scene cannot be reconstructed in 3D from "
             "that; move the camera or use several"
-        )
-    return problems + _ill_posed(capture)
+        ]
+    return _ill_posed(capture)
 
 
 def body_problems(capture: Capture) -> list[str]:
@@ -82,11 +64,7 @@ def body_problems(capture: Capture) -> list[str]:
 
     body = about_pelvis(body, np.zeros(3) if body.pelvis is None else body.pelvis)
     rows = {frame: row for row, frame in enumerate(body.frames)}
-    seen = [
-        (rows[v.frame], v)
-        for v in capture.splits.get("train", ())
-        if v.frame in rows and pose_fault(v) is None
-    ]
+    seen = [(rows[v.frame], v) for v in capture.splits.get("train", ()) if v.frame in rows]
     if not seen:
         return []
     at = [row for row, _ in seen]
@@ -109,25 +87,15 @@ def body_problems(capture: Capture) -> list[str]:
 def scene_problems(capture: Capture) -> list[str]:
     """Return the problems of poses and points together: cameras that look away, points that no
     camera sees, .."""
-    views = [view for view in all_views(capture.splits) if pose_fault(view) is None]
-    if not views:
-        return []
+    views = all_views(capture.splits)
     problems = []
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    if (
-        len(poses) > 1
-        and spread < 1e-9
-        and capture.body is None
-        and not _is_still_monocular(capture)
-    ):
+    is_still = capture.body is not None or _is_still_monocular(capture)
+    if len(poses) > 1 and spread < 1e-9 and not is_still:
         problems.append("all cameras are at one place, so no depth can be found")
     xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
-    finite = np.isfinite(xyz).all(axis=1)
-    if not finite.all():
-        problems.append(f"{int((~finite).sum())} of {len(xyz)} points hold NaN or infinity")
-    xyz = xyz[finite]
     focus = np.median(xyz, axis=0) if len(xyz) else focus_point(poses)
     what = "the sparse points" if len(xyz) else "each other's scene"
     if focus is not None and fraction_in_front(poses, focus) < 0.5:
@@ -249,15 +217,6 @@ def problems_of(capture: Capture, deep: bool) -> list[str]:
         )
     if len(train) < 3:
         problems.append(f"only {len(train)} training views; a scene needs some 20 or more")
-    names = Counter(view.name for view in views)
-    images = Counter(view.image_path for view in views)
-    problems += listed(
-        f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1
-    )
-    problems += listed(
-        f"{path} is the image of {count} views" for path, count in images.items() if count > 1
-    )
-    problems += listed(fault for view in views if (fault := pose_fault(view)) is not None)
     poses = Counter(view.cam_from_world.round(9).tobytes() for view in views if view.time is None)
     same = sum(count for count in poses.values() if count > 1)
     if same:
@@ -267,22 +226,14 @@ def problems_of(capture: Capture, deep: bool) -> list[str]:
         for view in views
         if (fault := _fault_of_intrinsics(view)) is not None
     )
-    problems += [*_image_problems(capture, deep), *mask_problems(capture)]
+    problems += [*_image_problems(capture, deep), *masks_of(capture)[1]]
     return [*problems, *time_problems(capture), *scene_problems(capture), *body_problems(capture)]
 
 
 def _fault_of_intrinsics(view: View) -> str | None:
-    k = view.intrinsics
-    width = view.width
-    height = view.height
-    fx = k[0, 0]
-    fy = k[1, 1]
-    cx = k[0, 2]
-    cy = k[1, 2]
-    if not np.isfinite(k).all() or fx <= 0 or fy <= 0:
-        return f"the focal length ({fx:g}, {fy:g}) px is not a positive number"
-    if not (0 <= cx <= width and 0 <= cy <= height):
-        return f"the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} image"
+    width, height = view.width, view.height
+    fx, fy = np.diag(view.intrinsics)[:2]
+    cx, cy = view.intrinsics[:2, 2]
     if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > 0.2:
         return f"the principal point ({cx:g}, {cy:g}) is far from the middle of {width}x{height}"
     if not 0.9 < fx / fy < 1.1:
@@ -318,44 +269,6 @@ def _image_problems(capture: Capture, deep: bool) -> list[str]:
     return problems
 
 
-def transforms_file_problems(root: Path, known: str) -> list[str]:
-    """Return the problems of ``transforms*.json`` files that no reader accepts, but for those in
-    ``known``."""
-    problems = []
-    for file in sorted(root.glob("transforms*.json")) if root.is_dir() else []:
-        try:
-            with staying_within(root):
-                frames: Any = read_json_object(file).get("frames", [])
-            with reading(file):
-                entries = [
-                    (str(frame["file_path"]), np.array(frame["transform_matrix"], float))
-                    for frame in frames
-                ]
-                names = Counter(name for name, _ in entries)
-                images = FileFinder(root)
-                missing = [
-                    n
-                    for n in names
-                    if not any(images.find(n + suffix).is_file() for suffix in ("", *SUFFIXES))
-                ]
-        except DyngsError as error:
-            if str(file) not in known:
-                why = reason(error.__cause__ or error)
-                problems.append(
-                    f"{file}: holds no frames with 'file_path' and 'transform_matrix' ({why})"
-                )
-            continue
-        faults = (matrix_fault(pose, f"{file}: '{name}'") for name, pose in entries)
-        if not entries:
-            problems.append(f"{file} lists no frames")
-        problems += listed(f"{root / n}: no such image" for n in missing)
-        problems += listed(fault for fault in faults if fault is not None)
-        problems += listed(
-            f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1
-        )
-    return [line for line in problems if line not in known]
-
-
 def tallied(counter: Counter[Any]) -> str:
     """Return the most frequent keys with their counts."""
     return ", ".join(
@@ -369,51 +282,30 @@ LOOKED_AT = 4  # masks that are read
 MOST_IGNORED = 0.5
 
 
-def described_masks(capture: Capture) -> str | None:
-    """Return how many images have masks, which value counts, and how much a few masks ignore; None
-    without masks."""
+def masks_of(capture: Capture) -> tuple[str | None, list[str]]:
+    """Return a description of the masks of a capture, None without any, and a line if they ignore
+    most of the pixels.
+
+    A few masks are read; unreadable ones are reported by those who check files.
+    """
     views = all_views(capture.splits)
-    count = sum(view.mask_path is not None for view in views)
-    if not count:
-        return None
-    ignored = _ignored_fractions(capture)
-    share = (
-        f": {fmean(ignored.values()):.0%} of the pixels in {len(ignored)} that were read"
-        if ignored
-        else ""
-    )
-    return f"{count} of {len(views)} images; white counts, black is ignored{share}"
-
-
-def mask_problems(capture: Capture) -> list[str]:
-    """Return a line if masks ignore most of the pixels; a few masks are read, unreadable ones are
-    passed over."""
-    ignored = _ignored_fractions(capture)
-    if not ignored or fmean(ignored.values()) <= MOST_IGNORED:
-        return []
-    brightest = max(int(read_image(path)[..., :3].max()) for path in ignored)
+    paths = [view.mask_path for view in views if view.mask_path is not None]
+    if not paths:
+        return None, []
+    found = f"{len(paths)} of {len(views)} images; white counts, black is ignored"
+    sample = [paths[index] for index in evenly_spaced(len(paths), LOOKED_AT)]
+    try:
+        ignored = fmean(1 - float(read_mask(path).float().mean()) for path in sample)
+        brightest = max(int(read_image(path)[..., :3].max()) for path in sample)
+    except DyngsError:
+        return found, []
+    found += f": {ignored:.0%} of the pixels in {len(sample)} that were read"
+    if ignored <= MOST_IGNORED:
+        return found, []
     why = (
         f"they hold no value above {brightest}, but white is 255: are they labels?"
         if brightest < 128
         else "white counts and black is ignored: are they inverted?"
     )
-    fraction = fmean(ignored.values())
-    first = next(iter(ignored))
-    return [
-        f"masks ignore {fraction:.0%} of the pixels in {len(ignored)} that were looked at, first {first}; {why}"
-    ]
-
-
-def _ignored_fractions(capture: Capture) -> dict[Path, float]:
-    """Return which fraction of its pixels each of a few masks ignores; none if one of them is
-    unreadable."""
-    paths = [
-        view.mask_path
-        for view in all_views(capture.splits)
-        if view.mask_path and view.mask_path.is_file()
-    ]
-    looked_at = [paths[index] for index in evenly_spaced(len(paths), LOOKED_AT)]
-    try:
-        return {path: 1 - float(read_mask(path).float().mean()) for path in looked_at}
-    except DyngsError:  # those who check files report it
-        return {}
+    line = f"masks ignore {ignored:.0%} of the pixels in {len(sample)} that were looked at, first {sample[0]}; {why}"
+    return found, [line]

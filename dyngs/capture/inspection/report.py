@@ -5,24 +5,21 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dyngs.capture.first_points import checked_points
 from dyngs.capture.inspection.problems import (
-    described_masks,
     listed,
+    masks_of,
     problems_of,
     tallied,
-    transforms_file_problems,
 )
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, counted, printable, reading
 from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.geometry import camera_center, inverse_rigid, pose_fault
+from dyngs.data.geometry import camera_center, inverse_rigid
 from dyngs.data.images.lens import is_pinhole, kept_fraction
 from dyngs.data.times import distinct_times
 from dyngs.io.containment import images_up_to, leaving_links
@@ -63,7 +60,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("lens", tallied(lenses) + _kept(views)),
         *_exposures(views),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
-        ("masks", described_masks(capture) or "none"),
+        ("masks", masks_of(capture)[0] or "none"),
         *_prior_facts(capture),
         *_time_facts(capture),
         ("points", "none" if capture.points is None else f"{len(capture.points.xyz)}{file}"),
@@ -99,16 +96,12 @@ def _kept(views: Sequence[View]) -> str:
         100 * kept_fraction(view.lens, view.intrinsics, view.width, view.height)
         for view in distorted
     ]
-    ratios = [view.lens.focal_ratio for view in distorted]
-    if max(ratios) > 1:
-        how = f"to a pinhole with {_range([1 / ratio for ratio in ratios])} of the focal length"
-    else:
-        how = "with the same focal length"
-    more = (
-        " (data.undistort=wide keeps more)"
-        if max(ratios) == 1 and min(fractions) < MUCH_LOST
-        else ""
-    )
+    shorter = [1 / view.lens.focal_ratio for view in distorted]
+    how = "with the same focal length"
+    more = " (data.undistort=wide keeps more)" if min(fractions) < MUCH_LOST else ""
+    if min(shorter) < 1:
+        how = f"to a pinhole with {_range(shorter)} of the focal length"
+        more = ""
     return f"; undistorted {how}, which keeps {_range(fractions)} % of each image{more}"
 
 
@@ -119,15 +112,9 @@ def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
     if not known:
         return []
     factor = max(known) / min(known)
-    said = f"by EXIF tags of {len(known)} of {len(views)} images, "
-    if factor < SAME_LIGHT:
-        return [("exposure", f"{said}the same")]
-    return [
-        (
-            "exposure",
-            f"{said}up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters",
-        )
-    ]
+    light = f"up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters"
+    light = "the same" if factor < SAME_LIGHT else light
+    return [("exposure", f"by EXIF tags of {len(known)} of {len(views)} images, {light}")]
 
 
 def _prior_facts(capture: Capture) -> Iterator[tuple[str, str]]:
@@ -221,18 +208,13 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
         ):
             report = report_on(capture, deep)
     except DyngsError as error:
-        more = (*listed(links), *transforms_file_problems(options.root, str(error)))
-        return InspectReport(options.root, None, (), (str(error), *more))
+        return InspectReport(options.root, None, (), (str(error), *listed(links)))
     return replace(report, problems=(*listed(links), *report.problems))
 
 
 def report_on(capture: Capture, deep: bool = False) -> InspectReport:
     """Return the report on a capture that has been read; see ``inspect_capture``."""
-    checked, line = capture, None
-    with suppress(DyngsError):  # images that cannot be read, which is a problem of its own
-        checked, line = checked_points(capture, DataConfig(root=capture.root))
-    noise = [line] if line is not None and checked.points is None else []
-    problems = dict.fromkeys([*capture.warnings, *noise, *problems_of(checked, deep)])
+    problems = dict.fromkeys([*capture.warnings, *problems_of(capture, deep)])
     return InspectReport(capture.root, capture, facts_of(capture), tuple(problems))
 
 
@@ -263,15 +245,14 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     orthographic.
 
     Frusta of training cameras are orange, of validation green, of test and new poses blue; points
-    have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras, and
-    views without a rigid pose, are left out.
+    have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras are
+    left out.
     """
+    from PIL import Image, ImageDraw, ImageFont
+
     Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
-    usable = [(split, view) for split, view in views if pose_fault(view) is None]
-    if not usable:
-        raise DyngsError(f"cannot draw the cameras of {capture.root}: no view has a usable pose")
-    poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in usable])
+    poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in views])
     axes = _drawing_axes(poses)
     xyz, rgb = _near_points(capture, poses[:, :3, 3])
     core = np.quantile(xyz @ axes.T, [0.03, 0.97], axis=0) if len(xyz) else xyz
@@ -281,59 +262,31 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     extent = max(float((high - low).max()) * 1.2, 1e-6)
     depth = extent * min(0.08, 0.4 / len(poses) ** 0.5)
     panels = []
-    for title, horizontal, vertical in (("from above", 0, 1), ("from the side", 0, 2)):
-        shown = [horizontal, vertical]
+    for title, shown in (("from above", [0, 1]), ("from the side", [0, 2])):
+        image = Image.new("RGB", (2 * size, 2 * size), BACKGROUND)  # at twice its size
+        draw = ImageDraw.Draw(image)
         middle = 0.5 * (low + high)[shown]
-        panel = _Panel(size, axes[shown], middle, extent)
-        panel.draw_points(xyz, rgb)
-        for (split, view), pose in zip(usable, poses, strict=True):
-            panel.draw_frustum(view, pose, depth, SPLIT_COLORS[split])
-        panels.append(panel.finished(title))
+
+        def places(points: np.ndarray, at: list[int] = shown, middle: np.ndarray = middle) -> list:
+            """Return columns and rows of world points (P, 3); they may lie outside the panel."""
+            flat = np.clip((points @ axes[at].T - middle) / extent + 0.5, -10.0, 10.0)
+            return ((flat * (1, -1) + (0, 1)) * (2 * size - 1)).tolist()
+
+        for (x, y), colour in zip(places(xyz), np.maximum(rgb, 60).tolist(), strict=True):
+            draw.rectangle((x, y, x + 1, y + 1), fill=tuple(colour))
+        for (split, view), pose in zip(views, poses, strict=True):
+            corners = np.array(
+                [[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]]
+            )
+            rays = np.c_[corners, np.ones(4)] @ np.linalg.inv(view.intrinsics).T
+            rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
+            frustum = np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3]
+            tips = [tuple(place) for place in places(frustum)]
+            line = [tips[i] for i in (0, 1, 2, 3, 4, 1, 2, 0, 3, 4, 0)]
+            draw.line(line, fill=SPLIT_COLORS[split], width=2)
+        draw.text((16, 12), title, fill=(204, 204, 204), font=ImageFont.load_default(28))
+        panels.append(np.asarray(image.resize((size, size))))
     write_image(out, np.concatenate(panels, axis=1))
-
-
-class _Panel:
-    """One square of the plot, drawn at twice its size: ``extent`` units around ``center`` (2,),
-    axes (2, 3)."""
-
-    def __init__(self, size: int, axes: np.ndarray, center: np.ndarray, extent: float) -> None:
-        from PIL import Image, ImageDraw
-
-        self._size, self._axes, self._center, self._extent = size, axes, center, extent
-        self._image = Image.new("RGB", (2 * size, 2 * size), BACKGROUND)
-        self._draw = ImageDraw.Draw(self._image)
-
-    def draw_points(self, xyz: np.ndarray, rgb: np.ndarray) -> None:
-        for (x, y), colour in zip(self._places(xyz), np.maximum(rgb, 60).tolist(), strict=True):
-            self._draw.rectangle((x, y, x + 1, y + 1), fill=tuple(colour))
-
-    def draw_frustum(
-        self, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]
-    ) -> None:
-        """Draw lines from the camera's centre to the corners of its image, and the image's border,
-        ``depth`` away."""
-        corners = np.array(
-            [[0, 0, 1], [view.width, 0, 1], [view.width, view.height, 1], [0, view.height, 1]],
-            float,
-        )
-        rays = corners @ np.linalg.inv(view.intrinsics).T
-        rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
-        tips = self._places(np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3])
-        self._draw.line([tips[i] for i in (0, 1, 2, 0, 3, 4, 0)], fill=color, width=2)
-        self._draw.line([tips[i] for i in (2, 3)], fill=color, width=2)
-        self._draw.line([tips[i] for i in (4, 1)], fill=color, width=2)
-
-    def finished(self, title: str) -> np.ndarray:
-        """Return the (S, S, 3) uint8 panel with its title at the upper left."""
-        from PIL import ImageFont
-
-        self._draw.text((16, 12), title, fill=(204, 204, 204), font=ImageFont.load_default(28))
-        return np.asarray(self._image.resize((self._size, self._size)))
-
-    def _places(self, points: np.ndarray) -> list[tuple[float, float]]:
-        """Return columns and rows of world points (P, 3); they may lie outside the panel."""
-        flat = np.clip((points @ self._axes.T - self._center) / self._extent + 0.5, -10.0, 10.0)
-        return [(x, y) for x, y in ((flat * (1, -1) + (0, 1)) * (2 * self._size - 1)).tolist()]
 
 
 def _drawing_axes(poses: np.ndarray) -> np.ndarray:
@@ -353,13 +306,10 @@ def _near_points(capture: Capture, centers: np.ndarray) -> tuple[np.ndarray, np.
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     xyz = capture.points.xyz
     rgb = capture.points.rgb
-    finite = np.isfinite(xyz).all(axis=1)
-    xyz = xyz[finite]
-    rgb = rgb[finite]
     middle = centers.mean(axis=0)
     distance = np.linalg.norm(xyz - middle, axis=1)
     spread = np.linalg.norm(centers - middle, axis=1).max()
-    limit = max(4.0 * spread, float(np.median(distance)) if len(distance) else 0.0)
+    limit = max(4.0 * spread, float(np.median(distance)))
     near = np.flatnonzero(distance <= limit)
     near = near[:: max(len(near) // 20_000, 1)]
     return xyz[near], rgb[near]

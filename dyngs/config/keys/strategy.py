@@ -154,7 +154,3 @@ class OptimConfig(Section):
     )
     lr_scales: Positive = Field(default=5e-3, description="learning rate of log-scales")
     lr_quats: Positive = Field(default=1e-3, description="learning rate of rotations (quaternions)")
-    sparse: bool = Field(
-        default=False,
-        description="update only Gaussians that received a gradient in the step; faster, not the same",
-    )

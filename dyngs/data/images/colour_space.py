@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from dyngs.core.conventions import srgb_decoded
+from dyngs.core.conventions import srgb_decoded, srgb_encoded
 
 UNSPECIFIED = 2
 BT2020, _DISPLAY_P3 = 9, 12
@@ -83,15 +83,6 @@ def to_srgb(pixels: np.ndarray, tags: ColourTags, white: int = _LEVELS) -> np.nd
         linear = _linear_table(tags.transfer, white).take(pixels[rows]) @ matrix
         _srgb_table().take(linear.astype(np.int32), out=encoded[rows], mode="clip")
     return encoded
-
-
-def srgb_encoded(linear: np.ndarray) -> np.ndarray:
-    """Return the sRGB signal of linear light in [0, 1]."""
-    return np.where(
-        linear <= 0.0031308,
-        12.92 * linear,
-        1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
-    )
 
 
 @lru_cache

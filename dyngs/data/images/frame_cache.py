@@ -14,7 +14,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -26,20 +26,18 @@ from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.video import DECODER_VERSION, VideoInfo, probe_video, read_numbered_frames
 from dyngs.io.containment import inside
-from dyngs.io.limits import read_limited
-from dyngs.io.temporary import CACHE_VARIABLE, cache_folder
-from dyngs.io.write import atomic_file, image_error, write_text
+from dyngs.io.fields import read_limited
+from dyngs.io.write import CACHE_VARIABLE, atomic_file, cache_folder, image_error, write_text
 
 try:
     import fcntl
-except ImportError:  # Windows, where a folder with an open file in it cannot be renamed
+except ImportError:  # Windows, where an open file cannot be removed
     fcntl = None
 
-WHOLE_BYTES = 2**30  # larger videos are compared by samples and modification time only
+WHOLE_BYTES = 2**30  # larger videos are compared by their beginning and modification time only
 _MARK_NAME = "video.json"
 _MARK = "frames that dyngs decoded from a video; the folder may be removed"
-_NUM_SAMPLES = 256
-_SAMPLE_BYTES = 2**20
+_BLOCK_BYTES = 2**20
 _OUR_FILES = re.compile(r"\.?(frame_\d{6,}|video)(\.\d+-[0-9a-f]{6}\.dyngs)?\.(png|json)")
 _MAX_LOCKED = 256
 _locked: dict[Path, BinaryIO] = {}
@@ -98,15 +96,15 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
     need = sum(map(len, missing.values()))
     count = 0
     written = 0
-    space = _DiskSpace(root, frozenset(videos), limit_mb)
     for folder, numbers in missing.items():
         _make(folder, videos[folder])
         for number, rgb in read_numbered_frames(videos[folder], numbers):
             path = folder / f"frame_{number:06d}.png"
             _write_png(path, rgb)
-            count = count + 1
-            written = written + path.stat().st_size
-            space.check(written, written * need / count)
+            count += 1
+            written += path.stat().st_size
+            if count & (count - 1) == 0:  # 1, 2, 4, 8, ...
+                _make_room(root, videos.keys(), written * (need - count) / count, limit_mb)
 
 
 def _make(folder: Path, video: Path) -> None:
@@ -144,21 +142,15 @@ def _write_png(path: Path, rgb: np.ndarray) -> None:
 
 @lru_cache(maxsize=4096)
 def _digest(video: Path, size: int, changed_ns: int) -> bytes:
-    """SHA-256 of size and bytes; for huge files of size, samples and modification time.
-
-    The time is included because a copy that was cut off and then completed may agree in all
-    samples.
-    """
+    """SHA-256 of size and bytes; for huge files of size, modification time and the beginning."""
     digest = hashlib.sha256(str(size).encode())
+    if size > WHOLE_BYTES:
+        digest.update(str(changed_ns).encode())
     with video.open("rb") as file:
-        if size <= WHOLE_BYTES:
-            while block := file.read(_SAMPLE_BYTES):
-                digest.update(block)
-        else:
-            digest.update(str(changed_ns).encode())
-            for sample in range(_NUM_SAMPLES):
-                file.seek(sample * max(size - _SAMPLE_BYTES, 0) // (_NUM_SAMPLES - 1))
-                digest.update(file.read(_SAMPLE_BYTES))
+        while block := file.read(_BLOCK_BYTES):
+            digest.update(block)
+            if size > WHOLE_BYTES:
+                break
     return digest.digest()
 
 
@@ -196,53 +188,40 @@ def _lock(folder: Path) -> None:
         pass
 
 
-class _DiskSpace:
-    """Disk space for the frames of one capture; frames of others are removed as needed."""
+def _make_room(root: Path, kept: Collection[Path], more: float, limit_mb: float) -> None:
+    """Free space for ``more`` bytes in the folders ``kept``: the least recently used frames of
+    other captures are removed.
 
-    def __init__(self, root: Path, kept: frozenset[Path], limit_mb: float) -> None:
-        self._root, self._kept, self._limit_mb = root, kept, limit_mb
-        self._used = sum(map(_num_bytes, kept))
-        self._elsewhere = sum(_num_bytes(folder) for folder in _our_folders() if folder not in kept)
-
-    def check(self, now: int, end: float) -> None:
-        """Free space for ``end`` bytes, of which ``now`` are written already.
-
-        Raises DyngsError: it is more than the limit, or than other processes or the disk leave.
-        """
-        total = self._used + end
-        limit = self._limit_mb * 1e6
-        cache = cache_folder("frames")
-        if total > limit:
-            others = f", of which {self._used / 1e6:.4g} MB are there already" if self._used else ""
-            raise DyngsError(
-                f"{self._root}: the frames of its videos need about {total / 1e6:.4g} MB on disk{others}, but "
-                f"data.frame_cache_mb is {self._limit_mb:g}; raise it, or choose fewer with data.frames=start:stop:step"
-            )
-        if self._elsewhere + total > limit:
-            self._elsewhere -= _removed(self._kept, self._elsewhere + total - limit)
-        if self._elsewhere + total > limit:
-            raise DyngsError(
-                f"{cache}: the frames of other videos, which are in use, take {self._elsewhere / 1e6:.4g} MB, and "
-                f"those of {self._root} need about {total / 1e6:.4g} MB, but data.frame_cache_mb is "
-                f"{self._limit_mb:g}; raise it, or wait until the others are done"
-            )
-        free = shutil.disk_usage(cache).free
-        if end - now > free:
-            raise DyngsError(
-                f"{cache}: the frames of the videos need about {(end - now) / 1e6:.4g} MB more, but the disk has only "
-                f"{free / 1e6:.4g} MB left; free some, set {CACHE_VARIABLE} to a folder on another disk, or choose "
-                "fewer with data.frames=start:stop:step"
-            )
-
-
-def _removed(kept: frozenset[Path], too_much: float) -> int:
-    """Remove the least recently used frames, except in ``kept``, until ``too_much`` bytes are
-    freed; return these."""
-    gone = 0
-    others = [folder for folder in _our_folders() if folder not in kept and folder not in _locked]
+    Raises DyngsError: it is more than the limit, or than other processes or the disk leave.
+    """
+    cache = cache_folder("frames")
+    limit = limit_mb * 1e6
+    there = sum(map(_num_bytes, kept))
+    total = there + more
+    if total > limit:
+        raise DyngsError(
+            f"{root}: the frames of its videos need about {total / 1e6:.4g} MB on disk, of which {there / 1e6:.4g} MB "
+            f"are there, but data.frame_cache_mb is {limit_mb:g}; raise it, or choose fewer with "
+            "data.frames=start:stop:step"
+        )
+    others = [folder for folder in _our_folders() if folder not in kept]
+    elsewhere = sum(map(_num_bytes, others))
     for folder in sorted(others, key=lambda folder: (folder / _MARK_NAME).stat().st_mtime_ns):
-        gone += _remove(folder) if gone < too_much else 0
-    return gone
+        if elsewhere + total > limit and folder not in _locked:
+            elsewhere -= _remove(folder)
+    if elsewhere + total > limit:
+        raise DyngsError(
+            f"{cache}: the frames of other videos, which are in use, take {elsewhere / 1e6:.4g} MB, and those of "
+            f"{root} need about {total / 1e6:.4g} MB, but data.frame_cache_mb is {limit_mb:g}; raise it, or wait until "
+            "the others are done"
+        )
+    free = shutil.disk_usage(cache).free
+    if more > free:
+        raise DyngsError(
+            f"{cache}: the frames of the videos need about {more / 1e6:.4g} MB more, but the disk has only "
+            f"{free / 1e6:.4g} MB left; free some, set {CACHE_VARIABLE} to a folder on another disk, or choose fewer "
+            "with data.frames=start:stop:step"
+        )
 
 
 def _our_folders() -> list[Path]:
@@ -255,17 +234,13 @@ def _remove(folder: Path) -> int:
     freed."""
     freed = 0
     try:
-        if fcntl is None:
-            folder = folder.rename(folder.with_name(f"{folder.name}.{os.getpid()}"))
         with (folder / _MARK_NAME).open("rb") as mark:
             if fcntl is not None:
                 fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            for path in _own_files(folder):
-                if path.name != _MARK_NAME:
-                    size = path.stat().st_size
-                    path.unlink()
-                    freed += size
-        (folder / _MARK_NAME).unlink()
+            for path in sorted(_own_files(folder), key=lambda path: path.name == _MARK_NAME):
+                size = path.stat().st_size
+                path.unlink()
+                freed += size
         folder.rmdir()
     except OSError:
         pass  # another process reads these frames, or somebody else's files are there, too

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.core.conventions import srgb_encoded
 from dyngs.core.errors import DyngsError, reading
-from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.images.exr_layers import Layer, beauty_pass, layers_of
 from dyngs.io.containment import check_size, inside, max_decoded_mb
 from dyngs.io.fields import first_few

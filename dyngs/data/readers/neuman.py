@@ -16,8 +16,7 @@ from dyngs.data.geometry import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
 from dyngs.data.readers.transforms import SPLITS
 from dyngs.io.containment import inside
-from dyngs.io.fields import entry, first_few, numbers_of
-from dyngs.io.limits import read_limited
+from dyngs.io.fields import entry, first_few, numbers_of, read_limited
 from dyngs.io.numpy_files import read_npz
 from dyngs.io.pickles import read_pickle, read_pickled_array
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dyngs.data.images.colour_space import srgb_encoded
+from dyngs.core.conventions import srgb_encoded
 
 CAMERA_ANGLE_X = 0.6911112070083618
 """Horizontal field of view of the NeRF-synthetic scenes, radians."""

@@ -35,7 +35,7 @@ SOLID = 0.6  # Opacity from which it hides what lies behind
 
 
 @dataclass(frozen=True)
-class Shots:
+class FrameStack:
     """T images of distinct times, in order, the static model's in the same places, and pinhole
     cameras."""
 
@@ -146,13 +146,13 @@ def one_camera(views: Sequence[View]) -> list[int] | None:
 
 
 @torch.no_grad()
-def shots_of(
+def frame_stack_of(
     images: Iterable[Image],
     still: Gaussians,
     options: RenderOptions,
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
-) -> Shots:
+) -> FrameStack:
     """Return ``images``, in order of time, with what ``still`` shows, at most ``LONGEST_SIDE``
     pixels wide or high.
 
@@ -187,7 +187,7 @@ def shots_of(
         for name, x in (shown | camera).items():
             parts.setdefault(name, []).append(x.cpu().numpy())
         parts.setdefault("times", []).append(np.array(small.time or 0.0))
-    return Shots(**{name: np.stack(x) for name, x in parts.items()})
+    return FrameStack(**{name: np.stack(x) for name, x in parts.items()})
 
 
 # Radii of discs: number, least in pixels, greatest in image widths
@@ -286,7 +286,7 @@ class Discs:
         return np.stack([x[best] + 0.5, y[best] + 0.5, self.radii[k[best]]], axis=1)
 
 
-def found_paths(shots: Shots, maps: np.ndarray) -> list[Path]:
+def found_paths(shots: FrameStack, maps: np.ndarray) -> list[Path]:
     """Return paths that things may move along where ``maps`` (T, H, W) are marked, the most likely
     first.
 
@@ -308,14 +308,16 @@ def found_paths(shots: Shots, maps: np.ndarray) -> list[Path]:
     return found
 
 
-def clear_(maps: np.ndarray, shots: Shots, path: Path) -> None:
+def clear_(maps: np.ndarray, shots: FrameStack, path: Path) -> None:
     """Set ``maps`` (T, H, W) to 0 where the thing on ``path`` is seen, and a little around it."""
     for i, center in enumerate(path.centers):
         rows, columns, _ = shots.on_ball(i, center, 1.2 * path.radius, 1.0)
         maps[i, rows, columns] = 0
 
 
-def _colors(shots: Shots, which: np.ndarray, centers: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def _colors(
+    shots: FrameStack, which: np.ndarray, centers: np.ndarray, radius: np.ndarray
+) -> np.ndarray:
     """Return the (n, 3) mean colours in the middle of balls with ``centers`` (n, 3) in the images
     ``which`` (n,)."""
     height, width = shots.size
@@ -327,7 +329,7 @@ def _colors(shots: Shots, which: np.ndarray, centers: np.ndarray, radius: np.nda
     return shots.images[which[:, None], y, x].mean(1)
 
 
-def _unsteadiness(shots: Shots, discs: Discs, path: Path) -> float:
+def _unsteadiness(shots: FrameStack, discs: Discs, path: Path) -> float:
     """Return the standard deviation of a path's colours over time: that of what goes on as another
     thing is large."""
     which = np.nonzero(_contrast(shots, discs, path.centers, path.radius) > LEAST_PEAK)[0]
@@ -337,7 +339,7 @@ def _unsteadiness(shots: Shots, discs: Discs, path: Path) -> float:
     return float(np.linalg.norm(colors.std(axis=0)))
 
 
-def _contrast(shots: Shots, discs: Discs, centers: np.ndarray, radius: float) -> np.ndarray:
+def _contrast(shots: FrameStack, discs: Discs, centers: np.ndarray, radius: float) -> np.ndarray:
     which = np.arange(len(shots))
     pixels, depths = shots.projected(which, centers)
     return discs.at(which, pixels, radius * shots.focal / depths)
@@ -365,7 +367,7 @@ class Start:
     last: int
 
 
-def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) -> list[Pieces]:
+def _straight_pieces(shots: FrameStack, discs: Discs, random: np.random.Generator) -> list[Pieces]:
     """Return straight paths through the most marked discs, around every other image."""
     peaks = [discs.peaks(i) for i in range(len(shots))]
     found = []
@@ -482,7 +484,7 @@ def _parting(first: Pieces, later: Pieces) -> np.ndarray:
 
 
 def _through(
-    shots: Shots, which: np.ndarray, middle: int, picked: np.ndarray
+    shots: FrameStack, which: np.ndarray, middle: int, picked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return centres (n, 3), steps (n, 3) and radii (n,) of paths through three discs each, where
     these agree."""
@@ -514,7 +516,7 @@ def _through(
     return centers[agree], steps[agree], radii[agree]
 
 
-def _followed(shots: Shots, discs: Discs, start: Start) -> Path:
+def _followed(shots: FrameStack, discs: Discs, start: Start) -> Path:
     """Return the smooth path through all images of the ball that begins as ``start`` says.
 
     Followed outwards from there image by image, then looked for in all images at once.
@@ -548,7 +550,12 @@ def _followed(shots: Shots, discs: Discs, start: Start) -> Path:
 
 
 def _sighted(
-    shots: Shots, discs: Discs, which: np.ndarray, centers: np.ndarray, radius: float, reach: float
+    shots: FrameStack,
+    discs: Discs,
+    which: np.ndarray,
+    centers: np.ndarray,
+    radius: float,
+    reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return in ``which`` (n,) images (n, 3) directions and (n,) weights of discs up to ``reach``
     radii from balls."""
@@ -564,7 +571,7 @@ def _sighted(
     return ways, np.maximum(np.take_along_axis(values, best, 1)[:, 0], 0.0) ** 2
 
 
-def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray, radius: float) -> np.ndarray:
+def _smooth(shots: FrameStack, ways: np.ndarray, weights: np.ndarray, radius: float) -> np.ndarray:
     """Return the (T, 3) places nearest to the rays along ``ways``, with small second differences
     but at kinks.
 

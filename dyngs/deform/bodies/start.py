@@ -23,7 +23,7 @@ import torch
 
 from dyngs.core.conventions import SH_C0
 from dyngs.deform.bodies.field import BodyField, BodyRest
-from dyngs.deform.bodies.paths import Path, Shots, clear_, found_paths
+from dyngs.deform.bodies.paths import FrameStack, Path, clear_, found_paths
 from dyngs.deform.control_nodes import spline_basis
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField
 from dyngs.gaussians import Gaussians
@@ -57,7 +57,7 @@ Frames = Sequence[Frame]
 
 
 @dataclass(frozen=True)
-class Turning:
+class BodyRotation:
     """Rotations of a body along its path, and mean squared differences of its colours in other
     images, cell by cell."""
 
@@ -69,7 +69,7 @@ class Turning:
     counts: np.ndarray  # (C,) pixels that fell on it
 
 
-def found_turning(shots: Shots, path: Path) -> Turning:
+def estimate_rotation(shots: FrameStack, path: Path) -> BodyRotation:
     """Return how the body on ``path`` turns."""
     frames = without_light([_frame(shots, path, t) for t in range(len(shots))])
     starts = _windows(frames, _basis(shots.times, path))
@@ -83,10 +83,10 @@ def found_turning(shots: Shots, path: Path) -> Turning:
     moved, stood = disagreements(frames, np.stack([rotations, still]))
     every = np.concatenate([colors for _, colors in frames])
     by_chance = 2 * float(every.var(axis=0).sum()) if len(every) else 0.0
-    return Turning(rotations, float(moved), float(stood), by_chance, _means(seen).T, seen[3])
+    return BodyRotation(rotations, float(moved), float(stood), by_chance, _means(seen).T, seen[3])
 
 
-def _frame(shots: Shots, path: Path, index: int) -> Frame:
+def _frame(shots: FrameStack, path: Path, index: int) -> Frame:
     rows, columns, normals = shots.on_ball(index, path.centers[index], path.radius)
     step = max(len(rows) // MOST_PIXELS, 1)
     return normals[::step], shots.images[index, rows[::step], columns[::step]]
@@ -403,19 +403,19 @@ STIFFNESS = 0.1
 
 
 @dataclass(frozen=True)
-class Body:
+class RigidBody:
     """A thing that moves rigidly over the times of T images."""
 
     path: Path
-    turning: Turning
+    turning: BodyRotation
 
 
 @dataclass(frozen=True)
 class Bodies:
     """Bodies that were found, and how they were seen."""
 
-    shots: Shots
-    bodies: tuple[Body, ...]
+    shots: FrameStack
+    bodies: tuple[RigidBody, ...]
     seeds: tuple[Gaussians, ...]  # of each, where it is in the middle of the clip
 
     @property
@@ -470,7 +470,7 @@ class Bodies:
         return BodyField(others, rest, points | {"albedo": albedo, "sun": up})
 
 
-def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
+def found_bodies(shots: FrameStack, limit: int, num_terms: int) -> Bodies | None:
     """Return what moves rigidly, with at most ``limit`` Gaussians of ``num_terms`` harmonics; None
     where nothing does.
 
@@ -488,7 +488,7 @@ def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
     )
 
 
-def _rigid_bodies(shots: Shots) -> tuple[Body, ...]:
+def _rigid_bodies(shots: FrameStack) -> tuple[RigidBody, ...]:
     """Return what moves rigidly; each is taken out before the next is sought, and what hides others
     where none is."""
     maps = shots.differences()
@@ -500,7 +500,7 @@ def _rigid_bodies(shots: Shots) -> tuple[Body, ...]:
             break
         fresh = [path for path in paths if not any(path.is_like(other) for other in refused)]
         for path in fresh[: MOST_REFUSED - len(refused)]:
-            body = Body(path, found_turning(shots, path))
+            body = RigidBody(path, estimate_rotation(shots, path))
             if _is_rigid(body.turning):
                 bodies.append(body)
                 clear_(maps, shots, path)
@@ -511,12 +511,12 @@ def _rigid_bodies(shots: Shots) -> tuple[Body, ...]:
     return tuple(bodies)
 
 
-def _is_rigid(turning: Turning) -> bool:
+def _is_rigid(turning: BodyRotation) -> bool:
     least = min(AGREES * turning.standing, BY_CHANCE * turning.by_chance)
     return turning.by_chance >= LEAST_MARKS and turning.disagreement < least
 
 
-def _seeds(body: Body, shots: Shots, limit: int, num_terms: int) -> Gaussians:
+def _seeds(body: RigidBody, shots: FrameStack, limit: int, num_terms: int) -> Gaussians:
     middle = len(shots) // 2
     random = np.random.default_rng(0)
     radius = body.path.radius
@@ -529,16 +529,10 @@ def _seeds(body: Body, shots: Shots, limit: int, num_terms: int) -> Gaussians:
     usual = body.turning.colors[body.turning.counts > 0].mean(0)
     place = cells(ways, FINE)
     colors = np.where(body.turning.counts[place, None] > 0, body.turning.colors[place], usual)
-    sh = torch.zeros(count, num_terms, 3, device="cpu")
-    sh[:, 0] = torch.from_numpy((colors - 0.5) / SH_C0).float()
+    base = torch.from_numpy((colors - 0.5) / SH_C0).float()
     spacing = radius * math.sqrt(4 * math.pi / count)
-    return Gaussians(
-        means=torch.from_numpy(body.path.centers[middle] + away * ways).float(),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
-        log_scales=torch.full((count, 3), math.log(SCALE * spacing), device="cpu"),
-        logit_opacities=torch.full((count,), LOGIT, device="cpu"),
-        sh=sh,
-    )
+    means = torch.from_numpy(body.path.centers[middle] + away * ways).float()
+    return Gaussians.isotropic(means, math.log(SCALE * spacing), LOGIT, base, num_terms)
 
 
 def _quats(rotations: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ COVERED = 0.1  # Opacity from which they cover a pixel
 
 
 @dataclass(frozen=True)
-class Moment:
+class TimedGaussians:
     """Gaussians that are there at one time."""
 
     time: float
@@ -42,7 +42,7 @@ class Moment:
 
 def moments_of(
     track: Track, footage: Sequence[Footage], thinned: float, num_terms: int
-) -> list[Moment]:
+) -> list[TimedGaussians]:
     """Return Gaussians on the surface of what ``track`` follows, one for ``thinned`` of its cubes,
     for each time.
 
@@ -53,7 +53,7 @@ def moments_of(
     """
     usual = surface(track)
     pace = np.gradient(track.centers, np.array(track.times), axis=0)
-    found: list[Moment] = []
+    found: list[TimedGaussians] = []
     for time, blob, velocity in zip(track.times, track.blobs, pace, strict=True):
         here = Track((time,), (blob,))
         points, side = usual if track.travels else surface(here)
@@ -61,7 +61,7 @@ def moments_of(
         if pays(dense, time, footage):
             gaussians = _thinned(dense, max(round(len(points) / thinned), 1))
             found.append(
-                Moment(time, gaussians, torch.from_numpy(velocity * track.travels).float())
+                TimedGaussians(time, gaussians, torch.from_numpy(velocity * track.travels).float())
             )
     return found
 
@@ -122,16 +122,9 @@ def surface(track: Track) -> tuple[np.ndarray, float]:
 def _on_surface(
     points: np.ndarray, side: float, here: Track, footage: Sequence[Footage], num_terms: int
 ) -> Gaussians:
-    count = len(points)
-    sh = torch.zeros(len(points), num_terms, 3, device="cpu")
-    sh[:, 0] = torch.from_numpy((_colors(points, here, footage) - 0.5) / SH_C0).float()
-    return Gaussians(
-        means=torch.from_numpy(points + here.centers[0]).float(),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
-        log_scales=torch.full((count, 3), math.log(SCALE * side), device="cpu"),
-        logit_opacities=torch.full((count,), LOGIT, device="cpu"),
-        sh=sh,
-    )
+    base = torch.from_numpy((_colors(points, here, footage) - 0.5) / SH_C0).float()
+    means = torch.from_numpy(points + here.centers[0]).float()
+    return Gaussians.isotropic(means, math.log(SCALE * side), LOGIT, base, num_terms)
 
 
 def _colors(points: np.ndarray, track: Track, footage: Sequence[Footage]) -> np.ndarray:
@@ -160,7 +153,7 @@ LIFT = 0.5  # Distance of a copy before its original, in longest standard deviat
 
 def surface_changes(
     footage: Sequence[Footage], still: Gaussians, options: RenderOptions, limit: int
-) -> list[Moment]:
+) -> list[TimedGaussians]:
     """Return copies of ``still`` Gaussians at the times at which most cameras see another colour
     there, in this colour.
 
@@ -191,12 +184,12 @@ def surface_changes(
         found.append((time, rows, usual[rows]))
     sizes = torch.cat([usual.abs().amax(1) for _, _, usual in found]).sort(descending=True).values
     least = float(sizes[limit]) if len(sizes) > limit else 0.0
-    moments: list[Moment] = []
+    moments: list[TimedGaussians] = []
     for time, rows, usual in found:
         kept = usual.abs().amax(1) > least
         if bool(kept.any()):
             copies = _recoloured(still.select(rows[kept]), usual[kept], towards)
-            moments.append(Moment(time, copies, still.means.new_zeros(3)))
+            moments.append(TimedGaussians(time, copies, still.means.new_zeros(3)))
     return moments
 
 
@@ -235,7 +228,7 @@ ROOM = 0.25  # Room around the things that stand still and the cameras, in sides
 class FirstMotion:
     """What changes, as Gaussians at single times."""
 
-    moments: tuple[Moment, ...] = ()
+    moments: tuple[TimedGaussians, ...] = ()
     finding: str | None = None
 
 

@@ -16,8 +16,8 @@ from dyngs.core.errors import DyngsError, printable, reading, require_regular
 from dyngs.data.times import evenly_spaced
 from dyngs.export.edit.frame import Point, number, point
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.similarity import Similarity
-from dyngs.io.limits import require_at_most
 
 _TIMES = 24
 _AT_ONCE = 1_000_000  # pairs of a point and a triangle

@@ -4,30 +4,24 @@ control points."""
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, printable, require_regular
+from dyngs.core.errors import DyngsError, printable
+from dyngs.data.capture import all_views
 from dyngs.data.scene_space import MAX_DISTANCE
+from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, Similarity, turn_between, turn_of
 from dyngs.io.formats.splat_file import geo_comment
-from dyngs.io.limits import require_at_most
+from dyngs.runs.opened import Opened
 
 _FACTORS = (1e-9, 1e9)
 _MOST_BYTES = 1 << 20  # of a file of control points
 Point = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Distance:
-    """Two points (3,) of the scene, and how long their distance is to be."""
-
-    start: Point
-    end: Point
-    length: float
 
 
 @dataclass(frozen=True)
@@ -37,42 +31,26 @@ class Frame:
     Attributes:
         up: direction (3,) of the scene that is up; "auto": by the cameras of its run.
         origin: point (3,) of the scene that becomes the origin.
-        scale: factor, or a distance that is known.
+        scale: factor.
     """
 
     up: Point | str | None = None
     origin: Point | None = None
-    scale: float | Distance | None = None
+    scale: float = 1.0
 
     def similarity(self, up: Sequence[float] | None, wanted: Sequence[float]) -> Similarity:
         """Return the similarity that brings the direction ``up`` (3,) to ``wanted`` (3,), and does
         the rest.
 
-        Without ``up`` nothing is turned. Raises DyngsError: the scale is no positive factor of
-        modest size.
+        Without ``up`` nothing is turned.
         """
-        found = Similarity(scale=_factor(self.scale))
+        found = Similarity(scale=self.scale)
         if up is not None:
             found = found.after(Similarity(turn_between(tuple(up), tuple(wanted))))
         if self.origin is None:
             return found
         x, y, z = (-found.points(np.array(self.origin))).tolist()
         return replace(found, shift=(x, y, z))
-
-
-def _factor(scale: float | Distance | None) -> float:
-    if scale is None:
-        return 1.0
-    length = scale.length if isinstance(scale, Distance) else scale
-    now = math.dist(scale.start, scale.end) if isinstance(scale, Distance) else 1.0
-    if not now > 0:
-        raise DyngsError("--scale: the two points are one; give points that are apart")
-    if not _FACTORS[0] <= length / now <= _FACTORS[1]:
-        what = "a positive factor, or two points and their distance"
-        raise DyngsError(
-            f"--scale: {length / now:g} is no factor from {_FACTORS[0]:g} to {_FACTORS[1]:g}; give {what}"
-        )
-    return length / now
 
 
 def point(text: str, option: str) -> Point:
@@ -111,18 +89,22 @@ def direction(text: str) -> Point | str:
     return found
 
 
-def scale_of(text: str) -> float | Distance:
-    """Return what ``--scale`` names: a factor, or "x,y,z x,y,z LENGTH". Raises DyngsError:
-    neither."""
+def scale_of(text: str) -> float:
+    """Return the factor that ``--scale`` names: itself, or "x,y,z x,y,z LENGTH", two points of the
+    scene and what their distance is to be. Raises DyngsError."""
     words = text.split()
     if len(words) == 3:
-        start, end = (point(word, "--scale") for word in words[:2])
-        return Distance(start, end, number(words[2], "--scale"))
-    if len(words) != 1 or "," in text:
+        now = math.dist(point(words[0], "--scale"), point(words[1], "--scale"))
+        factor = number(words[2], "--scale") / now if now > 0 else math.nan
+    else:
+        factor = number(text, "--scale")
+    low, high = _FACTORS
+    if not low <= factor <= high:
+        what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
         raise DyngsError(
-            f"--scale: {printable(repr(text), 60)}: give a factor, or 'x,y,z x,y,z LENGTH'"
+            f"--scale: {printable(repr(text), 60)} is no factor from {low:g} to {high:g}; give {what}"
         )
-    return number(text, "--scale")
+    return factor
 
 
 _STRAIGHT = 1e-4  # second singular value of points, over the first, below which they lie on a line
@@ -217,23 +199,143 @@ def _control_points(path: Path) -> np.ndarray:
     names, # remarks."""
     if not path.exists():
         raise DyngsError(f"{path}: no such file; give rows of x,y,z,X,Y,Z")
-    require_regular(path)
-    require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of control points")
+    text = read_limited(path, _MOST_BYTES).decode("utf-8", "replace")
     rows: list[list[float]] = []
-    lines = enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
-    told = [(i, line) for i, line in lines if line.strip() and not line.lstrip().startswith("#")]
-    for index, (line_number, line) in enumerate(told):
-        words = line.replace(",", " ").replace(";", " ").split()
+    has_names = True
+    for line_number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
         try:
-            row = [float(word) for word in words]
+            row = [float(word) for word in re.split(r"[\s,;]+", line.strip())]
         except ValueError:
-            if index == 0:  # names of columns
-                continue
             row = []
+        if not row and has_names:
+            has_names = False
+            continue
+        has_names = False
         if len(row) != 6 or not np.isfinite(row).all():
-            shown = printable(repr(line), 60)
             raise DyngsError(
-                f"{path}: line {line_number} is {shown}, not six numbers x,y,z,X,Y,Z (scene, then world)"
+                f"{path}: line {line_number} is {printable(repr(line), 60)}, not six numbers "
+                "x,y,z,X,Y,Z (scene, then world)"
             )
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 6)
+
+
+FEWEST = 4
+MOST_TILT = 10.0  # degrees that the error of the positions may turn the scene by
+# of EXIF: where the positions are, and what makes them negative
+_GPS, _SOUTH, _WEST = 0x8825, "S", "W"
+_RADIUS = 6378137.0
+_FLATTENING = 1 / 298.257223563  # of WGS84: semi-major axis, m
+
+
+def gps_frame(opened: Opened) -> GeoFrame:
+    """Return the frame with x east, y north, z up, in metres, by least squares of the cameras'
+    positions.
+
+    Raises DyngsError: no capture, fewer than ``FEWEST`` photos with a position, or positions so
+    near to a line, for their error, that the scene could be turned about it.
+    """
+    views = {
+        view.image_path: view
+        for view in all_views(opened.capture.splits)
+        if view.image_path is not None
+    }
+    found = {path: position for path in views if (position := position_of(path)) is not None}
+    root = opened.capture.root
+    if len(found) < FEWEST:
+        have = f"{len(found):,} of {len(views):,} photos have a position with altitude in EXIF"
+        raise DyngsError(
+            f"{root}: {have}, and --geo exif needs {FEWEST} or more; give control points: --geo FILE"
+        )
+    poses = np.stack([views[path].cam_from_world for path in found])
+    centres = opened.world.points(-np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]))
+    origin = np.mean(list(found.values()), axis=0)
+    world = east_north_up(np.array(list(found.values())), origin)
+    try:
+        similarity = fitted(centres, world)
+    except DyngsError:
+        raise DyngsError(
+            f"{root}: the photos stand on one line, which leaves open what is up; {_INSTEAD}"
+        ) from None
+    residuals = np.linalg.norm(similarity.points(centres) - world, axis=1)
+    spread = np.linalg.svd(similarity.points(centres - centres.mean(0)), compute_uv=False)
+    error = float(np.sqrt(np.square(residuals).sum() / max(len(residuals) - 2, 1)))
+    tilt = math.degrees(error / spread[1])
+    if tilt > MOST_TILT:
+        raise DyngsError(
+            f"{root}: the photos stand too near to one line for positions that are off by {error:.2g} m: up would be "
+            f"uncertain by {tilt:.0f} degrees; {_INSTEAD}"
+        )
+    latitude, longitude, altitude = origin.tolist()
+    place = f"{latitude:.7f}, {longitude:.7f}, {altitude:.2f} m"
+    notes = (
+        f"x is east, y north, z up, in metres; the origin is at {place} (WGS84)",
+        f"positions are off by {error:.2g} m: up and north are good to about {tilt:.2g} degrees, the scale to "
+        f"{100 * error / float(np.linalg.norm(spread)):.2g} %",
+    )
+    return replace(
+        GeoFrame(similarity, (0.0, 0.0, 0.0), residuals), what="photos with a position", notes=notes
+    )
+
+
+_INSTEAD = "give control points (--geo FILE), or --up and --scale"
+
+
+def position_of(path: Path) -> tuple[float, float, float] | None:
+    """Return latitude, longitude (degrees) and altitude (m) that EXIF of a photo states; None: not
+    all of them."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            told = image.getexif().get_ifd(_GPS)
+        latitude, longitude = (_degrees(told[key]) for key in (2, 4))
+        altitude = float(told[6]) * (-1 if told.get(5, b"\0") in (1, b"\1") else 1)
+        latitude *= -1 if str(told[1]).upper().startswith(_SOUTH) else 1
+        longitude *= -1 if str(told[3]).upper().startswith(_WEST) else 1
+    except Exception:  # whatever is wrong with a file, it states no position then
+        return None
+    is_one = (
+        all(map(math.isfinite, (latitude, longitude, altitude)))
+        and abs(latitude) <= 90
+        and abs(longitude) <= 180
+    )
+    return (latitude, longitude, altitude) if is_one else None
+
+
+def _degrees(parts: tuple[float, float, float]) -> float:
+    degrees, minutes, seconds = map(float, parts)
+    return degrees + minutes / 60 + seconds / 3600
+
+
+def east_north_up(positions: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return positions (P, 3), degrees and m, in the tangent plane of the ellipsoid at ``origin``
+    (3,): (P, 3) m."""
+    latitude, longitude = np.radians(origin[:2])
+    sin_a = np.sin(latitude)
+    cos_a = np.cos(latitude)
+    sin_o = np.sin(longitude)
+    cos_o = np.cos(longitude)
+    axes = np.array(
+        [
+            [-sin_o, cos_o, 0.0],
+            [-sin_a * cos_o, -sin_a * sin_o, cos_a],
+            [cos_a * cos_o, cos_a * sin_o, sin_a],
+        ]
+    )
+    return (_from_centre(positions) - _from_centre(origin[None])) @ axes.T
+
+
+def _from_centre(positions: np.ndarray) -> np.ndarray:
+    """Return positions (P, 3), degrees and m above the ellipsoid, from the centre of the earth: (P,
+    3) m."""
+    latitude = np.radians(positions[:, 0])
+    longitude = np.radians(positions[:, 1])
+    height = positions[:, 2]
+    squeeze = (1 - _FLATTENING) ** 2
+    normal = _RADIUS / np.sqrt(np.cos(latitude) ** 2 + squeeze * np.sin(latitude) ** 2)
+    across = (normal + height) * np.cos(latitude)
+    up = (squeeze * normal + height) * np.sin(latitude)
+    return np.stack([across * np.cos(longitude), across * np.sin(longitude), up], axis=1)

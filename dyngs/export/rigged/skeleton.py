@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.human.avatar.anchors import Anchors, heaviest_joints
-from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.posing import Anchors, Skeleton, heaviest_joints
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body import BodyTemplate, apply_shape
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS

@@ -27,7 +27,7 @@ from dyngs.export.rigged.skeleton import (
 )
 from dyngs.export.rigged.texture import frontal_colours
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import heaviest_joints
+from dyngs.human.avatar.posing import heaviest_joints
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.ply import write_ply

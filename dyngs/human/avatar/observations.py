@@ -3,21 +3,277 @@ letter: N points."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
+from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import Anchors, skinning_weights
-from dyngs.human.avatar.neighbours import mirrored_trust, smoothed, trust_in
-from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
+from dyngs.gaussians.rendering import RenderOptions, contributions
+from dyngs.human.avatar.posing import (
+    Anchors,
+    BodyPose,
+    PoseBlendShapes,
+    Skeleton,
+    frame_pose,
+    rest_offsets,
+    skinning_weights,
+)
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion
+
+# least cosine between the skinning weights of points that belong to the same part of the body
+_SAME_JOINTS = 0.5
+_LOOKED_AT = 4  # points that are looked at, over the number of requested neighbours
+
+
+def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
+    """Return the rows (Q, count) int64 of the nearest other points of each of ``points`` (Q, 3),
+    nearest first.
+
+    Points may coincide; none is its own neighbour. There are at most Q - 1 columns. Raises
+    DyngsError: a point that is not finite.
+    """
+    from scipy.spatial import KDTree
+
+    num_points = len(points)
+    count = min(count, num_points - 1)
+    if count < 1:
+        return torch.zeros(num_points, 0, dtype=torch.long, device=points.device)
+    positions = points.detach().double().cpu().numpy()
+    if not np.isfinite(positions).all():
+        raise DyngsError("neighbours: a point is not finite; check the positions for NaN")
+    found = np.asarray(KDTree(positions).query(positions, k=count + 1)[1])
+    own = found == np.arange(num_points)[:, None]
+    own[~own.any(1), -1] = True  # more than ``count`` points coincide: drop the last one
+    return torch.from_numpy(found[~own].reshape(num_points, count)).long().to(points.device)
+
+
+def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
+    """Return the rows (Q, count) int64 of the nearest other points that follow the same joints,
+    nearest first.
+
+    They do where the cosine between their skinning weights (Q, J) is above a half, among four times
+    ``count`` points around each; where fewer do, the point itself is in their place. At most Q - 1
+    columns.
+    """
+    near = nearest_neighbours(points, _LOOKED_AT * count)
+    unit = torch.nn.functional.normalize(weights, dim=1)
+    alike = [
+        (unit * unit.index_select(0, column)).sum(1) > _SAME_JOINTS for column in near.unbind(1)
+    ]
+    if not alike:
+        return near
+    others = ~torch.stack(alike, dim=1)
+    own = torch.arange(len(points), device=near.device)[:, None]
+    order = others.int().sort(dim=1, stable=True).indices[:, :count]
+    return torch.where(others, own, near).gather(1, order)
+
+
+class _Strains(torch.autograd.Function):
+    """See ``strains``. Numbers of one kind lie side by side: sums over rows of three are slow in
+    torch."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        columns = (x.T.contiguous() for x in (means, moved, means - points))
+        rest, posed, uneven = (x - x.index_select(1, near) for x in columns)
+        before, after = (x.square().sum(0).add_(_SHORTEST**2).sqrt_() for x in (rest, posed))
+        strain = after / scale - before
+        ctx.save_for_backward(
+            rest.mul_(strain / before), posed.mul_(strain / after), uneven, near, scale
+        )
+        return strain.square().mean(), uneven.square().sum() / len(near)
+
+    @staticmethod
+    @once_differentiable  # whose type hides the name of ctx
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        rest, posed, uneven, near, scale = ctx.saved_tensors
+        by_strain, by_uneven = (2 / len(near) * x for x in grads)
+        by_rest = by_uneven * uneven - by_strain * rest
+        by_posed = by_strain / scale * posed
+        by_means, by_moved = (x.index_add(1, near, x, alpha=-1).T for x in (by_rest, by_posed))
+        return by_means, by_moved, None, None, None
+
+
+_SHORTEST = 1e-6  # added to all distances, squared: points that coincide pull each other nowhere
+
+
+def strains(
+    means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return mean squares () of changes of the distance to a neighbour, and of unlike offsets;
+    differentiable once.
+
+    ``means`` (N, 3) at rest, which are offset from ``points`` (N, 3), are ``moved`` (N, 3) to a
+    pose, in a world with ``scale`` () units per unit of theirs; ``near`` (N,) are rows of their
+    neighbours.
+    """
+    return cast(Any, _Strains).apply(means, moved, points, near, scale)
+
+
+# sightings (see sightings) at which a Gaussian's own values count as much as what is around it
+ENOUGH = 1.0
+MIRRORED = 0.9  # trust in the other side of the body, where that was seen
+# trust in a Gaussian's own values below which it is counted as unseen in the line for people
+HARDLY = 0.5
+_NEIGHBOURS = 8
+_SAME_PLACE = 1.5
+"""Distance from the mirrored anchor, in sides of its texel, within which a Gaussian is its mirror
+image."""
+_OWN = 1e-6  # least weight of own values, which decides where nothing around is seen either
+_SURE = 1e-3  # least doubt in own values, so that the numbers stay in range
+_RESIDUAL, _MAX_ROUNDS = 1e-5, 1000
+"""Largest residual of the linear system at which its solution is good enough, and bound on the
+rounds it takes."""
+
+
+@torch.no_grad()
+def sightings(
+    drawn: Iterable[tuple[Gaussians, Cameras]], sizes: Tensor, scale: float, options: RenderOptions
+) -> Tensor:
+    """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen
+    there.
+
+    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the
+    Gaussians in the pose of each view, and its camera; ``sizes`` (N,) sides of the texels, m;
+    ``scale`` world units per metre.
+    """
+    total = torch.zeros_like(sizes)
+    for gaussians, camera in drawn:
+        opacity = gaussians.opacities
+        pose = camera.cam_from_world[0].to(opacity)
+        focal = camera.intrinsics[0, 0, 0].to(opacity)
+        depth = (gaussians.means @ pose[2, :3] + pose[2, 3]).clamp_min(options.near)
+        seen = contributions(gaussians, camera, options)[0] / opacity.clamp_min(options.alpha_min)
+        total += (seen / (sizes * scale * focal / depth).square()).square()
+        total[opacity <= options.alpha_min] = torch.inf
+    return total
+
+
+def trust_in(seen: Tensor) -> Tensor:
+    """Return the trust (N,) in [0, 1] in values learned from so many sightings (N,)."""
+    return 1 - ENOUGH / (seen + ENOUGH)
+
+
+def filled(
+    gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: float, trust: Tensor
+) -> dict[str, Tensor]:
+    """Return new ``sh``, ``means`` and ``logit_opacities`` of N Gaussians at rest; the same where
+    trust is 1.
+
+    Offsets, opacities and colours are mixed with those of the mirror image; base colours are made
+    like those of linked neighbours. ``weights`` (N, J) are the template's; ``middle`` is x of the
+    plane of symmetry, m; ``trust`` (N,) in [0, 1].
+    """
+    other, mixed, known = mirrored_trust(anchors, middle, trust)
+    fraction = mixed[:, None]
+    away = gaussians.means - anchors.points
+    flipped = away[other] * away.new_tensor([-1.0, 1.0, 1.0])
+    opacity = gaussians.logit_opacities[:, None]
+    sh = gaussians.sh.clone()
+    colour = torch.lerp(sh[:, 0], sh[other, 0], fraction)
+    sh[:, 0] = smoothed(colour, known, anchors, weights)
+    sh[:, 1:] *= trust[:, None, None]
+    return {
+        "sh": sh,
+        "means": anchors.points + torch.lerp(away, flipped, fraction),
+        "logit_opacities": torch.lerp(opacity, opacity[other], fraction)[:, 0],
+    }
+
+
+def mirrored_trust(anchors: Anchors, middle: float, trust: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return rows (N,) of the mirror images, the fractions (N,) to mix of their values, and trust
+    (N,) in the mixture.
+
+    ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) is that in own values.
+    """
+    other, is_image = mirror_images(anchors, middle)
+    borrowed = (1 - trust) * trust[other] * is_image * MIRRORED
+    known = trust + borrowed
+    return other, borrowed / known.clamp_min(_OWN), known
+
+
+def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
+    """Return (N,) rows of the Gaussians nearest to positions mirrored at x = ``middle``, and if
+    they are near (N,)."""
+    from scipy.spatial import KDTree
+
+    points = anchors.points.detach().double().cpu().numpy()
+    mirrored = points * [-1, 1, 1] + [2 * middle, 0, 0]
+    away, rows = KDTree(points).query(mirrored)
+    is_near = torch.from_numpy(np.asarray(away)).to(anchors.size) < _SAME_PLACE * anchors.size
+    return torch.from_numpy(np.asarray(rows)).long().to(anchors.points.device), is_near
+
+
+def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -> Tensor:
+    """Return values (N, C) that are like those of linked neighbours, and like ``values`` where
+    there is trust.
+
+    They minimize the sum of trust / (1 - trust) (x_i - v_i)^2 over Gaussians, and of w_ij (x_i -
+    x_j)^2 over neighbours that follow the same joints, where w falls with their distance; by
+    conjugate gradients.
+    """
+    from scipy.sparse import csr_array
+
+    count = len(values)
+    given = values.detach().double().cpu().numpy()
+    # a link to itself changes nothing
+    near = linked_neighbours(anchors.points, weights, _NEIGHBOURS)
+    if not near.shape[1]:
+        return values
+    steps = (anchors.points[near] - anchors.points[:, None]).norm(dim=-1) / anchors.size[:, None]
+    strength = (1 / (1 + steps.square())).double().cpu().numpy()
+    rows = np.repeat(np.arange(count), near.shape[1])
+    links = csr_array((strength.ravel(), (rows, near.cpu().numpy().ravel())), (count, count))
+    links = links.maximum(links.T)
+    sure = trust.detach().double().cpu().numpy()
+    own = sure / np.maximum(1 - sure, _SURE) + _OWN
+    diagonal = (np.asarray(links.sum(1)).ravel() + own)[:, None]
+    found = _conjugate_gradients(
+        lambda x: diagonal * x - links @ x, own[:, None] * given, given, 1 / diagonal
+    )
+    return torch.where(trust[:, None] > 1 - _SURE, values, torch.from_numpy(found).to(values))
+
+
+def _conjugate_gradients(
+    applied: Callable[[np.ndarray], np.ndarray],
+    wanted: np.ndarray,
+    first: np.ndarray,
+    scaling: np.ndarray,
+) -> np.ndarray:
+    """Return x (N, C) with ``applied`` (x) = ``wanted``, a positive definite system, column by
+    column, from ``first``.
+
+    ``scaling`` (N, 1) is the inverse of its diagonal (Jacobi's preconditioner).
+    """
+    x = first
+    residual = wanted - applied(first)
+    direction = scaled = scaling * residual
+    size = (residual * scaled).sum(0)
+    for _ in range(_MAX_ROUNDS):
+        if float(np.abs(residual).max(initial=0)) < _RESIDUAL:
+            break
+        image = applied(direction)
+        step = size / np.maximum((direction * image).sum(0), 1e-300)
+        x = x + step * direction
+        residual = residual - step * image
+        scaled = scaling * residual
+        before = size
+        size = (residual * scaled).sum(0)
+        direction = scaled + size / np.maximum(before, 1e-300) * direction
+    return x
+
 
 FACING_EXPONENT = 4
 """Exponent of the cosine between normal and view direction in the weights of colours: frontal views

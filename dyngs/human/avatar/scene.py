@@ -22,25 +22,25 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
-from dyngs.human.avatar.anchors import Anchors, skinning_weights
-from dyngs.human.avatar.corrections import (
-    SharedCorrection,
-    corrected_clip,
-    corrected_pose,
-    corrected_skeleton,
-    learned_light,
-    new_corrections,
-)
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (
     LEFT_OUT,
     TERMS,
+    Anchors,
     BodyPose,
     Light,
     PoseBlendShapes,
+    SharedCorrection,
     Skeleton,
+    corrected_clip,
+    corrected_pose,
+    corrected_skeleton,
     frame_pose,
+    learned_light,
+    new_corrections,
     pose_gaussians,
     rest_offsets,
+    skinning_weights,
 )
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
@@ -153,7 +153,7 @@ class HumanScene(GaussianScene, Posable):
     @property
     def up(self) -> Tensor:
         """The up direction (3,) of the world, as training saw it."""
-        from dyngs.human.motion.placement import up_direction  # late: scipy
+        from dyngs.human.motion.placement import up_direction
 
         if "up" not in self._derived:
             self._derived["up"] = up_direction(self.clip)
@@ -320,6 +320,22 @@ class HumanScene(GaussianScene, Posable):
                 "shapes.faces": self.shapes.faces.int(),
             }
         return state | {name: StateTensor(x, Role.SHARED) for name, x in given.items()}
+
+
+def first_scene(
+    gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
+) -> HumanScene:
+    """Return the scene of the first Gaussians: nothing is learned yet; light only with their
+    ``normals`` (N, 3)."""
+    clip = subject.motion.clip
+    return HumanScene(
+        gaussians=gaussians,
+        anchors=subject.anchors,
+        skeleton=subject.skeleton,
+        clip=clip,
+        learned=new_corrections(clip, subject.skeleton, subject.anchors, normals),
+        shapes=subject.shapes,
+    )
 
 
 def avatar_of(scene: Renderable) -> HumanScene | None:

@@ -12,13 +12,18 @@ from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of
-from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
 from dyngs.human.avatar.observations import Subject, in_colours_of
-from dyngs.human.avatar.outlines import outline_loss
-from dyngs.human.avatar.pose_refit import PoseRefit
-from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
-from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.avatar.pose_fit import PoseRefit
+from dyngs.human.avatar.posing import (
+    Skeleton,
+    pixel_size,
+    pose_blend_shapes,
+    rest_normals,
+    surface_gaussians,
+    surface_texels,
+)
+from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.avatar.training import HumanTraining, outline_loss
 from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.keys import NO_BODY, HumanModel
 from dyngs.human.motion.motion import captured_motion
@@ -52,7 +57,7 @@ def start(run: RunStart) -> GaussianModel:
     )
     training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines, refit)
     lit = model.light and model.refine and colours.network is None
-    scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
+    scene = first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
     return GaussianModel(run, scene, training, densifier_of(run), colours)
 
 
@@ -82,7 +87,7 @@ def human_start(
     body = load_template(model)
     vertices, joints = rest_shape(body, given)
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
-    cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
+    cameras = training_cameras(capture.splits["train"], config.data)
     parts = surface_texels(
         body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0])
     )

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.capture.masks import SEEN_BARE
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, with_role
-from dyngs.data.loader import Image
+from dyngs.data.capture import View
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
-from dyngs.human.avatar.corrections import (
-    OF_FRAMES,
-    correction_penalties,
-    new_corrections,
-    share_sides,
-)
-from dyngs.human.avatar.neighbours import (
+from dyngs.human.avatar.observations import (
     HARDLY,
     filled,
     linked_neighbours,
@@ -33,24 +31,195 @@ from dyngs.human.avatar.neighbours import (
     strains,
     trust_in,
 )
-from dyngs.human.avatar.observations import Subject
-from dyngs.human.avatar.outlines import OutlineLoss
-from dyngs.human.avatar.pose_refit import PoseRefit
-from dyngs.human.avatar.posing import BodyPose, difference_of_sides
+from dyngs.human.avatar.pose_fit import PoseRefit
+from dyngs.human.avatar.posing import (
+    OF_FRAMES,
+    BodyPose,
+    correction_penalties,
+    difference_of_sides,
+    share_sides,
+)
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
+from dyngs.models.kind import RunStart
+from dyngs.models.model import Look, Loss
+from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
+from dyngs.ops.device import sent
+from dyngs.ops.loss import l1_ssim_loss
 
-NEIGHBOURS = 5
-FRAMES_FROM = 0.25
-"""Fraction of the run after which poses of single frames are learned: what all frames share comes
-first."""
+REACH = 2  # distance from the mask up to which images are compared as they were taken, px
+OUTSIDE = 0.02  # alpha up to which a pixel is outside of the mask
+FRAMES = 21  # of a camera, whose median is what is behind
+# median difference, over pixels outside of the masks, from which the camera or the light has moved
+STANDS = 12 / 255
+# least fraction of the pixels near outlines, behind which something is known, to use any
+WORTH_TELLING = 0.01
+_STRIP = 32  # rows whose median is taken at once
+
+
+@dataclass(frozen=True)
+class Plate:
+    """What stands behind the person before one camera."""
+
+    colours: Tensor  # (H, W, 3)
+    known: Tensor  # (H, W) bool: seen without the person often enough
+
+
+class OutlineLoss(Loss):
+    """L1 and D-SSIM of the image; in masks and up to ``REACH`` px around them, before the plate
+    where that is known.
+
+    There the render's own opacity, not the mask, says how much of the plate is seen.
+    """
+
+    def __init__(
+        self,
+        photos: ImageLoader,
+        plates: Mapping[int, Plate],
+        behind: Tensor,
+        ssim_weight: float,
+        known: float,
+    ) -> None:
+        """Keep all of it.
+
+        Args:
+            photos: the training images as they were taken.
+            plates: by the number of the camera.
+            behind: (3,) colour of the run's background.
+            known: fraction of the pixels near outlines where a plate is known, for people.
+        """
+        self._photos, self._plates, self._behind, self._ssim_weight = (
+            photos,
+            plates,
+            behind,
+            ssim_weight,
+        )
+        self.finding = (
+            f"masks are found ones: {known:.0%} of the pixels at their outlines are compared before what other frames "
+            "show behind the person"
+        )
+
+    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+        rendered = look.rendered
+        truth = look.truth
+        plate = self._plates.get(self._photos.views[look.index].camera_id)
+        alpha = look.image.alpha
+        if plate is not None and alpha is not None and truth.shape == plate.colours.shape:
+            photo = self._photos[look.index].rgb_premultiplied
+            colours, known, photo, behind = (
+                sent(x, rendered.device) for x in (plate.colours, plate.known, photo, self._behind)
+            )
+            use = (known & _near(alpha))[..., None]
+            seen = look.drawn.rendering.transmittance[0][..., None]
+            rendered = rendered + use * seen * (colours - behind)
+            truth = torch.where(use, photo, truth)
+        return {"image": l1_ssim_loss(rendered, truth, self._ssim_weight, look.image.mask)}
+
+
+def outline_loss(run: RunStart) -> OutlineLoss | None:
+    """Return how colours are compared near outlines; None where masks come with the images, or no
+    camera stands."""
+    views = run.images.views
+    config = run.config
+    if (
+        run.background == "random"
+        or config.train.exposure != "never"
+        or config.camera.refine == "always"
+    ):
+        return None
+    if any(view.silhouette is None for view in views):
+        return None
+    photos = ImageLoader([replace(view, silhouette=None) for view in views], config.data)
+    if photos[0].alpha is not None:
+        return None
+    plates: dict[int, Plate] = {}
+    known = total = 0.0
+    for camera, rows in _standing(views).items():
+        shown = [rows[i] for i in evenly_spaced(len(rows), FRAMES)]
+        near = torch.stack([_near(x) for i in shown if (x := run.images[i].alpha) is not None])
+        plate = _plate(torch.stack([_bytes(photos[i].rgb_premultiplied) for i in shown]), near)
+        if plate is None:
+            continue
+        plates[camera] = plate
+        rims = near & ~torch.stack(
+            [x > 1 - OUTSIDE for i in shown if (x := run.images[i].alpha) is not None]
+        )
+        known = known + float((rims & plate.known).sum())
+        total = total + float(rims.sum())
+    if not plates or known < WORTH_TELLING * total:
+        return None
+    return OutlineLoss(
+        photos, plates, background_colour(run.background), config.train.ssim_weight, known / total
+    )
+
+
+def _standing(views: Sequence[View]) -> dict[int, list[int]]:
+    """Return the rows of the views of each camera that stands, by its number."""
+    rows: dict[int, list[int]] = defaultdict(list)
+    for row, view in enumerate(views):
+        rows[view.camera_id].append(row)
+
+    def stands(own: list[int]) -> bool:
+        first = views[own[0]]
+        places = np.stack([views[i].cam_from_world for i in own])
+        lenses = {(views[i].intrinsics.tobytes(), views[i].width, views[i].height) for i in own}
+        return len(lenses) == 1 and np.allclose(places, first.cam_from_world, atol=1e-6)
+
+    return {camera: own for camera, own in rows.items() if len(own) > SEEN_BARE and stands(own)}
+
+
+def _near(alpha: Tensor) -> Tensor:
+    """Return where (H, W) the mask is, and up to ``REACH`` px around it."""
+    size = 2 * REACH + 1
+    return torch.nn.functional.max_pool2d(alpha[None, None], size, 1, REACH)[0, 0] > OUTSIDE
+
+
+def _bytes(rgb: Tensor) -> Tensor:
+    return (255 * rgb).round().byte()
+
+
+def _plate(photos: Tensor, near: Tensor) -> Plate | None:
+    """Return the median of photos (F, H, W, 3) uint8 over those that show no person at a pixel.
+
+    ``near`` (F, H, W) says where the person may be. None: it is not one thing, or never seen.
+    """
+    known = (~near).sum(0) >= SEEN_BARE
+    colours = torch.zeros(*photos.shape[1:], device=photos.device)
+    away = []
+    for first in range(0, len(known), _STRIP):
+        rows = slice(first, first + _STRIP)
+        bare = (photos[:, rows] / 255).masked_fill(near[:, rows, :, None], torch.nan)
+        colours[rows] = bare.nanmedian(0).values.nan_to_num()
+        away.append((bare - colours[rows]).abs().amax(-1)[:, known[rows]].flatten())
+    differences = torch.cat(away)
+    differences = differences[~differences.isnan()]
+    if not len(differences) or float(differences.median()) > STANDS:
+        return None
+    return Plate(colours, known)
+
+
+@dataclass(frozen=True)
+class AvatarParams:
+    """When and how strongly an avatar is regularised; distances in cm."""
+
+    refine_from: float = 0.1  # fraction of the run after which corrections are learned
+    # fraction after which those of single frames are: what all frames share comes first
+    frames_from: float = 0.25
+    offset_weight: float = 2e-4  # of squared distances from the scaffold
+    scale_weight: float = 1e-2  # of the squared excess of log-scales over the size of the texel
+    rigidity: float = 1e-2  # of squared changes, by posing, of distances between neighbours
+    smoothness: float = 1e-3  # of squared differences between the offsets of neighbours
+    neighbours: int = 5
+    # of the squared difference between colours of both sides, where light is learned
+    sides_weight: float = 0.1
+    views: int = 100  # training views, at most, in which it is counted how much they show
+    # fraction of Gaussians that are hardly seen from which on a message says so
+    worth_telling: float = 0.01
+
+
+PARAMS = AvatarParams()
 CENTIMETRE = 0.01
-# of the squared difference between colours of both sides, where light is learned, in the loss
-SIDES_WEIGHT = 0.1
-# number of training views, at most, in which it is counted how much they show of each Gaussian
-LOOKS = 100
-WORTH_TELLING = 0.01  # least fraction of Gaussians that are hardly seen at which a line says so
 
 
 class HumanTraining(SceneTraining[HumanScene]):
@@ -75,29 +244,14 @@ class HumanTraining(SceneTraining[HumanScene]):
     ) -> None:
         self.options, self.rates, self.views, self.colour_loss = options, rates, views, outlines
         self._finding = None if outlines is None else outlines.finding
-        self.refines_from = round(options.refine_from * rates.steps)
-        self.frames_from = round(FRAMES_FROM * rates.steps)
+        self.refines_from = round(PARAMS.refine_from * rates.steps)
+        self.frames_from = round(PARAMS.frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
+        self._has_refined = False
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
         self._refit = refit
-
-    def first_scene(
-        self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
-    ) -> HumanScene:
-        """Return the scene of the first Gaussians: nothing is learned yet; light only with their
-        ``normals`` (N, 3)."""
-        clip = subject.motion.clip
-        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
-        return HumanScene(
-            gaussians=gaussians,
-            anchors=subject.anchors,
-            skeleton=subject.skeleton,
-            clip=clip,
-            learned=learned,
-            shapes=subject.shapes,
-        )
 
     def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
         """Return the Gaussians in the pose of ``image``, and the regularizers.
@@ -113,7 +267,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         if self._refines(step):
             penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
-                penalties["sides"] = SIDES_WEIGHT * difference_of_sides(
+                penalties["sides"] = PARAMS.sides_weight * difference_of_sides(
                     scene.gaussians, *self._images_in(scene)
                 )
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
@@ -124,6 +278,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         """Update the corrections."""
         if not self._refines(step):
             return 0
+        self._has_refined = True
         progress = self.rates.progress(step, since=self.refines_from)
         share_sides(scene.learned)
         if step <= self.frames_from:
@@ -153,7 +308,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
 
     def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
-        shown = [self.views[i] for i in evenly_spaced(len(self.views), LOOKS)]
+        shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
         last = len(scene.clip) - 1
         with torch.no_grad():
             drawn = (
@@ -173,17 +328,19 @@ class HumanTraining(SceneTraining[HumanScene]):
             )
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
-        finding = line if hardly >= WORTH_TELLING else None
+        finding = line if hardly >= PARAMS.worth_telling else None
         return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
 
-    def follow(self, edit: TopologyEdit) -> None:
+    def follow(self, edit: TopologyEdit | None = None) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
         self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+        self.follow()
         self._near = tensors.get("near")
-        self._given_weights = None
-        self._images = None
+        if "refines_from" in tensors:  # the run may have become longer since
+            self._has_refined = True
+            self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
         if self._refit is not None:
             self._refit.goes_on = "poses_stay" not in tensors
         return HumanScene.restored(gaussians, tensors)
@@ -192,6 +349,8 @@ class HumanTraining(SceneTraining[HumanScene]):
         kept = {} if self._near is None else {"near": self._near}
         if self._refit is not None and not self._refit.goes_on:
             kept["poses_stay"] = torch.ones(1, device="cpu")
+        if self._has_refined:
+            kept["refines_from"] = torch.tensor(self.refines_from, device="cpu")
         return with_role(kept, Role.TRAINING)
 
     def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
@@ -212,16 +371,13 @@ class HumanTraining(SceneTraining[HumanScene]):
 
     def _penalties(self, scene: HumanScene) -> dict[str, Tensor]:
         """Return penalties for Gaussians far from their scaffolds, or larger than their texels."""
-        terms = {}
-        options = self.options
         now = scene.gaussians
-        if options.offset_weight > 0:
-            away = (now.means - scene.anchors.points) / CENTIMETRE
-            terms["offset"] = options.offset_weight * away.square().sum() / len(away)
-        if options.scale_weight > 0:
-            longer = now.log_scales - scene.anchors.size.log()[:, None]
-            terms["scale"] = options.scale_weight * longer.clamp_min(0).square().sum() / len(longer)
-        return terms
+        away = (now.means - scene.anchors.points) / CENTIMETRE
+        longer = now.log_scales - scene.anchors.size.log()[:, None]
+        return {
+            "offset": PARAMS.offset_weight * away.square().sum() / len(away),
+            "scale": PARAMS.scale_weight * longer.clamp_min(0).square().sum() / len(longer),
+        }
 
     def _between_neighbours(
         self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int
@@ -231,15 +387,16 @@ class HumanTraining(SceneTraining[HumanScene]):
 
         Rigidity: distances do not change. Smoothness: offsets from the scaffold are alike.
         """
-        options = self.options
         means = scene.gaussians.means
-        if options.rigidity == 0 and options.smoothness == 0:
-            return {}
         if self._near is None:
-            self._near = linked_neighbours(scene.anchors.points, scene.given_weights(), NEIGHBOURS)
+            self._near = linked_neighbours(
+                scene.anchors.points, scene.given_weights(), PARAMS.neighbours
+            )
         if not self._near.shape[1]:
             return {}
         near = self._near[:, step % self._near.shape[1]]
         strain, uneven = strains(means, moved.means, scene.anchors.points, near, scale)
-        terms = {"rigidity": options.rigidity * strain, "smoothness": options.smoothness * uneven}
-        return {name: x / CENTIMETRE**2 for name, x in terms.items() if getattr(options, name) > 0}
+        return {
+            "rigidity": PARAMS.rigidity * strain / CENTIMETRE**2,
+            "smoothness": PARAMS.smoothness * uneven / CENTIMETRE**2,
+        }

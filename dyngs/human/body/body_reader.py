@@ -19,7 +19,7 @@ from dyngs.core.errors import DyngsError, reading, reason
 from dyngs.data.capture import BodyFrames
 from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shapes
 from dyngs.human.keys import HumanModel
-from dyngs.io.limits import read_limited, require_at_most
+from dyngs.io.fields import read_limited, require_at_most
 from dyngs.io.numpy_files import read_arrays
 from dyngs.io.pickles import read_pickle
 

@@ -10,29 +10,185 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
-from dyngs.capture.background import at_size, outlined
 from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
-from dyngs.capture.photos import digest_of
+from dyngs.capture.masks import at_size, outlined
+from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
-from dyngs.human.detect.detector import Detection, Detector
-from dyngs.human.detect.following import followed, with_sides
-from dyngs.human.detect.mediapipe import MediaPipe
-from dyngs.human.detect.warnings import warnings_of
+from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 from dyngs.io.lock import make_once
 from dyngs.io.outputs import note_sources, require_new_folder
-from dyngs.io.temporary import cache_folder, temporary_folder_beside
-from dyngs.io.write import write_image, write_text
+from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
+
+REACH = 0.6  # distance between following detections of one person, at most, in heights an image
+PATIENCE = 10  # images after which anybody may be the person again
+SWAP = 0.04
+"""What a swapped image costs, in heights of the person by which each key point moves: a limb taken
+for the other one in a few images moves them more, and who has turned around stays so for long."""
+_PAIRS = {
+    "all": ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)),
+    "arms": ((7, 8), (9, 10)),
+    "legs": ((13, 14), (15, 16)),
+}
+"""Key points of COCO on the left and on the right."""
+
+
+def followed(images: Sequence[Sequence[Detection]]) -> list[Detection | None]:
+    """Return one person in the images (F) of a camera: the largest that is found first, then who is
+    nearest."""
+    person: list[Detection | None] = []
+    last: Detection | None = None
+    missing = 0
+    for people in images:
+        if last is None or missing > PATIENCE:
+            found = max(people, key=lambda x: x.height, default=None)
+        else:
+            reach = REACH * (missing + 1) * last.height
+            away = [float(np.linalg.norm(x.middle - last.middle)) for x in people]
+            row = int(np.argmin([*away, reach]))
+            found = people[row] if row < len(people) else None
+        person.append(found)
+        missing = missing + 1 if found is None else 0
+        last = last if found is None else found
+    return person
+
+
+def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
+    """Return the detections of a person (F) with left and right as over time, and in how many
+    images that changed.
+
+    Detectors take one arm for the other where they cross, and front for back. First all pairs of
+    key points, then arms, then legs are swapped in those images where the key points then move so
+    much less that ``SWAP`` is worth it: the cheapest sequence of swapped and not, by dynamic
+    programming.
+    """
+    numbers = [number for number, x in enumerate(person) if x is not None]
+    detections = [x for x in person if x is not None]
+    points = np.array([x.keypoints for x in detections], np.float64).reshape(-1, 17, 3)
+    heights = np.array([x.height for x in detections])
+    changed = np.zeros(len(points), bool)
+    for pairs in _PAIRS.values():
+        swapped = _swapped(points, np.array(pairs), heights)
+        for left, right in pairs:
+            points[swapped, left], points[swapped, right] = (
+                points[swapped, right],
+                points[swapped, left],
+            )
+        changed ^= swapped
+    result = list(person)
+    for number, detection, own in zip(numbers, detections, points.astype(np.float32), strict=True):
+        result[number] = replace(detection, keypoints=own)
+    return result, int(changed.sum())
+
+
+def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Return in which images (F,) bool the ``pairs`` (P, 2) of ``points`` (F, 17, 3) are better
+    swapped."""
+    count = len(points)
+    # (2, F, P, 2, 3): as they are, swapped
+    both = np.stack([points[:, pairs], points[:, pairs[:, ::-1]]])
+    sure: np.ndarray = np.all(points[:, pairs, 2] > SURE, axis=-1)  # (F, P)
+    best = np.array([0.0, SWAP])
+    came_from = np.zeros((count, 2), int)
+    for t in range(1, count):
+        weights = (sure[t] & sure[t - 1])[None, None, :, None]
+        # (2, 2, P, 2)
+        moved = np.linalg.norm(both[None, :, t, ..., :2] - both[:, None, t - 1, ..., :2], axis=-1)
+        steps = (
+            (moved * weights).sum((2, 3)) / max(heights[t], 1e-6) / max(2 * int(weights.sum()), 1)
+        )
+        total = best[:, None] + steps
+        came_from[t] = total.argmin(0)
+        best = total.min(0) + np.array([0.0, SWAP])
+    states = np.zeros(count, bool)
+    state = int(best.argmin()) if count else 0
+    for t in range(count - 1, -1, -1):
+        states[t], state = bool(state), int(came_from[t, state])
+    return states
+
+
+OFTEN = 0.1  # fraction of the images from which on something is said
+SMALL = 120.0  # height of a person below which an avatar has little to learn from, px
+# sharpness, as a fraction of the clip's median, below which an image is called blurred
+BLURRED = 0.3
+# width of the shoulders, of the person's height, from which on they are seen from the front or
+# behind
+FACING = 0.1
+_SHOULDERS = (5, 6)
+_ANKLES = (15, 16)
+
+
+def warnings_of(
+    images: np.ndarray, person: Sequence[Detection | None], *, alone: bool = True
+) -> list[str]:
+    """Return lines on what will be bad.
+
+    Args:
+        images: (F, H, W, 3) uint8.
+        person: their detection in each image.
+        alone: there is no other camera.
+    """
+    shown = [(image, x) for image, x in zip(images, person, strict=True) if x is not None]
+    detections = [x for _, x in shown]
+    count = len(shown)
+    height = float(np.median([x.height for x in detections]))
+    cut = sum(_is_cut_off(x, images.shape[1]) for x in detections)
+    sharp = np.array([_sharpness(image, x) for image, x in shown])
+    blurred = int((sharp < BLURRED * np.median(sharp)).sum())
+    lines = []
+    if count < len(images):
+        gone = len(images) - count
+        lines.append(
+            f"nobody is found in {gone} of {counted(len(images), 'image')}; these are left out"
+        )
+    if cut > OFTEN * count:
+        lines.append(
+            f"the feet are cut off or hidden in {cut} of {counted(count, 'image')}; legs will be a guess there"
+        )
+    if height < SMALL:
+        lines.append(f"the person is {height:.0f} px high; come nearer or record larger images")
+    if blurred > OFTEN * count:
+        lines.append(f"{counted(blurred, 'image')} blurred; more light, or slower motion, helps")
+    if alone and not _turns(detections):
+        lines.append("the person never turns around: what the camera never sees will be a guess")
+    return lines
+
+
+def _is_cut_off(person: Detection, height: int) -> bool:
+    ankles = person.keypoints[list(_ANKLES)]
+    return bool(
+        (ankles[:, 2] < SURE).all()
+        or (ankles[:, 1] > height - 2).any()
+        or person.box[3] > height - 1.5
+    )
+
+
+def _sharpness(image: np.ndarray, person: Detection) -> float:
+    """Return the spread of the Laplacian over that of the grey levels in the person's box."""
+    left, top, right, bottom = (max(round(float(edge)), 0) for edge in person.box)
+    grey = image[top:bottom, left:right].astype(np.float32).mean(-1)
+    return float(ndimage.laplace(grey).std() / max(float(grey.std()), 1.0)) if grey.size else 0.0
+
+
+def _turns(people: Sequence[Detection]) -> bool:
+    """Whether the person is seen from the front and from behind: the left shoulder right of the
+    right one, and left."""
+    left, right = (np.array([x.keypoints[row] for x in people]) for row in _SHOULDERS)
+    sure = (left[:, 2] > SURE) & (right[:, 2] > SURE)
+    across = (left[sure, 0] - right[sure, 0]) / np.array([max(x.height, 1.0) for x in people])[sure]
+    return bool((across > FACING).any() and (across < -FACING).any())
+
 
 SIDE = 960  # longest side of the images that a detector sees, px
 
@@ -56,7 +212,6 @@ def find_person(
     folder: Path,
     report: ReportProgress,
     say: Callable[[str], None] = show,
-    number: int = 1,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
     are.
@@ -64,31 +219,26 @@ def find_person(
     Left and right are made the same over time. Where a camera stands, outlines of masks are those
     of what stands before its background. Views without the person, or a camera that never shows
     them, get empty masks. Says what was found, and what will be bad about it.
-    Raises DyngsError: nobody is found, or not so many.
-
-    Args:
-        number: which person of several: 1 is who fills most of the clip.
+    Raises DyngsError: nobody is found.
     """
     points: dict[str, np.ndarray] = {}
     cameras = _cameras_of(capture)
     for index, camera in enumerate(cameras):
-        people = followed(_detected(camera, detector, folder / "frames"))
+        person, swapped = with_sides(followed(_detected(camera, detector, folder / "frames")))
         report("cameras in which the person is found", index + 1, len(cameras))
         where = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
-        if not people:
+        heights = [x.height for x in person if x is not None]
+        if not heights:
             say(f"warning: {where}{detector.name} finds nobody, its images are left out")
-            _write_empty_masks(camera, folder / "masks")
+            for view in camera.views:
+                nobody = np.zeros((view.height, view.width), np.uint8)
+                write_image(folder / "masks" / f"{view.name}.png", nobody)
             continue
-        if not 1 <= number <= len(people):
-            raise DyngsError(
-                f"{capture.root}: {where}--person {number}, but people found: {len(people)}"
-            )
-        person, swapped = with_sides(people[number - 1])
         say(
-            f"{where}{_summary(person, detector)}; left and right swapped in {counted(swapped, 'image')}"
+            f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
+            f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
         )
-        others = [x for x in people if x is not people[number - 1]]
-        for warning in warnings_of(camera.images, person, others, alone=len(cameras) == 1):
+        for warning in warnings_of(camera.images, person, alone=len(cameras) == 1):
             say(f"warning: {where}{warning}")
         _write_masks(camera, person, folder / "masks", say)
         for view, own in zip(camera.views, person, strict=True):
@@ -128,12 +278,6 @@ def _detected(camera: _Camera, detector: Detector, folder: Path) -> list[list[De
             file.unlink(missing_ok=True)
 
 
-def _summary(person: Sequence[Detection | None], detector: Detector) -> str:
-    seen = [x for x in person if x is not None]
-    height = float(np.median([x.height for x in seen]))
-    return f"{detector.name} finds the person, {height:.0f} px high, in {len(seen)} of {counted(len(person), 'image')}"
-
-
 def _write_masks(
     camera: _Camera, person: Sequence[Detection | None], folder: Path, say: Callable[[str], None]
 ) -> None:
@@ -148,11 +292,6 @@ def _write_masks(
         )
     for view, mask in zip(camera.views, masks if better is None else better, strict=True):
         write_image(folder / f"{view.name}.png", at_size(mask, view))
-
-
-def _write_empty_masks(camera: _Camera, folder: Path) -> None:
-    for view in camera.views:
-        write_image(folder / f"{view.name}.png", np.zeros((view.height, view.width), np.uint8))
 
 
 def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
@@ -171,7 +310,6 @@ def write_found_person(
     detector: Detector,
     report: ReportProgress = report_nothing,
     say: Callable[[str], None] = show,
-    number: int = 1,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
     new folder ``out``.
@@ -184,7 +322,7 @@ def write_found_person(
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = find_person(capture, detector, folder, report, say, number)
+        found = find_person(capture, detector, folder, report, say)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -3,39 +3,1077 @@ on views left out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from dyngs.config import DataConfig
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.camera import Cameras
+from dyngs.core.conventions import RasterizeMode, ReportProgress
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import numbered
 from dyngs.data.capture import Capture, Split, View
+from dyngs.data.images.images import area_downscale
+from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
+from dyngs.data.times import evenly_spaced
+from dyngs.gaussians import Gaussians
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.body.body import BodyTemplate
-from dyngs.human.fit.keypoints import Joints3D, Keypoints
-from dyngs.human.fit.silhouettes import ObservedFrame, longest_box_side, observed_frame, surface_of
-from dyngs.human.fit.solve import (
-    FRAMES,
-    BodyFit,
-    Fitting,
-    InTurn,
-    LensFit,
-    body_fit,
-    drawn_frame,
-    fit_lens,
-    near_given,
-    new_fit,
-    usual,
+from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.human.avatar.posing import (
+    BodyPose,
+    SharedCorrection,
+    Skeleton,
+    corrected_clip,
+    pose_gaussians,
+    posed_joints,
+    skinning_weights,
+    texel_gaussians,
 )
-from dyngs.human.fit.start import first_poses, num_ticks
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import NUM_BONE_SHAPES, BodyTemplate
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.skinning import axis_angle_to_matrix
+from dyngs.human.fit.keypoints import Joints3D, Keypoints
 from dyngs.human.motion.motion import CapturedMotion, MotionClip, captured_motion
+
+_WIDTH, _THICKNESS, _INSET = 0.4, 0.075, 0.2
+"""Standard deviations of a disc in the tangent plane and along the normal, and its depth below the
+skin, in sides of its texel. With these, drawn silhouettes have the area of the mesh to 2 % and an
+IoU with it of 0.95 (48 texels a side) to 0.97 (72); wider discs cover more than the body, narrower
+ones leave gaps."""
+_OPACITY_LOGIT = 4.0
+_OPTIONS = RenderOptions(nonfinite="trust", eps2d=0.1, mode=RasterizeMode.ANTIALIASED)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Discs on the texels of a template, and how they follow its shape."""
+
+    discs: Gaussians  # P at rest in the mean shape, m
+    normals: Tensor  # (P, 3) outward
+    weights: Tensor  # (P, J) skinning weights
+    shape_dirs: Tensor  # (P, 3, B) m per unit of the shape parameters
+    # (9 (J - 1), 3 P) pose blend shapes, m per unit of the rotations minus the identity; None
+    # without
+    pose_dirs: Tensor | None
+    body: BodyTemplate  # the template
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def skeleton(self, betas: Tensor) -> Skeleton:
+        """Return the skeleton of shape parameters (B,); differentiable."""
+        dirs = self.body.joint_shape_dirs
+        joints = self.body.joints if dirs is None else self.body.joints + dirs @ betas
+        return Skeleton(joints, self.body.parents)
+
+    def in_shape(self, betas: Tensor, padding: Tensor) -> ShapedSurface:
+        """Return the surface of one person at rest; differentiable.
+
+        ``betas`` (B,) are shape parameters; ``padding`` (P,) m, by how much clothes and hair lie
+        outside the skin.
+        """
+        means = self.discs.means + self.shape_dirs @ betas + padding[:, None] * self.normals
+        return ShapedSurface(
+            self.discs.replace(means=means), self.weights, self.skeleton(betas), self.pose_dirs
+        )
+
+
+@dataclass(frozen=True)
+class ShapedSurface:
+    """The surface of one person."""
+
+    discs: Gaussians  # P at rest, m
+    weights: Tensor  # (P, J) skinning weights
+    skeleton: Skeleton
+    pose_dirs: Tensor | None = None  # (9 (J - 1), 3 P) as of ``Surface``
+
+    def in_pose(self, pose: BodyPose) -> Gaussians:
+        """Return the discs in a pose, in the world; differentiable."""
+        offsets = None
+        if self.pose_dirs is not None:
+            turned = pose.rotations[1:] - torch.eye(
+                3, dtype=pose.rotations.dtype, device=pose.rotations.device
+            )
+            offsets = (turned.flatten() @ self.pose_dirs).unflatten(0, (-1, 3))
+        return pose_gaussians(self.discs, self.weights, self.skeleton, pose, offsets)
+
+
+def surface_of(body: BodyTemplate, resolution: int) -> Surface:
+    """Return the surface of a template as the discs of an atlas of ``resolution`` texels a side."""
+    texels = atlas_texels(body, resolution, body.vertices)
+    discs, anchors = texel_gaussians(texels, [0.0], 0)
+    ratios = anchors.size.new_tensor([_WIDTH, _WIDTH, _THICKNESS]).log()
+    solid = torch.full_like(discs.logit_opacities, _OPACITY_LOGIT)
+    around = body.faces[texels.faces]
+    parts = texels.barycentric[..., None]
+    pose_dirs = None
+    if body.shape_dirs is None:
+        shape_dirs = discs.means.new_zeros(len(discs), 3, 0)
+    else:
+        shape_dirs = (parts[..., None] * body.shape_dirs[around]).sum(1)
+    if body.pose_dirs is not None:
+        pose_dirs = (parts * body.pose_dirs.unflatten(1, (-1, 3))[:, around]).sum(2).flatten(1)
+    return Surface(
+        discs=discs.replace(
+            means=discs.means - _INSET * anchors.size[:, None] * texels.normals,
+            log_scales=anchors.size.log()[:, None] + ratios,
+            logit_opacities=solid,
+        ),
+        normals=texels.normals,
+        weights=skinning_weights(anchors, len(body.joints)),
+        shape_dirs=shape_dirs,
+        pose_dirs=pose_dirs,
+        body=body,
+    )
+
+
+def drawn_silhouettes(discs: Gaussians, cameras: Cameras) -> Tensor:
+    """Return coverage (V, H, W) in [0, 1] of posed discs in the images of V cameras;
+    differentiable."""
+    return render(discs, cameras, _OPTIONS, shader=_black).alpha
+
+
+def _black(discs: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+    """Return the colours (V, P, 1) of discs of which only the coverage counts: one channel, without
+    a gradient."""
+    return discs.means.new_zeros(len(cameras), len(discs), 1)
+
+
+_MARGIN = 1.25  # side of the square over the longest side of the person's box
+
+
+@dataclass(frozen=True)
+class ObservedFrame:
+    """The views of one frame in which the person is seen."""
+
+    cameras: Cameras  # V, of squares of S px
+    alpha: Tensor  # (V, S, S) float32 in [0, 1]: coverage by the person
+    # (V, S, S) float32, 1 inside the image that the square was cut out of and where its mask
+    # counts, else 0
+    known: Tensor
+    # (V, 55, 3) column and row in the square, as fractions of its side, and confidence of joints
+    # that were marked as key points; None without any
+    joints: Tensor | None = None
+    # (55, 4) positions in the world and confidence of joints that are given in 3D; None without any
+    positions: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.alpha)
+
+    def part(self, turn: int, count: int) -> ObservedFrame:
+        """Return ``count`` of the V views, far apart in their order; V turns show each as often.
+        All if V <= count."""
+        if len(self) <= count:
+            return self
+        rows = [(turn + i * len(self) // count) % len(self) for i in range(count)]
+        picked = {
+            name: x[rows]
+            for name in ("alpha", "known", "joints")
+            if (x := getattr(self, name)) is not None
+        }
+        cameras = self.cameras
+        cameras = Cameras(
+            cameras.cam_from_world[rows], cameras.intrinsics[rows], cameras.width, cameras.height
+        )
+        return replace(self, cameras=cameras, **picked)
+
+    def shrunk(self, factor: int) -> ObservedFrame:
+        """Return the squares with sides divided by ``factor``."""
+        size = self.cameras.width // factor
+        scale = self.cameras.intrinsics.new_tensor([1 / factor, 1 / factor, 1.0])
+        cameras = Cameras(
+            self.cameras.cam_from_world, scale[:, None] * self.cameras.intrinsics, size, size
+        )
+        known = (_resized(self.known, size) > 0.999).float()
+        return ObservedFrame(
+            cameras, _resized(self.alpha, size), known, self.joints, self.positions
+        )
+
+
+def longest_box_side(images: Iterable[Image]) -> int:
+    """Return the longest side of the person's box in the images (with alpha), px; 0 if nobody is
+    seen."""
+    longest = 0
+    for image in images:
+        box = _box(image)
+        longest = longest if box is None else max(longest, box[1] - box[0], box[3] - box[2])
+    return longest
+
+
+def observed_frame(
+    images: Sequence[Image], box_side: int, size: int, marked: Mapping[str, Tensor] | None = None
+) -> ObservedFrame | None:
+    """Return the squares around the person in the images of one frame; None if no image shows
+    anybody.
+
+    ``box_side`` is the ``longest_box_side`` of all images, so that all squares have the same scale;
+    ``size`` is S; ``marked`` are key points (55, 3) in pixels, by image.
+    """
+    side = max(round(_MARGIN * box_side), 1)
+    squares = [
+        square
+        for image in images
+        if (square := _square(image, side, size, marked or {})) is not None
+    ]
+    if not squares:
+        return None
+    poses, intrinsics, alphas, known, joints = (
+        torch.cat(parts) for parts in zip(*squares, strict=True)
+    )
+    return ObservedFrame(
+        Cameras(poses, intrinsics, size, size), alphas, known, joints if marked else None
+    )
+
+
+def _square(
+    image: Image, side: int, size: int, marked: Mapping[str, Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None:
+    """Return pose (1, 4, 4), intrinsics (1, 3, 3), alpha and known (1, S, S) and joints (1, 55, 3)
+    of the square."""
+    box = _box(image)
+    if box is None or image.alpha is None:
+        return None
+    top, left = ((box[i] + box[i + 1] - side) // 2 for i in (0, 2))
+    weights = torch.ones_like(image.alpha) if image.mask is None else image.mask
+    shift = image.cameras.intrinsics.new_tensor(
+        [[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]]
+    )
+    scale = image.cameras.intrinsics.new_tensor([size / side, size / side, 1.0])
+    cut = [_resized(_cut(x, top, left, side)[None], size) for x in (image.alpha, weights)]
+    intrinsics = scale[:, None] * (image.cameras.intrinsics - shift)
+    joints = marked.get(image.name, torch.zeros(len(JOINT_NAMES), 3, device="cpu")).clone()
+    joints[:, :2] = (joints[:, :2] - joints.new_tensor([left, top])) / side
+    return image.cameras.cam_from_world, intrinsics, cut[0], (cut[1] > 0.999).float(), joints[None]
+
+
+def _cut(values: Tensor, top: int, left: int, side: int) -> Tensor:
+    height, width = values.shape
+    square = values.new_zeros(side, side)
+    rows = slice(max(top, 0), min(top + side, height))
+    columns = slice(max(left, 0), min(left + side, width))
+    square[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = values[
+        rows, columns
+    ]
+    return square
+
+
+def _resized(values: Tensor, size: int) -> Tensor:
+    """Return values (V, S', S') averaged over the areas of the pixels of (V, size, size)."""
+    return area_downscale(values.permute(1, 2, 0), size, size).permute(2, 0, 1).contiguous()
+
+
+def _box(image: Image) -> tuple[int, int, int, int] | None:
+    """Return first and last + 1 row, first and last + 1 column of the person; None if nobody is
+    seen."""
+    box = None if image.alpha is None else silhouette_box(image.alpha, 0.5)
+    return None if box is None else (box[0].start, box[0].stop, box[1].start, box[1].stop)
+
+
+NUM_TURNED = 22
+"""Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
+_GIVEN = 0.05  # expected error of given poses, rad
+_LIMIT = 3.0  # standard deviations of usual poses beyond which joints would be dislocated
+_LEAST = 8.0  # least spread, degrees: a few clips do not show how far a joint can go
+_DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "hip": ((-11, 1, -6), (23, 14, 7)),
+    "knee": ((26, 0, 1), (22, 1, 0)),
+    "ankle": ((-1, 27, -12), (13, 8, 6)),
+    "spine1": ((7, 0, 0), (7, 2, 3)),
+    "spine2": ((5, 0, 0), (7, 6, 10)),
+    "spine3": ((-2, 0, 0), (3, 1, 2)),
+    "neck": ((-12, 0, 0), (4, 17, 10)),
+    "head": ((-1, 0, 0), (11, 5, 4)),
+    "collar": ((0, 1, -16), (0, 7, 10)),
+    "shoulder": ((16, -13, -49), (37, 20, 28)),
+    "elbow": ((-7, -40, 16), (5, 29, 13)),
+    "wrist": ((-4, -2, 10), (3, 11, 6)),
+}
+"""Axis-angle vectors of the left side, and their standard deviations; the right side is the mirror
+image."""
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Expected corrections of the poses of F frames, axis-angle, rad."""
+
+    centre: Tensor  # (F, 22, 3) mean
+    spread: Tensor  # (22, 3) standard deviation
+    # of these from the centre, beyond which nobody is expected to turn a joint
+    limit: float = math.inf
+
+
+def near_given(clip: MotionClip) -> PosePrior:
+    """Return the prior that poses are about those given."""
+    return PosePrior(
+        torch.zeros_like(clip.poses[:, :NUM_TURNED]),
+        torch.full_like(clip.poses[0, :NUM_TURNED], _GIVEN),
+    )
+
+
+def usual(clip: MotionClip) -> PosePrior:
+    """Return the prior that corrected poses are usual ones; rotations add as vectors, which holds
+    for small ones."""
+    spread = usual_spread(NUM_TURNED).to(clip.poses)
+    return PosePrior(
+        usual_pose(NUM_TURNED).to(clip.poses) - clip.poses[:, :NUM_TURNED], spread, _LIMIT
+    )
+
+
+def usual_pose(joints: int) -> Tensor:
+    """Return the mean pose (joints, 3), axis-angle, rad; zero for joints that are not known."""
+    return _table(0, joints)
+
+
+def usual_spread(joints: int) -> Tensor:
+    """Return the standard deviations (joints, 3) about it, rad, at least 8 degrees."""
+    return _table(1, joints).abs().clamp_min(torch.deg2rad(torch.tensor(_LEAST, device="cpu")))
+
+
+def _table(which: int, joints: int) -> Tensor:
+    found = torch.zeros(joints, 3, device="cpu")
+    for row, name in enumerate(JOINT_NAMES[:joints]):
+        side, _, rest = name.partition("_")
+        degrees = _DEGREES.get(rest if side in ("left", "right") else name)
+        if degrees is not None:
+            mirrored = (1.0, -1.0, -1.0) if side == "right" else (1.0, 1.0, 1.0)
+            found[row] = torch.tensor(
+                [x * m for x, m in zip(degrees[which], mirrored, strict=True)], device="cpu"
+            )
+    return torch.deg2rad(found)
+
+
+LR = {
+    "log_scale": 3e-3,
+    "betas": 0.1,
+    "turns": 1e-2,
+    "poses": 1e-2,
+    "trans": 6e-3,
+    "padding": 1e-3,
+} | {
+    "offset": 3e-3,
+    "shift": 3e-3,
+    "log_focal": 3e-2,
+}
+"""Learning rates at the first step; those of positions per metre of the person's unit."""
+LR_DECAY = 0.1
+# of the mean squared shape parameter, of bones as well, whose unit is the spread among adults
+BETAS_WEIGHT = 1e-3
+TURN, STEP = 0.25, 0.1
+"""Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the
+next."""
+TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
+"""Of their mean squares. What silhouettes do not show, such as a limb turned about itself, follows
+the noise of Adam's steps where these are much smaller: renders of new poses then lose 1 to 3 dB,
+while the silhouettes look as good."""
+# of the mean square of what lies beyond the limit of a joint, in standard deviations
+LIMIT_WEIGHT = 2e-2
+KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
+"""Expected error of a key point, as a fraction of the square's side, and the weight of their robust
+mean."""
+PLACE, PLACE_WEIGHT = 0.03, 0.1
+"""Expected error of a joint given in 3D, metres of the person, and the weight of their robust
+mean."""
+FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
+"""Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
+PADDING, PADDING_WEIGHT = 0.01, 2e-3
+"""Metres between skin and silhouette that cost as much as one unit of shape, and the weight of
+their mean square."""
+MISTAKEN = 1.0
+"""Squared difference of coverages, over the person's area, from which on a silhouette is rather a
+mistake. Good masks have 0.05 to 0.2; at 0.3 bodies found in masks of a detector were no better, at
+infinity twice as far off."""
+FRAMES = 3  # frames drawn in each step
+VIEWS = 3  # views of a frame, other ones each time, that are drawn where not all are (``InTurn``)
+Observations = Callable[[int], ObservedFrame | None]  # returns what is seen in a row of the clip
+
+
+class InTurn:
+    """Observations of a few views of each frame, other ones each time; ``frames`` are all views, by
+    row of the clip."""
+
+    def __init__(self, frames: Mapping[int, ObservedFrame | None]) -> None:
+        self._frames, self._turns = frames, Counter[int]()
+
+    def __call__(self, row: int) -> ObservedFrame | None:
+        frame = self._frames[row]
+        self._turns[row] += 1
+        return None if frame is None else frame.part(self._turns[row], VIEWS)
+
+
+def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
+    """Return what is learned, all zero.
+
+    ``betas`` (B,) shape; ``log_scale`` (1,) of the factor on the scale; ``turns`` (22, 3)
+    axis-angle, rad, applied before the given rotations, in all frames; ``poses`` (F, 22, 3) the
+    same per frame; ``shift`` (3,) added to the translations, ``offset`` (3,) m in the frame of the
+    pelvis; ``trans`` (F, 3) per frame; ``padding`` (P,) m between skin and silhouette.
+    """
+    joints = surface.body.joints
+    zeros = {
+        "log_scale": joints.new_zeros(1),
+        "betas": joints.new_zeros(surface.shape_dirs.shape[-1]),
+        "turns": joints.new_zeros(NUM_TURNED, 3),
+        "poses": joints.new_zeros(len(clip), NUM_TURNED, 3),
+        "trans": joints.new_zeros(len(clip), 3),
+        "padding": joints.new_zeros(len(surface)),
+        "offset": joints.new_zeros(3),
+        "shift": joints.new_zeros(3),
+    }
+    unit = float(clip.scale.mean())
+    return Parameters(zeros, LR | {name: LR[name] * unit for name in ("trans", "shift")}, LR_DECAY)
+
+
+def with_lens(learned: Parameters, distance: float) -> Parameters:
+    """Return the same with a focal length to be learned: of one camera that stands at the origin of
+    the world.
+
+    Adds ``log_focal`` (1,), the natural logarithm of the factor on the given focal length, and
+    ``distance`` (1,), which is never learned: the camera steps back as its focal length grows, so
+    that what is at this distance stays as large.
+    """
+    blank = learned["log_scale"].detach()
+    values = {"log_focal": torch.zeros_like(blank), "distance": torch.full_like(blank, distance)}
+    rates = {"log_focal": LR["log_focal"], "distance": 0.0}
+    return Parameters(learned.values() | values, learned.rates | rates, learned.decay)
+
+
+def refined(cameras: Cameras, learned: Parameters) -> Cameras:
+    """Return the cameras with the focal length that was learned; as they are where none is."""
+    if "log_focal" not in learned:
+        return cameras
+    factor = learned["log_focal"].exp()
+    focal = torch.zeros_like(cameras.intrinsics[0])
+    focal[0, 0] = focal[1, 1] = 1.0
+    intrinsics = cameras.intrinsics + (factor - 1) * focal * cameras.intrinsics
+    along = torch.zeros_like(cameras.cam_from_world[0])
+    along[2, 3] = 1.0
+    poses = cameras.cam_from_world + (factor - 1) * learned["distance"] * along
+    return Cameras(poses, intrinsics, cameras.width, cameras.height)
+
+
+def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
+    """Return the fitted pose of frame ``row``."""
+    own = learned["turns"] + learned["poses"][row]
+    given = clip.rotations[row]
+    turned = given[: len(own)] @ axis_angle_to_matrix(own)
+    scale = clip.scale[row] * learned["log_scale"][0].exp()
+    away = learned["shift"] + learned["trans"][row] + scale * (turned[0] @ learned["offset"])
+    return BodyPose(torch.cat([turned, given[len(own) :]]), clip.trans[row] + away, scale)
+
+
+def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
+    """Return a mean over the V views of e / (1 + e / ``MISTAKEN``); e is the squared difference
+    over what is seen.
+
+    So a mask that shows half the person, or something else, counts little beside those of the other
+    views (Geman and McClure 1987).
+    """
+    wrong = ((drawn - seen.alpha) * seen.known).square().sum((1, 2))
+    error = wrong / (seen.alpha * seen.known).sum((1, 2)).clamp_min(1.0)
+    return (error / (1 + error / MISTAKEN)).mean()
+
+
+def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
+    """Return the mean robust distance of joints (J, 3) in the world from key points (V, 55, 3), see
+    ``ObservedFrame``.
+
+    J is 24, 52 or 55; joints of the same name are compared.
+    sqrt(1 + (d / ``KEYPOINT``)^2) - 1, weighted by the confidences: large errors count linearly.
+    """
+    rows = SMPLX_ROWS[len(joints)]
+    marked = marked[:, list(rows)]
+    local = (
+        joints[: len(rows)] @ cameras.cam_from_world[:, :3, :3].mT
+        + cameras.cam_from_world[:, None, :3, 3]
+    )
+    pixels = local @ cameras.intrinsics.mT
+    positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
+    away = (positions - marked[..., :2]).square().sum(-1) / KEYPOINT**2
+    weights = marked[..., 2]
+    return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
+
+
+def place_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
+    """Return the mean robust distance of joints (J, 3) from positions (55, 4), as for key points.
+
+    ``unit`` is the length of a metre of the person in the world.
+    """
+    rows = SMPLX_ROWS[len(joints)]
+    given = given[list(rows)]
+    away = (joints[: len(rows)] - given[:, :3]).square().sum(-1) / (PLACE * unit) ** 2
+    weights = given[:, 3]
+    return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
+
+
+def prior(learned: Parameters, expected: PosePrior) -> Tensor:
+    """Return the penalty of shapes, turns and poses that are far from those given, or that jump."""
+    total = learned["betas"].new_zeros(())
+    # Of the free template the last directions are those of bones; SMPL has none.
+    for part in learned["betas"].square().tensor_split([-NUM_BONE_SHAPES]):
+        total = total + (BETAS_WEIGHT * part.mean() if len(part) else 0.0)
+    total = total + TURN_WEIGHT * (learned["turns"][1:] / TURN).square().mean()
+    away = (learned["poses"] - expected.centre) / expected.spread
+    total = total + POSE_WEIGHT * away[:, 1:].square().mean()
+    total = (
+        total + LIMIT_WEIGHT * (away[:, 1:].abs() - expected.limit).clamp_min(0.0).square().mean()
+    )
+    if len(learned["poses"]) > 1:
+        jumps = learned["poses"][1:] - learned["poses"][:-1]
+        total = total + STEP_WEIGHT * (jumps / STEP).square().mean()
+    if "log_focal" in learned:
+        total = total + FOCAL_WEIGHT * (learned["log_focal"] / FOCAL).square().mean()
+    return total + PADDING_WEIGHT * (learned["padding"] / PADDING).square().mean()
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """Given poses of F frames, the template's surface, and the poses that are expected."""
+
+    clip: MotionClip
+    surface: Surface
+    expected: PosePrior
+
+    def run(
+        self,
+        start: Parameters,
+        learned: Sequence[str],
+        steps: int,
+        observed: Observations,
+        tick: Callable[[], None] = lambda: None,
+        fallen: float = 0.0,
+    ) -> Parameters:
+        """Return the fit ``start`` after ``steps`` of Adam on what is named; ``tick`` is called
+        after each.
+
+        Frames are taken in a fixed order that covers the clip evenly. Rates begin where they are
+        after the fraction ``fallen`` of a run; higher where it is negative.
+        """
+        # Copies, as updates are in place and ``start`` may be what is taken in the end; without
+        # moments.
+        found = Parameters(
+            {name: x.clone() for name, x in start.values().items()}, start.rates, start.decay
+        )
+        for name in found.values():
+            found[name].requires_grad_(name in learned)
+        order = spread_order(len(self.clip))
+        for step in range(1, steps + 1):
+            rows = {order[((step - 1) * FRAMES + i) % len(order)] for i in range(FRAMES)}
+            seen = {row: frame for row in sorted(rows) if (frame := observed(row)) is not None}
+            loss = prior(found, self.expected)
+            if seen:
+                loss = loss + mean_error(found, self.clip, self.surface, seen) * (
+                    len(seen) / len(rows)
+                )
+            if loss.requires_grad:  # else nothing is to be learned
+                loss.backward()
+            found.step(step, fallen + (1 - fallen) * step / steps)
+            tick()
+        return found
+
+
+def mean_error(
+    learned: Parameters, clip: MotionClip, surface: Surface, seen: Mapping[int, ObservedFrame]
+) -> Tensor:
+    """Return the error of the frames ``seen``, by row: of silhouettes, and of joints where they are
+    marked."""
+    body = shaped(learned, surface)
+    errors = []
+    for row, frame in seen.items():
+        pose = frame_pose_of(learned, clip, row)
+        cameras = refined(frame.cameras, learned)
+        error = silhouette_error(drawn_silhouettes(body.in_pose(pose), cameras), frame)
+        if frame.joints is not None:
+            joints = posed_joints(body.skeleton, pose)
+            error = error + KEYPOINT_WEIGHT * keypoint_error(joints, frame.joints, cameras)
+        if frame.positions is not None:
+            joints = posed_joints(body.skeleton, pose)
+            error = error + PLACE_WEIGHT * place_error(joints, frame.positions, pose.scale.detach())
+        errors.append(error)
+    return torch.stack(errors).mean()
+
+
+def shaped(learned: Parameters, surface: Surface) -> ShapedSurface:
+    """Return the surface in the fitted shape."""
+    return surface.in_shape(learned["betas"], learned["padding"])
+
+
+def drawn_frame(
+    learned: Parameters, clip: MotionClip, surface: Surface, row: int, cameras: Cameras
+) -> Tensor:
+    """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
+    discs = shaped(learned, surface).in_pose(frame_pose_of(learned, clip, row))
+    return drawn_silhouettes(discs, refined(cameras, learned))
+
+
+def spread_order(count: int) -> list[int]:
+    """Return 0 .. count - 1 in an order whose every stretch is spread over the full range."""
+    stride = max(1, round(count * 0.618))
+    while count > 1 and math.gcd(stride, count) != 1:
+        stride += 1
+    return [(i * stride) % count for i in range(count)]
+
+
+@dataclass(frozen=True)
+class BodyFit:
+    """A body fitted to a clip of F frames, as a correction of the poses that were given."""
+
+    betas: Tensor  # (B,) shape parameters of the template
+    shared: SharedCorrection  # turns of the joints and factor on the size, the same in all frames
+    # (3,) m, correction of the translation in the frame of the pelvis, the same in all frames
+    offset: Tensor
+    shift: Tensor  # (3,) the same in the frame of the world, in its unit
+    poses: Tensor  # (F, J, 3) axis-angle, rad, added to the turns per frame
+    trans: Tensor  # (F, 3) added to the given translations
+
+    def fitted(self, clip: MotionClip) -> MotionClip:
+        """Return the clip that was fitted, with its corrections."""
+        return self._moved(corrected_clip(self.shared, clip, self.poses, self.trans))
+
+    def applied(self, clip: MotionClip) -> MotionClip:
+        """Return another clip whose poses were given by the same means, with what holds for all
+        frames."""
+        return self._moved(corrected_clip(self.shared, clip))
+
+    def _moved(self, turned: MotionClip) -> MotionClip:
+        roots = axis_angle_to_matrix(turned.poses[:, 0])
+        away = self.shift + turned.scale[:, None] * (roots @ self.offset[:, None])[..., 0]
+        return replace(turned, trans=turned.trans + away)
+
+
+def body_fit(learned: Parameters, joints: int) -> BodyFit:
+    """Return what was learned (``new_fit``) as a fit of a body of so many joints."""
+    values = learned.values()
+
+    def padded(turns: Tensor) -> Tensor:
+        blank = turns.new_zeros(*turns.shape[:-2], joints - turns.shape[-2], 3)
+        return torch.cat([turns, blank], dim=-2)
+
+    shared = SharedCorrection(padded(values["turns"]), float(values["log_scale"][0]))
+    positions = (values["offset"], values["shift"])
+    return BodyFit(values["betas"], shared, *positions, padded(values["poses"]), values["trans"])
+
+
+EVERY = 4  # each so many-th frame is left out: of those only poses are fitted
+# fraction by which the error on frames left out must fall for a refined focal length to be taken
+LENS_GAIN = 0.01
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """A focal length that was tried."""
+
+    factor: float  # on the guessed focal length
+    # from the camera at which the size in the images is kept, in units of the world
+    distance: float
+    # on the frames left out, with the focal length as guessed and as refined
+    error: tuple[float, float]
+    taken: bool  # the refined one is better
+
+    def summary(self) -> str:
+        """Return a line for people."""
+        guessed, refined = self.error
+        return (
+            f"focal length: {self.factor:.2f} times the guess, error on frames left out {guessed:.4f} -> {refined:.4f}"
+            + (", taken" if self.taken else ": the guess stays, as the images do not tell")
+        )
+
+
+def fit_lens(
+    fitting: Fitting,
+    start: Parameters,
+    shape: Sequence[str],
+    observed: Observations,
+    steps: int,
+    tick: Callable[[], None] = lambda: None,
+) -> tuple[Parameters, LensFit]:
+    """Return the fit of shape, poses and focal length to the frames of one camera at the origin;
+    ``start`` if it stays.
+
+    Both lenses are fitted to three of four frames; then poses of the other frames: where these
+    agree better, the refined one is taken. ``start`` was found with the guessed focal length;
+    ``shape`` names what is the same in all frames.
+    """
+    rows = list(range(len(fitting.clip)))
+    apart = rows[EVERY // 2 :: EVERY] or rows
+    rest = [row for row in rows if row not in apart] or rows
+    own = ("poses", "trans")
+
+    def run(start: Parameters, learned: Sequence[str], seen: Sequence[int]) -> Parameters:
+        return fitting.run(
+            start, learned, steps, lambda row: observed(row) if row in seen else None, tick
+        )
+
+    distance = float(-fitting.clip.trans[:, 2].mean())
+    guessed = run(start, (*shape, *own), rest)
+    refined = run(with_lens(start, distance), (*shape, *own, "log_focal"), rest)
+    both = [run(found, own, apart) for found in (guessed, refined)]
+    errors = (
+        _mean_error(fitting, both[0], observed, apart),
+        _mean_error(fitting, both[1], observed, apart),
+    )
+    taken = errors[1] < (1 - LENS_GAIN) * errors[0]
+    found = run(both[1], (*shape, *own, "log_focal"), rows) if taken else start
+    last = found if taken else refined
+    return found, LensFit(float(last["log_focal"].detach().exp()), distance, errors, taken)
+
+
+@torch.no_grad()
+def _mean_error(
+    fitting: Fitting, learned: Parameters, observed: Observations, rows: Sequence[int]
+) -> float:
+    seen = {row: frame for row in rows if (frame := observed(row)) is not None}
+    return float(mean_error(learned, fitting.clip, fitting.surface, seen)) if seen else 0.0
+
+
+NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor
+LIKELY = 3  # of these, nearest to the key points, that are tried where there are some
+MOST_ANCHORS = 20  # frames in which headings are tried
+CHANGE_WEIGHT = 0.01
+"""Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the
+square."""
+
+
+def likely_path(errors: Sequence[Sequence[float]], weight: float = CHANGE_WEIGHT) -> list[int]:
+    """Return the heading (A,) of each anchor for which errors (A, H) and changes of heading cost
+    least in all.
+
+    Source: the algorithm of Viterbi, 1967.
+    """
+    costs = np.asarray(errors, dtype=np.float64)
+    count = costs.shape[1]
+    apart = np.abs(np.arange(count)[:, None] - np.arange(count))
+    change = weight * (np.minimum(apart, count - apart) * (8 / count)) ** 2
+    total = costs[0]
+    came_from = []
+    for own in costs[1:]:
+        ways = total[:, None] + change
+        came_from.append(ways.argmin(0))
+        total = ways.min(0) + own
+    path = [int(total.argmin())]
+    for back in reversed(came_from):
+        path.append(int(back[path[-1]]))
+    return path[::-1]
+
+
+def roots_between(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
+    """Return rotations (count, 3) of the root, axis-angle, rad: those (A, 3) of the anchors, turned
+    on between them.
+
+    Before the first anchor and after the last one they stay.
+    """
+    if len(anchors) == 1:
+        return roots.expand(count, 3).clone()
+    between = Slerp(np.asarray(anchors, dtype=np.float64), Rotation.from_rotvec(roots.numpy()))
+    rows = np.clip(np.arange(count, dtype=np.float64), anchors[0], anchors[-1])
+    return torch.from_numpy(between(rows).as_rotvec()).to(roots)
+
+
+def angle_between(a: Tensor, b: Tensor) -> float:
+    """Return the angle, rad, of the rotation from ``a`` (3,) to ``b`` (3,), both axis-angle."""
+    return float(
+        (Rotation.from_rotvec(a.numpy()).inv() * Rotation.from_rotvec(b.numpy())).magnitude()
+    )
+
+
+def heading(index: int) -> float:
+    """Return the angle about the vertical, rad, of the heading ``index``."""
+    return 2 * math.pi * index / NUM_HEADINGS
+
+
+STEPS = 40
+"""Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of
+the one before."""
+OFF_COURSE = math.radians(30)
+"""Rotation of the root away from the path of headings from which a frame is begun on that path
+instead."""
+ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
+"""Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent
+forward."""
+# headings of the first frame from which clips without key points are followed without the path, too
+_WITHOUT_PATH = 2
+MOMENTUM = 0.8
+"""Fraction of the last rotation that is expected again, so that legs which pass each other are not
+exchanged."""
+STATURE = 1.70  # height of a person in a usual pose, m, where a single camera leaves it open
+PELVIS_FRACTION = 0.53  # height of the pelvis, of that of the person
+
+
+def first_poses(
+    times: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None] = lambda: None
+) -> MotionClip:
+    """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row)
+    alone.
+
+    In some frames, the anchors, every heading is tried; a likely path through them says which way
+    the person faces. Each frame starts from the pose of the one before, and where that has left the
+    path from the path's heading. Without key points clips that never look at the path are compared
+    with it. Raises ValueError: nobody in the first frame.
+    """
+    seen = observed(0)
+    if seen is None:
+        raise ValueError("nobody is seen in the first frame")
+    standing = standing_clip(times, surface, observed)
+    up = up_of(seen)
+    shown = {
+        row: frame
+        for row in evenly_spaced(len(times), MOST_ANCHORS)
+        if (frame := observed(row)) is not None
+    }
+    anchors = list(shown)
+    tried = [_all_headings(standing, row, up, surface, shown[row], tick) for row in shown]
+    path = likely_path([[error for _, _, error in own] for own in tried])
+    roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
+    ways: list[tuple[int, Tensor | None]] = [(path[0], roots_between(anchors, roots, len(times)))]
+    if seen.joints is None:
+        best = sorted(range(NUM_HEADINGS), key=lambda i: tried[0][i][2])
+        ways += [(index, None) for index in best[:_WITHOUT_PATH]]
+    followed = []
+    for index, along in ways:
+        pose, trans, error = tried[0][index]
+        first = _with_better_arms(_with_row(standing, 0, pose, trans), error, surface, seen)
+        followed.append(_followed(first, along, surface, observed, tick))
+    return min(followed, key=lambda found: found[1])[0]
+
+
+def num_ticks(frames: int, *, marked: bool) -> int:
+    """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without
+    key points."""
+    headings, ways = (LIKELY, 1) if marked else (NUM_HEADINGS, 1 + _WITHOUT_PATH)
+    return headings * len(evenly_spaced(frames, MOST_ANCHORS)) + (frames - 1) * ways
+
+
+def _all_headings(
+    clip: MotionClip,
+    row: int,
+    up: Tensor,
+    surface: Surface,
+    seen: ObservedFrame,
+    tick: Callable[[], None],
+) -> list[tuple[Tensor, Tensor, float]]:
+    """Return pose, translation and error of a frame as found from each heading; after the first at
+    half the size.
+
+    With key points only the ``LIKELY`` headings are tried, and the error of others is infinite.
+    """
+    starts = [turned(clip, heading(index), up) for index in range(NUM_HEADINGS)]
+    errors = [_marked_error(start, row, surface, seen) for start in starts]
+    likely = sorted(range(NUM_HEADINGS), key=errors.__getitem__)[
+        : NUM_HEADINGS if seen.joints is None else LIKELY
+    ]
+    found = [(start.poses[row], start.trans[row], math.inf) for start in starts]
+    for index in likely:
+        levels = (2, 1) if row == 0 else (2,)
+        found[index] = _found_from(starts[index], *found[index][:2], row, surface, seen, levels)
+        tick()
+    return found
+
+
+@torch.no_grad()
+def _marked_error(clip: MotionClip, row: int, surface: Surface, seen: ObservedFrame) -> float:
+    """Return the error of the key points of a frame; 0 without any."""
+    if seen.joints is None:
+        return 0.0
+    blank = new_fit(clip, surface)
+    joints = posed_joints(surface.skeleton(blank["betas"]), frame_pose_of(blank, clip, row))
+    return float(keypoint_error(joints, seen.joints, seen.cameras))
+
+
+def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
+    poses = clip.poses.clone()
+    positions = clip.trans.clone()
+    poses[row], positions[row] = pose, trans
+    return replace(clip, poses=poses, trans=positions)
+
+
+def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
+    """Return the usual pose, upright, at the place and in the size of the silhouettes of each
+    frame.
+
+    Where nobody is seen, the place is that of the frame before.
+    """
+    joints = surface.body.joints
+    up = torch.zeros(3, device="cpu")
+    positions = []
+    heights = []
+    for row in range(len(times)):
+        seen = observed(row)
+        if seen is None:
+            positions.append(positions[-1] if positions else torch.zeros(3, device="cpu"))
+            continue
+        up = up if up.any() else up_of(seen)
+        place, height = place_and_height(seen, up)
+        positions.append(place)
+        heights += [] if height is None else [height]
+    upright = Rotation.align_vectors(up[None].numpy(), np.array([[0.0, 1.0, 0.0]]))[0]
+    poses = usual_pose(len(joints)).to(joints).repeat(len(times), 1, 1)
+    poses[:, 0] = torch.from_numpy(upright.as_rotvec()).to(poses)
+    scale = float(np.median(heights)) / STATURE if heights else 1.0
+    trans = torch.stack(positions) - scale * joints[0]  # the root turns about the pelvis
+    return MotionClip(times, poses, trans, torch.full((len(times),), scale, device="cpu"))
+
+
+def up_of(seen: ObservedFrame) -> Tensor:
+    """Return the unit vector (3,) that points up in the images, a mean over cameras."""
+    up = -seen.cameras.cam_from_world[:, 1, :3].mean(0)
+    return up / up.norm()
+
+
+def place_and_height(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | None]:
+    """Return the place (3,) of the pelvis in the world and the height of the person, None if one
+    camera sees them."""
+    rays = [_ray(seen.cameras.select(i), seen.alpha[i]) for i in range(len(seen))]
+    rays = [ray for ray in rays if ray is not None]
+    if not rays:
+        return torch.zeros(3, device="cpu"), None
+    starts, directions, angles = (torch.stack(x) for x in zip(*rays, strict=True))
+    if len(rays) == 1:
+        middle = starts[0] + directions[0] * STATURE / angles[0]
+        height = None
+    else:
+        across = torch.eye(3, device="cpu") - directions[:, :, None] * directions[:, None]
+        middle = torch.linalg.lstsq(across.sum(0), (across @ starts[..., None]).sum(0)).solution[
+            :, 0
+        ]
+        height = float((angles * (middle - starts).norm(dim=1)).median())
+    return middle + up * (PELVIS_FRACTION - 0.5) * (height or STATURE), height
+
+
+def turned(clip: MotionClip, angle: float, up: Tensor) -> MotionClip:
+    """Return the clip with the person turned by ``angle``, rad, about ``up`` through the pelvis."""
+    turn = Rotation.from_rotvec(angle * up.numpy()) * Rotation.from_rotvec(clip.poses[:, 0].numpy())
+    poses = clip.poses.clone()
+    poses[:, 0] = torch.from_numpy(turn.as_rotvec()).to(poses)
+    return replace(clip, poses=poses)
+
+
+def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Return start and unit direction (3,) of the ray through the middle of a silhouette, and its
+    height as an angle.
+
+    The angle is the height over the distance, for a person who stands upright in the image. None if
+    nobody is seen.
+    """
+    box = silhouette_box(alpha, 0.5)
+    if box is None:
+        return None
+    (top, bottom), (left, right) = ((part.start, part.stop) for part in box)
+    middle = torch.tensor([(left + right) / 2, (top + bottom) / 2, 1.0], device="cpu")
+    intrinsics = camera.intrinsics[0]
+    pose = camera.cam_from_world[0]
+    local = torch.linalg.solve(intrinsics, middle)
+    direction = pose[:3, :3].T @ local
+    return (
+        camera.centers[0],
+        direction / direction.norm(),
+        (bottom - top) / (intrinsics[1, 1] * local.norm()),
+    )
+
+
+def _followed(
+    clip: MotionClip,
+    roots: Tensor | None,
+    surface: Surface,
+    observed: Observations,
+    tick: Callable[[], None],
+) -> tuple[MotionClip, float]:
+    """Return the clip with the poses after the first frame found one by one, and the mean error of
+    what is seen.
+
+    ``roots`` (F, 3) is a path of headings to stay near; None: there is none.
+    """
+    poses = clip.poses.clone()
+    trans = clip.trans.clone()
+    errors = []
+    for row in range(1, len(poses)):
+        seen = observed(row)
+        poses[row] = _extrapolated(poses, row)
+        trans[row] = trans[row - 1] + clip.trans[row] - clip.trans[row - 1]
+        if seen is not None:
+            starts = [poses[row]]
+            if roots is not None and angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
+                starts = [
+                    torch.cat([roots[row : row + 1], others[1:]])
+                    for others in (poses[row], clip.poses[row])
+                ]
+            found = [_found_from(clip, start, trans[row], row, surface, seen) for start in starts]
+            poses[row], trans[row], error = min(found, key=lambda x: x[2])
+            errors.append(error)
+        tick()
+    return replace(clip, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
+
+
+def _with_better_arms(
+    clip: MotionClip, error: float, surface: Surface, seen: ObservedFrame
+) -> MotionClip:
+    """Return the clip whose first frame has the arms that fit best, of those found from other
+    positions as well.
+
+    A forearm that starts in front of the trunk does not find its way out of it.
+    """
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for shoulder, elbow in ARMS:
+            pose = clip.poses[0].clone()
+            for name, degrees in (("shoulder", shoulder), ("elbow", elbow)):
+                turn = pose.new_tensor([degrees[0], sign * degrees[1], sign * degrees[2]])
+                pose[JOINT_NAMES.index(f"{side}_{name}")] = torch.deg2rad(turn)
+            pose, trans, found = _found_from(clip, pose, clip.trans[0], 0, surface, seen)
+            if found < error:
+                error = found
+                clip = _with_row(clip, 0, pose, trans)
+    return clip
+
+
+def _found_from(
+    clip: MotionClip,
+    pose: Tensor,
+    trans: Tensor,
+    row: int,
+    surface: Surface,
+    seen: ObservedFrame,
+    levels: tuple[int, ...] = (2, 1),
+) -> tuple[Tensor, Tensor, float]:
+    """Return pose (J, 3), translation and error of one frame, found from a start; unusual poses add
+    to the error.
+
+    ``levels`` are the factors by which what is seen is made smaller, one after the other.
+    """
+    one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
+    learned = new_fit(one, surface)
+    fitting = Fitting(one, surface, usual(one))
+    for level in levels:
+        learned = fitting.run(learned, ("poses", "trans"), STEPS, InTurn({0: seen.shrunk(level)}))
+    with torch.no_grad():
+        error = float(
+            mean_error(learned, one, surface, {0: seen}) + prior(learned, fitting.expected)
+        )
+    own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
+    given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
+    found = pose.clone()
+    found[:NUM_TURNED] = torch.from_numpy((given * own).as_rotvec()).to(found)
+    return found, trans + learned["trans"][0].detach(), error
+
+
+def _extrapolated(poses: Tensor, row: int) -> Tensor:
+    """Return the pose (J, 3) expected in frame ``row``: that before it, turned on as it turned
+    before.
+
+    What was put on the path of headings was no motion.
+    """
+    if row < 2 or angle_between(poses[row - 2, 0], poses[row - 1, 0]) > OFF_COURSE:
+        return poses[row - 1].clone()
+    before, last = (Rotation.from_rotvec(x.numpy()) for x in (poses[row - 2], poses[row - 1]))
+    on = Rotation.from_rotvec(MOMENTUM * (before.inv() * last).as_rotvec())
+    return torch.from_numpy((last * on).as_rotvec()).to(poses)
+
 
 IMAGE_SIDE = 512  # longest side of the images that are read, px
 RESOLUTION = 48  # texels per side of the atlas whose discs are drawn

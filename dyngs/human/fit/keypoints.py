@@ -20,8 +20,15 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.images.lens import undistorted_points
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.io.fields import LARGEST, entry, first_few, float_array, numbers_of, read_json_object
-from dyngs.io.limits import require_at_most
+from dyngs.io.fields import (
+    LARGEST,
+    entry,
+    first_few,
+    float_array,
+    numbers_of,
+    read_json_object,
+    require_at_most,
+)
 from dyngs.io.numpy_files import read_arrays, read_npz
 from dyngs.io.pickles import read_pickle
 

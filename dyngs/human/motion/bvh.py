@@ -21,7 +21,7 @@ from dyngs.human.motion.motion import (
     require_frame_count,
     require_frame_rate,
 )
-from dyngs.io.limits import read_limited, require_at_most
+from dyngs.io.fields import read_limited, require_at_most
 
 _END_SITE = -1
 _MOST_JOINTS = 4096

@@ -19,8 +19,8 @@ from dyngs.human.motion.motion import (
     require_frame_count,
     sample_times,
 )
+from dyngs.io.fields import require_at_most
 from dyngs.io.gltf import MOST_JOINTS, Animation, GltfFile
-from dyngs.io.limits import require_at_most
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 _VRM_THUMBS = {

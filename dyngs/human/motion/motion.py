@@ -23,7 +23,7 @@ from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.io.limits import VARIABLE, allowed
+from dyngs.io.fields import VARIABLE, allowed
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000

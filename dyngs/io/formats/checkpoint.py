@@ -14,8 +14,8 @@ from torch import Tensor
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
-from dyngs.io.limits import require_at_most
 
 _HINT = "export a .ply with the program that wrote it, such as `ns-export gaussian-splat`"
 _SHAPES = {"means": 3, "scales": 3, "quats": 4, "opacities": 1}
@@ -74,7 +74,7 @@ def _load(path: Path) -> object:
         return torch.load(path, map_location="cpu", mmap=True, weights_only=True)
     except OSError:
         raise
-    except Exception as error:  # a damaged pickle may raise any
+    except Exception as error:  # a damaged pickle may raise any; the text of torch misleads
         raise DyngsError(
             f"{path}: is damaged, or holds objects that only code could restore; {_HINT}"
         ) from error
@@ -95,13 +95,8 @@ def _tensors_of(contents: object) -> dict[str, Tensor]:
         and value.layout == torch.strided
         and value.device.type == "cpu"
     }
-    prefixes = [
-        name.removesuffix("means") for name in tensors if name == "means" or name.endswith(".means")
-    ]
+    prefixes = [name.removesuffix("means") for name in tensors if f".{name}".endswith(".means")]
     if len(prefixes) != 1:
         return {}
-    return {
-        name.removeprefix(prefixes[0]): tensor
-        for name, tensor in tensors.items()
-        if name.startswith(prefixes[0])
-    }
+    (prefix,) = prefixes
+    return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}

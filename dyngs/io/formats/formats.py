@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -13,8 +14,20 @@ import torch
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading, require_regular
 from dyngs.core.gaussians import Gaussians
-from dyngs.io.formats.edit_note import note_path, read_note, write_note
-from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, axis_of, turn_between
+from dyngs.io.formats import gltf, ply
+from dyngs.io.formats.antimatter import read_antimatter, write_antimatter
+from dyngs.io.formats.checkpoint import read_checkpoint
+from dyngs.io.formats.gltf import read_gltf, write_gltf
+from dyngs.io.formats.ply import read_ply, write_ply
+from dyngs.io.formats.similarity import (
+    AXES,
+    UNMOVED,
+    Similarity,
+    axis_of,
+    similarity_of,
+    turn_between,
+)
+from dyngs.io.formats.sog import SOG_META, read_sog, write_sog
 from dyngs.io.formats.splat_file import (
     GEO_OFFSET,
     Nonfinite,
@@ -26,7 +39,49 @@ from dyngs.io.formats.splat_file import (
     unit_rotations,
     with_degree,
 )
-from dyngs.io.write import atomic_file
+from dyngs.io.formats.spz import SYSTEM_OF_UP, read_spz, write_spz, write_spz_4
+from dyngs.io.formats.usd import read_usd, write_usd
+from dyngs.io.write import atomic_file, write_text
+
+_MOST_BYTES = 4096
+
+
+def note_path(path: Path) -> Path:
+    """Return where the note of a file lies."""
+    return path.with_name(f"{path.name}.edit.json")
+
+
+def write_note(path: Path, edited: Similarity) -> None:
+    """Write the note of the file ``path``, which it knows by its digest, atomically."""
+    write_text(
+        note_path(path), json.dumps({"edited": edited.numbers, "sha256": _digest(path)}) + "\n"
+    )
+
+
+def read_note(path: Path) -> Similarity:
+    """Return what the note of the file ``path`` says; no change without one, or where it is about
+    another file.
+
+    Raises DyngsError: it is damaged.
+    """
+    note = note_path(path)
+    if not note.is_file():
+        return UNMOVED
+    try:
+        if note.stat().st_size > _MOST_BYTES:
+            raise ValueError("too large")
+        told = json.loads(note.read_bytes())
+        edited = similarity_of([float(x) for x in told["edited"]])
+        digest = str(told["sha256"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise DyngsError(
+            f"{note}: is no note of `dyngs edit`; remove it, or write {path.name} again"
+        ) from None
+    return edited if digest == _digest(path) else UNMOVED
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -37,61 +92,35 @@ class Format:
     suffixes: tuple[str, ...]  # of its files, lower case; the first one is written
     up: str  # axis that viewers of these files take for up
     max_degree: int  # largest degree of the harmonics that it holds
-    states_mode: bool  # whether it can say that the scene is antialiased
-    home: tuple[str, str, str]  # module and the names of its reader and its writer
+    read: Callable[[Path], SplatFile]
+    write: Callable[[Path, SplatFile], None] | None
+    states_mode: bool = True  # whether it can say that the scene is antialiased
+    # whether its files say how they were turned and edited; beside others lies a note about edits
+    holds_comments: bool = True
     # smallest and largest logarithm of a size that it holds
     log_scales: tuple[float, float] = (-math.inf, math.inf)
 
-    @property
-    def holds_comments(self) -> bool:
-        """Return whether its files say how they were turned and edited; beside others lies a note
-        about edits."""
-        return self.home[0] in ("ply", "gltf", "usd", "sog")
 
-    @property
-    def reader(self) -> Callable[[Path], SplatFile]:
-        """Return the function that reads it."""
-        return getattr(import_module(f"dyngs.io.formats.{self.home[0]}"), self.home[1])
-
-    @property
-    def writer(self) -> Callable[[Path, SplatFile], None]:
-        """Return the function that writes it."""
-        return getattr(import_module(f"dyngs.io.formats.{self.home[0]}"), self.home[2])
-
-
+_SPZ = Format("spz", (".spz",), "y", 3, read_spz, write_spz, True, False, (-10.0, 5.9375))
+_GLB = Format("glb", (".glb",), "y", 3, read_gltf, write_gltf, False)
 FORMATS = (
-    Format(
-        "compressed-ply",
-        (".compressed.ply",),
-        "-y",
-        3,
-        True,
-        ("ply", "read_ply", "write_compressed"),
-    ),
-    Format("ply", (".ply",), "-y", 4, True, ("ply", "read_ply", "write_ply")),
-    Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz"), (-10.0, 5.9375)),
-    Format(
-        "splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")
-    ),
-    Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
-    Format("glb", (".glb",), "y", 3, False, ("gltf", "read_gltf", "write_gltf")),
-    Format("usd", (".usdc", ".usd", ".usda"), "y", 4, False, ("usd", "read_usd", "write_usd")),
+    Format("compressed-ply", (".compressed.ply",), "-y", 3, read_ply, ply.write_compressed),
+    Format("ply", (".ply",), "-y", 4, read_ply, write_ply),
+    _SPZ,
+    Format("splat", (".splat",), "-y", 0, read_antimatter, write_antimatter, False, False),
+    Format("sog", (".sog",), "-y", 3, read_sog, write_sog),
+    _GLB,
+    Format("usd", (".usdc", ".usd", ".usda"), "y", 4, read_usd, write_usd, False),
 )
 """All formats; a suffix that ends another one stands after it."""
-SPZ_4 = Format("spz", (".spz",), "y", 4, True, ("spz", "read_spz", "write_spz_4"), (-10.0, 5.9375))
-GLB_OF_SPZ = Format(
-    "glb", (".glb",), "y", 3, True, ("gltf", "read_gltf", "write_compressed"), (-10.0, 5.9375)
+SPZ_4 = replace(_SPZ, max_degree=4, write=write_spz_4)
+GLB_OF_SPZ = replace(
+    _GLB, write=gltf.write_compressed, states_mode=True, log_scales=_SPZ.log_scales
 )
 """Other ways to write files of a suffix."""
-SOG_META, SOG_INDEX = "meta.json", "lod-meta.json"
-"""Files of a .sog as a folder, and of one in levels of detail."""
-CHECKPOINT = Format(
-    "checkpoint", (".ckpt", ".pt"), "z", 4, False, ("checkpoint", "read_checkpoint", "")
-)
+CHECKPOINT = Format("checkpoint", (".ckpt", ".pt"), "z", 4, read_checkpoint, None, False, False)
 """Read, never written."""
-SYSTEM_OF_UP = {"y": 4, "-y": 6, "z": 12, "-z": 14}
-"""Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot
-state others."""
+SOG_INDEX = "lod-meta.json"  # of a .sog in levels of detail
 # fraction of the Gaussians that may be of a size that a format does not hold, without a note
 _MOST_LOST = 0.01
 
@@ -110,10 +139,10 @@ def format_of(path: Path) -> Format:
     of them."""
     found = known_format(path)
     if found is None:
-        given = (
-            f"the suffix {path.suffix!r} names" if path.suffix else "a name without a suffix names"
+        given = f"the suffix {path.suffix!r}" if path.suffix else "a name without a suffix"
+        raise DyngsError(
+            f"{path}: {given} names no format of Gaussians; use one of {all_suffixes()}"
         )
-        raise DyngsError(f"{path}: {given} no format of Gaussians; use one of {all_suffixes()}")
     return found
 
 
@@ -121,7 +150,7 @@ def known_format(path: Path) -> Format | None:
     """Return the format that the suffix of ``path`` names, None if none does."""
     name = path.name.lower()
     for candidate in FORMATS:
-        if any(name.endswith(suffix) and name != suffix for suffix in candidate.suffixes):
+        if name.endswith(candidate.suffixes) and name not in candidate.suffixes:
             return candidate
     return None
 
@@ -132,11 +161,12 @@ def format_to_read(path: Path) -> Format | None:
 
     A run is none, whatever lies in its folder. Raises DyngsError as of ``sog_meta``.
     """
-    if path.is_dir():
-        is_run = (path / "config.yaml").is_file()
-        return None if is_run or sog_meta(path) is None else format_named("sog")
+    if (path / "config.yaml").is_file():
+        return None
     if sog_meta(path) is not None:
         return format_named("sog")
+    if path.is_dir():
+        return None
     return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
 
 
@@ -149,19 +179,16 @@ def sog_meta(path: Path) -> Path | None:
         raise DyngsError(
             f"{path}: is a .sog in levels of detail; give the {SOG_META} of one of its folders, such as 0_0"
         )
-    if path.name == SOG_META:
-        return path
-    return path / SOG_META if (path / SOG_META).is_file() else None
+    inner = path if path.name == SOG_META else path / SOG_META
+    return inner if inner is path or inner.is_file() else None
 
 
 def format_named(name: str) -> Format:
     """Return the format called ``name``. Raises DyngsError if there is none."""
-    for candidate in FORMATS:
-        if candidate.name == name:
-            return candidate
-    raise DyngsError(
-        f"no format {name!r:.30} of Gaussians; use one of {', '.join(f.name for f in FORMATS)}"
-    )
+    known = {candidate.name: candidate for candidate in FORMATS}
+    if name not in known:
+        raise DyngsError(f"no format {name!r:.30} of Gaussians; use one of {', '.join(known)}")
+    return known[name]
 
 
 def all_suffixes() -> str:
@@ -184,10 +211,10 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     require_regular(path)
     path = sog_meta(path) or path
     with reading(path):
-        splat = own.reader(path)
+        splat = own.read(path)
         if splat.up is None:
             splat = replace(splat, up=own.up)
-        if splat.edited == UNMOVED and own.home[0] != "ply":
+        if splat.edited == UNMOVED and not own.holds_comments:
             splat = replace(splat, edited=read_note(path))
         return drawable(move_to_origin(splat), path, nonfinite)
 
@@ -221,8 +248,9 @@ def write_splats(
     own = own or format_of(path)
     whole, notes = fitted(path, own, splat, sh_degree)
     with atomic_file(path) as temporary:
+        assert own.write is not None
         try:
-            own.writer(temporary, whole)
+            own.write(temporary, whole)
         except DyngsError as error:
             reason = str(error).removeprefix(f"{temporary}: ")
             raise DyngsError(f"{path}: not written: {reason}") from error

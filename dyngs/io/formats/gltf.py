@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms, srgb_decoded
 from dyngs.core.gaussians import Gaussians
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
 from dyngs.io.formats.splat_file import (
     MOST_GAUSSIANS,
@@ -31,7 +31,6 @@ from dyngs.io.formats.splat_file import (
 )
 from dyngs.io.formats.spz import packed_spz, unpacked_spz
 from dyngs.io.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
-from dyngs.io.limits import require_at_most
 
 EXTENSION = "KHR_gaussian_splatting"
 # the draft has both names
@@ -70,7 +69,7 @@ def read_gltf(path: Path) -> SplatFile:
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
     return described(
-        SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras)), path
+        SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras))
     )
 
 
@@ -153,10 +152,9 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
 def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
     """Yield the primitives of Gaussians, and the matrices (4, 4) by which nodes place them."""
     document = file.document
+    nodes = document.nodes
     visited = 0
-    if document.scenes and document.scene >= len(document.scenes):
-        raise file.error(f"scene {document.scene} is missing; export it again")
-    roots = document.scenes[document.scene].nodes if document.scenes else range(len(document.nodes))
+    roots = document.scenes[document.scene].nodes if document.scenes else range(len(nodes))
     waiting = [(node, np.eye(4), 0) for node in roots]
     while waiting:
         index, above, depth = waiting.pop()
@@ -165,21 +163,18 @@ def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
             raise file.error(
                 f"has more than {_MOST_NODES} nodes or {_MOST_DEPTH} of them above one another"
             )
-        if index >= len(document.nodes):
-            raise file.error(f"node {index} is missing; export it again")
-        node = document.nodes[index]
+        node = nodes[index]
         world = above @ _matrix(node)
         waiting += [(child, world, depth + 1) for child in node.children]
-        if node.mesh is not None and node.mesh >= len(document.meshes):
-            raise file.error(f"mesh {node.mesh} is missing; export it again")
-        primitives = () if node.mesh is None else document.meshes[node.mesh].primitives
-        for primitive in primitives:
+        for primitive in () if node.mesh is None else document.meshes[node.mesh].primitives:
             if EXTENSION in primitive.extensions:
                 yield primitive, world
 
 
 def _matrix(node: Node) -> np.ndarray:
     """Return the transform (4, 4) of a node; a rotation of zeros counts as none."""
+    from scipy.spatial.transform import Rotation
+
     if node.matrix is not None:
         return np.array(node.matrix).reshape(4, 4).T
     matrix = np.eye(4)
@@ -197,11 +192,9 @@ def _compressed(file: GltfFile, primitive: Primitive) -> SplatFile | None:
     3DGS.
     """
     own = primitive.extensions[EXTENSION]
-    if not isinstance(own, dict):
-        raise file.error(f"{EXTENSION} is no object; export it again")
-    more = own.get("extensions", {})
-    if not isinstance(more, dict):
-        raise file.error(f"the extensions of {EXTENSION} are no object; export it again")
+    more = own.get("extensions", {}) if isinstance(own, dict) else None
+    if not isinstance(own, dict) or not isinstance(more, dict):
+        raise file.error(f"{EXTENSION} or its extensions are no object; export it again")
     # The draft of the compression leaves out both, which the base extension requires.
     is_optional = any(name in more for name in _COMPRESSIONS)
     for key in ("kernel", "colorSpace"):
@@ -210,9 +203,7 @@ def _compressed(file: GltfFile, primitive: Primitive) -> SplatFile | None:
             raise file.error(f"{key} {own.get(key)!r:.40} is not supported, only {known}")
     for name, value in more.items():
         if name not in _COMPRESSIONS:
-            raise file.error(
-                f"its Gaussians need the extension {name!r:.80}, which is not supported"
-            )
+            raise file.error(f"its Gaussians need {name!r:.80}, which is not supported")
         view = value.get("bufferView") if isinstance(value, dict) else None
         return unpacked_spz(file.path, file.view_bytes(view, name))
     return None
@@ -221,25 +212,23 @@ def _compressed(file: GltfFile, primitive: Primitive) -> SplatFile | None:
 def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
     names = primitive.attributes
 
-    def numbers(name: str, kind: str) -> np.ndarray:
+    def numbers(name: str, kind: str = "VEC3") -> np.ndarray:
         if name not in names:
             raise file.error(f"its Gaussians have no {name:.60}; export it again")
         found = file.numbers(names[name], kind, np.float32)
         require_at_most(file.path, len(found), MOST_GAUSSIANS, "Gaussians")
         return found
 
-    means = numbers("POSITION", "VEC3")
     terms = []
     for degree in range(4):
         keys = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)]
         if degree and keys[0] not in names:
             break
-        terms += [numbers(key, "VEC3") for key in keys]
-    scales = numbers(f"{EXTENSION}:SCALE", "VEC3")
-    opacities = numbers(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0]
-    rotations = numbers(f"{EXTENSION}:ROTATION", "VEC4")
-    if any(len(x) != len(means) for x in (*terms, scales, opacities, rotations)):
-        raise file.error("the attributes of its Gaussians have different lengths; export it again")
+        terms += [numbers(key) for key in keys]
     return from_linear(
-        means, rotations[:, [3, 0, 1, 2]], scales, opacities, np.stack(terms, axis=1)
+        numbers("POSITION"),
+        numbers(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
+        numbers(f"{EXTENSION}:SCALE"),
+        numbers(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
+        np.stack(terms, axis=1),
     )

@@ -74,7 +74,7 @@ def read_ply(path: Path) -> SplatFile:
             gaussians = _read_compressed(header, file, path)
         else:
             gaussians = _gaussians(header.read(file, "vertex"))
-    return described(SplatFile(gaussians, comments=header.comments), path)
+    return described(SplatFile(gaussians, comments=header.comments))
 
 
 def write_ply(

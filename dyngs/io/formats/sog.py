@@ -13,17 +13,15 @@ import json
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Annotated
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError
 
-from dyngs.core.conventions import RasterizeMode, num_sh_terms
-from dyngs.core.errors import DyngsError, require_regular
+from dyngs.core.conventions import RasterizeMode
+from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians, morton_order
-from dyngs.io.formats.formats import SOG_META
+from dyngs.io.fields import read_limited, require_at_most
 from dyngs.io.formats.packing import (
     codebook,
     largest_and_others,
@@ -39,61 +37,13 @@ from dyngs.io.formats.splat_file import (
     header_comments,
     stored_comments,
 )
-from dyngs.io.limits import require_at_most
 
+SOG_META = "meta.json"  # of a .sog, which may lie in a folder
 _PER_ROW = 64
 _MOST_META_BYTES = 1 << 20
 _MOST_PIXELS = 1 << 27
 _MODE = 252  # alpha of a rotation: this plus the index of its largest entry
 _HALF_ROOT = float(np.sqrt(0.5))
-
-_Table = Annotated[tuple[FiniteFloat, ...], Field(min_length=256, max_length=256)]
-_Three = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
-_One = Annotated[tuple[str, ...], Field(min_length=1, max_length=1)]
-_Two = Annotated[tuple[str, ...], Field(min_length=2, max_length=2)]
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class _Means(_Part):
-    mins: _Three
-    maxs: _Three
-    files: _Two
-
-
-class _Coded(_Part):
-    codebook: _Table
-    files: _One
-
-
-class _Rotations(_Part):
-    files: _One
-
-
-class _Rest(_Part):
-    count: PositiveInt
-    bands: Annotated[int, Field(ge=1, le=3)]
-    codebook: _Table
-    files: _Two
-
-
-class _Asset(_Part):
-    comments: object = None
-
-
-class _Meta(_Part):
-    version: int
-    asset: _Asset = _Asset()
-    count: PositiveInt
-    antialias: bool = False
-    means: _Means
-    scales: _Coded
-    quats: _Rotations
-    sh0: _Coded
-    shN: _Rest | None = None
-
 
 _Members = Callable[[str, int, str], bytes]
 """Returns the bytes of a file of the given name, whose size is at most so many of what the last
@@ -107,13 +57,8 @@ def read_sog(path: Path) -> SplatFile:
     """
     if path.name == SOG_META:
         return _read(path, _in_folder(path))
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _read(path, _in_archive(path, archive))
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-        raise DyngsError(
-            f"{path}: is no .sog or is cut off ({str(error)[:80]}); copy or export it again"
-        ) from error
+    with zipfile.ZipFile(path) as archive:
+        return _read(path, _in_archive(path, archive))
 
 
 def write_sog(path: Path, splat: SplatFile) -> None:
@@ -177,7 +122,12 @@ def sog_parts(splat: SplatFile) -> Iterator[tuple[str, bytes]]:
             "shN_labels.webp",
             np.stack([labels & 255, labels >> 8, 0 * labels], axis=1).astype(np.uint8),
         )
-        images["shN_centroids.webp"] = _palette_image(nearest_entries(values, rows))
+        terms = rows.shape[1] // 3
+        # 64 rows side by side, a pixel per term
+        centroids = np.zeros((_PER_ROW * -(-len(rows) // _PER_ROW), terms, 4), np.uint8)
+        centroids[..., 3] = 255
+        centroids[: len(rows), :, :3] = nearest_entries(values, rows).reshape(-1, terms, 3)
+        images["shN_centroids.webp"] = centroids.reshape(-1, _PER_ROW * terms, 4)
         files = ["shN_centroids.webp", labelled]
         meta["shN"] = {
             "count": len(rows),
@@ -188,16 +138,6 @@ def sog_parts(splat: SplatFile) -> Iterator[tuple[str, bytes]]:
     yield SOG_META, json.dumps(meta).encode()
     for name, image in images.items():
         yield name, _encoded(image)
-
-
-def _palette_image(indices: np.ndarray) -> np.ndarray:
-    """Return the image (H, W, 4) of palette rows (P, 3 T): 64 rows side by side, T pixels each."""
-    count = len(indices)
-    terms = indices.shape[1] // 3
-    whole = np.zeros((_PER_ROW * -(-count // _PER_ROW), terms, 4), np.uint8)
-    whole[..., 3] = 255
-    whole[:count, :, :3] = indices.reshape(count, terms, 3)
-    return whole.reshape(-1, _PER_ROW * terms, 4)
 
 
 def _encoded(image: np.ndarray) -> bytes:
@@ -212,121 +152,81 @@ def _encoded(image: np.ndarray) -> bytes:
 
 def _in_archive(path: Path, archive: zipfile.ZipFile) -> _Members:
     def member(name: str, most: int, what: str) -> bytes:
-        try:
-            info = archive.getinfo(name)
-        except KeyError:
-            raise DyngsError(
-                f"{path}: has no {name:.60}, so it is no .sog; export it again"
-            ) from None
+        info = archive.getinfo(name)
         require_at_most(path, info.file_size, most, what)
-        with archive.open(info) as file:
-            return file.read(info.file_size)
+        return archive.read(info)
 
     return member
 
 
 def _in_folder(path: Path) -> _Members:
     def member(name: str, most: int, what: str) -> bytes:
-        file = path.with_name(name) if Path(name).name == name and "\\" not in name else None
-        if file is None or (file.exists() and file.resolve().parent != path.parent.resolve()):
+        file = path.parent / name
+        if PureWindowsPath(name).name != name or file.resolve().parent != path.parent.resolve():
             raise DyngsError(f"{path}: {name!r:.60} lies outside of its folder; put the file there")
-        require_regular(file)
-        if not file.is_file():
-            raise DyngsError(f"{path}: {name:.60} is missing beside it; export it again")
-        require_at_most(file, file.stat().st_size, most, what)
-        return file.read_bytes()
+        return read_limited(file, most)
 
     return member
 
 
 def _read(path: Path, member: _Members) -> SplatFile:
-    meta = _meta(path, member)
-    n = meta.count
+    meta = json.loads(member(SOG_META, _MOST_META_BYTES, f"bytes of {SOG_META}"))
+    if meta.get("version", 1) != 2:
+        raise ValueError(f"it is a .sog of version {meta.get('version', 1)!r:.20}, only 2 is known")
+    n = meta["count"]
+    if type(n) is not int or n < 1:
+        raise ValueError("its count is no number of Gaussians")
     require_at_most(path, n, MOST_GAUSSIANS, "Gaussians")
 
-    def pixels(name: str) -> np.ndarray:
-        found = _image(path, member, name).reshape(-1, 4)
+    def pixels(part: str, index: int = 0) -> np.ndarray:
+        found = _image(path, member, meta[part]["files"][index]).reshape(-1, 4)
         if len(found) < n:
-            raise DyngsError(
-                f"{path}: {name:.60} has {len(found):,} pixels for {n:,} Gaussians; export it again"
-            )
+            raise ValueError(f"its {part} has {len(found):,} pixels for {n:,} Gaussians")
         return found[:n]
 
-    lower, upper = (pixels(name)[:, :3].astype(np.uint16) for name in meta.means.files)
-    low = np.array(meta.means.mins)
-    high = np.array(meta.means.maxs)
+    def table(part: str) -> np.ndarray:
+        found = np.array(meta[part]["codebook"], np.float32)
+        if found.shape != (256,) or not np.isfinite(found).all():
+            raise ValueError(f"the codebook of its {part} is not 256 numbers")
+        return found
+
+    lower, upper = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
+    low, high = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
     with np.errstate(over="ignore", invalid="ignore"):  # ranges of others may be absurd
         far = low + (lower | (upper << 8)) / 65535 * (high - low)
         means = (np.sign(far) * np.expm1(np.abs(far))).astype(np.float32)
-    coded = pixels(meta.quats.files[0])
+    coded = pixels("quats")
     if int(coded[:, 3].min()) < _MODE:
-        raise DyngsError(
-            f"{path}: {meta.quats.files[0]:.60} names entries of rotations that do not exist"
-        )
-    quats = with_largest(
-        coded[:, 3] - _MODE, (coded[:, :3].astype(np.float32) / 255 - 0.5) / _HALF_ROOT
-    )
-    base = pixels(meta.sh0.files[0])
-    sh = np.array(meta.sh0.codebook, np.float32)[base[:, :3]][:, None]
-    if meta.shN is not None:
-        sh = np.concatenate([sh, _rest(path, member, meta.shN, pixels(meta.shN.files[1]))], axis=1)
+        raise ValueError("it names entries of rotations that do not exist")
+    others = (coded[:, :3].astype(np.float32) / 255 - 0.5) / _HALF_ROOT
+    base = pixels("sh0")
+    sh = table("sh0")[base[:, :3]][:, None]
+    if meta.get("shN") is not None:
+        bands = meta["shN"]["bands"]
+        terms = {1: 3, 2: 8, 3: 15}[bands]
+        image = _image(path, member, meta["shN"]["files"][0])
+        labels = pixels("shN", 1).astype(np.int64)
+        if image.shape[1] != _PER_ROW * terms:
+            raise ValueError(f"its harmonics are not {_PER_ROW} rows of {terms} terms side by side")
+        rows = table("shN")[image[..., :3]].reshape(-1, terms, 3)
+        sh = np.concatenate([sh, rows[labels[:, 0] | labels[:, 1] << 8]], axis=1)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
-        quats=torch.from_numpy(quats),
-        log_scales=torch.from_numpy(
-            np.array(meta.scales.codebook, np.float32)[pixels(meta.scales.files[0])[:, :3]]
-        ),
+        quats=torch.from_numpy(with_largest(coded[:, 3] - _MODE, others)),
+        log_scales=torch.from_numpy(table("scales")[pixels("scales")[:, :3]]),
         logit_opacities=torch.from_numpy(logit(base[:, 3].astype(np.float32) / 255)),
         sh=torch.from_numpy(sh),
     )
-    mode = RasterizeMode.ANTIALIASED if meta.antialias else RasterizeMode.CLASSIC
-    return described(
-        SplatFile(gaussians, mode, comments=stored_comments(meta.asset.comments)), path
-    )
-
-
-def _rest(path: Path, member: _Members, rest: _Rest, labels: np.ndarray) -> np.ndarray:
-    name = rest.files[0]
-    terms = num_sh_terms(rest.bands) - 1
-    image = _image(path, member, name)
-    row = labels[:, 0].astype(np.int64) | (labels[:, 1].astype(np.int64) << 8)
-    fits = image.shape[1] == _PER_ROW * terms and image.shape[0] * _PER_ROW >= rest.count
-    if not fits or int(row.max()) >= rest.count:
-        raise DyngsError(
-            f"{path}: {name:.60} does not hold the {rest.count:,} harmonics that are named; export it again"
-        )
-    table = np.array(rest.codebook, np.float32)[image[..., :3]].reshape(-1, terms, 3)
-    return table[row]
-
-
-def _meta(path: Path, member: _Members) -> _Meta:
-    text = member(SOG_META, _MOST_META_BYTES, f"bytes of {SOG_META}")
-    try:
-        tree = json.loads(text)
-        if isinstance(tree, dict) and tree.get("version") != 2:
-            raise DyngsError(
-                f"{path}: is a .sog of version {tree.get('version', 1)!r:.20}, only 2 is known"
-            )
-        return _Meta.model_validate(tree)
-    except (ValueError, RecursionError) as error:
-        problem = str(error)
-        if type(error) is ValidationError:
-            first = error.errors(include_url=False)[0]
-            problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise DyngsError(
-            f"{path}: its meta.json is no .sog's ({problem:.120}); export it again"
-        ) from error
+    mode = RasterizeMode.ANTIALIASED if meta.get("antialias") else RasterizeMode.CLASSIC
+    asset = meta.get("asset")
+    comments = stored_comments(asset.get("comments") if isinstance(asset, dict) else None)
+    return described(SplatFile(gaussians, mode, comments=comments))
 
 
 def _image(path: Path, member: _Members, name: str) -> np.ndarray:
     from PIL import Image
 
     data = member(name, 8 * _MOST_PIXELS, "bytes of an image")
-    try:
-        with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
-            require_at_most(path, image.width * image.height, _MOST_PIXELS, "pixels of an image")
-            return np.asarray(image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DyngsError(
-            f"{path}: {name:.60} cannot be read ({str(error)[:80]}); export it again"
-        ) from error
+    with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
+        require_at_most(path, image.width * image.height, _MOST_PIXELS, "pixels of an image")
+        return np.asarray(image.convert("RGBA"))

@@ -21,11 +21,10 @@ import torch
 from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
-from dyngs.io.formats.formats import SYSTEM_OF_UP
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import largest_and_others, logit, with_largest
 from dyngs.io.formats.similarity import Similarity, mirrored, turn_of
 from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
-from dyngs.io.limits import require_at_most
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -35,6 +34,9 @@ _COORDINATE_SYSTEM = 0xADBE0003  # type of Adobe's extension that states one
 _NUM_SYSTEMS = 16
 _STANDARD = 4  # x points right, y up, z back
 _MOST_EXTENSION_BYTES = 1 << 16
+SYSTEM_OF_UP = {"y": 4, "-y": 6, "z": 12, "-z": 14}
+"""Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot
+state others."""
 _MOST_RATIO = 1032  # largest compression of deflate
 _MOST_BYTES = 1 << 31
 _COLOUR_SCALE = 0.15
@@ -57,29 +59,21 @@ def unpacked_spz(path: Path, data: bytes) -> SplatFile:
         return _read_streams(path, data)
     if data[:2] != b"\x1f\x8b":
         raise DyngsError(f"{path}: is not a .spz file (it starts neither with NGSP nor as gzip)")
-    head = _inflated(path, data, _HEADER.size)
-    if len(head) < _HEADER.size or head[:4] != _MAGIC:
-        raise DyngsError(f"{path}: is not a .spz file (its gzip stream does not start with NGSP)")
-    _, version, count, degree, fraction_bits, flags, _ = _HEADER.unpack(head)
-    if version not in (1, 2, 3):
-        raise DyngsError(f"{path}: is a .spz of version {version}, only 1 to 4 are known")
-    sizes = _sizes(path, version, count, degree)
+    magic, version, count, degree, bits, flags, _ = _HEADER.unpack(_inflated(data, _HEADER.size))
+    if magic != _MAGIC or version not in (1, 2, 3):
+        raise DyngsError(f"{path}: is no .spz of version 1 to 4 ({magic!r}, {version})")
+    sizes = _sizes(version, count, degree)
     total = _HEADER.size + sum(sizes.values())
     require_count(path, count, _MOST_RATIO * len(data), total / max(count, 1))
     require_at_most(path, total, _MOST_BYTES, "bytes of Gaussians")
     more = _MOST_EXTENSION_BYTES if flags & _HAS_EXTENSIONS else 0
-    content = _inflated(path, data, total + more)
-    if len(content) < total:
-        raise DyngsError(
-            f"{path}: is truncated: {count:,} Gaussians need {total:,} bytes, found {len(content):,}"
-        )
+    content = _inflated(data, total + more)
     parts = {}
     start = _HEADER.size
     for name, size in sizes.items():
         parts[name] = np.frombuffer(content, np.uint8, size, start)
         start += size
-    splat = _splat(path, parts, version, degree, fraction_bits, flags)
-    return _standard_axes(path, splat, content[total:] if more else b"")
+    return _standard_axes(_splat(parts, version, degree, bits, flags), content[start:])
 
 
 def write_spz(path: Path, splat: SplatFile) -> None:
@@ -155,94 +149,71 @@ def _packed_parts(splat: SplatFile) -> list[bytes]:
     ]
 
 
-def _sizes(path: Path, version: int, count: int, degree: int) -> dict[str, int]:
+def _sizes(version: int, count: int, degree: int) -> dict[str, int]:
+    """Return the bytes of the attributes, in the order of the file."""
     if degree > MAX_SH_DEGREE:
-        raise DyngsError(
-            f"{path}: has harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known"
-        )
+        raise ValueError(f"harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known")
     each = {
         "means": 6 if version == 1 else 9,
         "alphas": 1,
         "colours": 3,
         "scales": 3,
         "quats": 3 if version < 3 else 4,
+        "sh": 3 * (num_sh_terms(degree) - 1),
     }
-    return {
-        name: count * size for name, size in (each | {"sh": 3 * (num_sh_terms(degree) - 1)}).items()
-    }
+    return {name: count * size for name, size in each.items()}
 
 
-def _inflated(path: Path, data: bytes, most: int) -> bytes:
+def _inflated(data: bytes, most: int) -> bytes:
     """Return at most ``most`` bytes of a gzip stream; where it ends there, its checksum has been
     compared."""
     stream = zlib.decompressobj(31)
-    try:
-        content = stream.decompress(data, most)
-        more = stream.decompress(stream.unconsumed_tail, 1)
-    except zlib.error as error:
-        raise DyngsError(
-            f"{path}: its gzip stream is damaged ({error}); copy or export it again"
-        ) from error
-    if not more and not stream.eof:
-        raise DyngsError(
-            f"{path}: is truncated: its gzip stream does not end; copy or export it again"
-        )
+    content = stream.decompress(data, most)
+    if not stream.decompress(stream.unconsumed_tail, 1) and not stream.eof:
+        raise ValueError("it is truncated: its gzip stream does not end")
     return content
 
 
 def _read_streams(path: Path, data: bytes) -> SplatFile:
-    if len(data) < _WHOLE_HEADER:
-        raise DyngsError(f"{path}: is truncated: it ends within its header")
-    _, version, count, degree, fraction_bits, flags, streams = _HEADER.unpack(data[:16])
-    start = int.from_bytes(data[16:20], "little")
+    """Read version 4."""
+    _, version, count, degree, bits, flags, streams = _HEADER.unpack(data[:16])
     if version != 4:
         raise DyngsError(f"{path}: is a .spz of version {version}, only 1 to 4 are known")
-    sizes = {
-        name: size
-        for name, size in _sizes(path, version, count, degree).items()
-        if size or name != "sh"
-    }
+    start = int.from_bytes(data[16:20], "little")
+    sizes = _sizes(version, count, degree)
     require_at_most(path, sum(sizes.values()), _MOST_BYTES, "bytes of Gaussians")
     require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
-    if streams < len(sizes) or start + 16 * streams > len(data):
-        raise DyngsError(
-            f"{path}: is truncated or damaged: its table of streams does not fit; copy or export it again"
-        )
     table = np.frombuffer(data, "<u8", 2 * streams, start).reshape(-1, 2).tolist()
     begin = start + 16 * streams
-    parts = {}
-    for (name, size), (packed, whole) in zip(sizes.items(), table, strict=False):
-        if begin + packed > len(data) or whole != size:
-            raise DyngsError(
-                f"{path}: is truncated or damaged in its {name}; copy or export it again"
-            )
-        parts[name] = np.frombuffer(_unpacked(path, data[begin : begin + packed], size), np.uint8)
+    parts = {"sh": np.zeros(0, np.uint8)}
+    stored = [name for name, size in sizes.items() if size or name != "sh"]
+    for name, (packed, whole) in zip(stored, table[: len(stored)], strict=True):
+        if begin + packed > len(data) or whole != sizes[name]:
+            raise ValueError(f"it is truncated or damaged in its {name}")
+        parts[name] = np.frombuffer(
+            _unpacked(path, data[begin : begin + packed], whole), np.uint8, whole
+        )
         begin += packed
-    parts.setdefault("sh", np.zeros(0, np.uint8))
-    splat = _splat(path, parts, version, degree, fraction_bits, flags)
-    return _standard_axes(
-        path, splat, data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b""
-    )
+    splat = _splat(parts, version, degree, bits, flags)
+    return _standard_axes(splat, data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b"")
 
 
-def _standard_axes(path: Path, splat: SplatFile, extensions: bytes) -> SplatFile:
+def _standard_axes(splat: SplatFile, extensions: bytes) -> SplatFile:
     """Return the contents with x right, y up and z back, given the extensions of the file: type,
     size and value."""
     start = 0
     while start < len(extensions):
-        kind, size = (
-            int.from_bytes(extensions[start + i : start + i + 4], "little") for i in (0, 4)
-        )
+        kind, size = struct.unpack_from("<II", extensions, start)
         value = extensions[start + 8 : start + 8 + size]
         start += 8 + size
         if start > len(extensions):
-            raise DyngsError(f"{path}: is damaged in its extensions; copy or export it again")
+            raise ValueError("it is damaged in its extensions")
         if kind == _COORDINATE_SYSTEM:
-            return _from_system(path, splat, int.from_bytes(value, "little"))
+            return _from_system(splat, int.from_bytes(value, "little"))
     return splat
 
 
-def _from_system(path: Path, splat: SplatFile, number: int) -> SplatFile:
+def _from_system(splat: SplatFile, number: int) -> SplatFile:
     """Return the contents in standard axes, given in the coordinate system of that number; 0 states
     none.
 
@@ -250,9 +221,7 @@ def _from_system(path: Path, splat: SplatFile, number: int) -> SplatFile:
     vertical axis, and the third bit is y to the back.
     """
     if number > _NUM_SYSTEMS:
-        raise DyngsError(
-            f"{path}: states coordinate system {number}, but only 1 to {_NUM_SYSTEMS} exist; export it again"
-        )
+        raise ValueError(f"it states coordinate system {number}, but only 1 to 16 exist")
     if number in (0, _STANDARD):
         return splat
     right, up, front, is_z_vertical = ((number - 1) >> bit & 1 for bit in range(4))
@@ -280,32 +249,16 @@ def _zstandard(path: Path) -> Any:
 
 
 def _unpacked(path: Path, data: bytes, size: int) -> bytes:
-    zstandard = _zstandard(path)
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
-            content = stream.read(size)
-    except zstandard.ZstdError as error:
-        raise DyngsError(
-            f"{path}: a stream of it is damaged ({error}); copy or export it again"
-        ) from error
-    if len(content) < size:
-        raise DyngsError(f"{path}: is truncated: a stream holds {len(content):,} of {size:,} bytes")
-    return content
+    with _zstandard(path).ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
+        return stream.read(size)
 
 
 def _splat(
-    path: Path,
-    parts: Mapping[str, np.ndarray],
-    version: int,
-    degree: int,
-    fraction_bits: int,
-    flags: int,
+    parts: Mapping[str, np.ndarray], version: int, degree: int, fraction_bits: int, flags: int
 ) -> SplatFile:
     count = len(parts["alphas"])
     if fraction_bits > _MOST_FRACTION_BITS:
-        raise DyngsError(
-            f"{path}: positions with {fraction_bits} bits after the point do not exist; the file is damaged"
-        )
+        raise ValueError(f"positions with {fraction_bits} bits after the point do not exist")
     if version == 1:
         means = parts["means"].view("<f2").astype(np.float32).reshape(count, 3)
     else:

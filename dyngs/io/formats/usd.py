@@ -21,10 +21,10 @@ from dyngs.core.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.child import python_command
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats import usd_child
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
 from dyngs.io.formats.splat_file import SplatFile, described, from_linear, header_comments
-from dyngs.io.limits import require_at_most
 
 _SECONDS = 600.0  # of wall time; the child has less of processor time
 _NAMES = ("means", "scales", "opacities", "quats", "sh", "degree", "world")
@@ -65,11 +65,9 @@ def read_usd(path: Path) -> SplatFile:
     count = int(read["count"])
     if not count:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
-    found = [_gaussians(path, {name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
+    found = [_gaussians({name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
     up = _UP.get(str(read["up"]), "y")
-    return described(
-        SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())), path
-    )
+    return described(SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())))
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
@@ -119,30 +117,15 @@ def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
     return sdf, usd, geom, vol
 
 
-def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
+def _gaussians(arrays: Mapping[str, np.ndarray]) -> Gaussians:
     """Return the Gaussians of a prim, in the axes of the stage."""
     degree = int(arrays["degree"])
-    means = arrays["means"]
-    sh = arrays["sh"]
     if not 0 <= degree <= MAX_SH_DEGREE:
-        raise DyngsError(
-            f"{path}: harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known"
-        )
-    n = len(means)
-    terms = num_sh_terms(degree)
-    if (
-        any(len(arrays[name]) != n for name in ("scales", "opacities", "quats"))
-        or len(sh) != n * terms
-    ):
-        raise DyngsError(
-            f"{path}: the attributes of its Gaussians have different lengths; export it again"
-        )
-    found = from_linear(
-        means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3)
-    )
+        raise ValueError(f"harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known")
+    means = arrays["means"]
+    sh = arrays["sh"].reshape(len(means), num_sh_terms(degree), 3)
+    found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh)
     place = similarity_of_matrix(arrays["world"])
     if place is None:
-        raise DyngsError(
-            f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting"
-        )
+        raise ValueError("a prim distorts or mirrors its Gaussians; apply its transform first")
     return place.gaussians(found.replace(means=found.means.double()))

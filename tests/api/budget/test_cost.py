@@ -23,9 +23,10 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.training.clock import step_cost, with_steps
+from dyngs.training.clock import step_cost
 from dyngs.training.events import StepDone
 from dyngs.training.new_trainer import assemble
+from dyngs.training.plan import with_steps
 
 
 @pytest.fixture(scope="module")

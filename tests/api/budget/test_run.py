@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.api.budget.run import STAGES, stage
+from dyngs.api.budget.run import stage
 from hypothesis import given
 from hypothesis import strategies as st
 from limited import limited, said
 
+from dyngs.cli.kernel_bench import STAGES
 from dyngs.compress.stage import quality_of
 from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, TrainConfig
 from dyngs.static.keys import StaticModel

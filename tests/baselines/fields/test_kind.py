@@ -17,8 +17,8 @@ from dyngs.cli import main
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
-from dyngs.view.captured_views import viewpoint_of
 from dyngs.view.layers import Shot, draw
+from dyngs.view.views import viewpoint_of
 
 STEPS = ["train.steps=30", "train.save_every=15"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,9 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from tiny_captures import edit_json, write_cameras_json, write_video
 
 from dyngs.capture.inspection.report import draw_cameras, format_report, inspect_capture, report_on
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.synthetic.captures import StillOptions, hemisphere_cameras, write_still_capture
@@ -49,34 +46,20 @@ def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
         assert fact in text, text
 
 
-def test_the_demo_capture_is_quiet(tmp_path: Path) -> None:
-    root = write_still_capture(
-        tmp_path / "demo", StillOptions(size=16, num_train=4, num_test=2, samples=1)
-    )
-    for source in (root, DataConfig(root=root)):  # type: ignore[call-arg]
-        report = inspect_capture(source)
-        assert not report.problems, report.problems
-        assert "transparent background" in format_report(report)
-
-
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
         ({"image_path": Path("nowhere.png")}, "nowhere.png"),
         ({"width": 33}, "has 32x24 pixels, its camera says 33x24"),
-        ({"name": "2"}, "the name '2' occurs 2 times"),
-        ({"cam_from_world": np.diag([1.0, 1.0, -1.0, 1.0])}, "mirrored"),
-        ({"cam_from_world": np.diag([2.0, 2.0, 2.0, 1.0])}, "scale"),
-        ({"cam_from_world": np.full((4, 4), np.nan)}, "NaN"),
-        ({"intrinsics": np.diag([-40.0, 40.0, 1.0])}, "not a positive"),
-        ({"intrinsics": np.array([[40.0, 0, 99], [0, 40, 12], [0, 0, 1]])}, "outside the 32x24"),
+        (
+            {"intrinsics": np.array([[40.0, 0, 99], [0, 40, 12], [0, 0, 1]])},
+            "far from the middle of 32x24",
+        ),
         (
             {"intrinsics": np.array([[40.0, 0, 16], [0, 80, 12], [0, 0, 1]])},
             "differ by more than 10%",
         ),
         ({"intrinsics": np.array([[4e4, 0, 16], [0, 4e4, 12], [0, 0, 1]])}, "does not suit"),
-        ({"time": 0.5}, "5 of 6 views have no time"),
-        ({"time": 2.0}, "outside [0, 1]"),
     ],
 )
 def test_one_bad_view_gives_its_line(tmp_path: Path, changes: dict[str, Any], line: str) -> None:
@@ -84,21 +67,6 @@ def test_one_bad_view_gives_its_line(tmp_path: Path, changes: dict[str, Any], li
     assert any(line in problem for problem in report.problems), report.problems
     assert all("\n" not in problem for problem in report.problems)
     assert line in format_report(report)
-
-
-def test_damaged_images_and_masks(tmp_path: Path) -> None:
-    capture = _with_view(_capture(tmp_path), mask_path=tmp_path / "mask.png")
-    write_image(tmp_path / "mask.png", np.ones((5, 5)))
-    (tmp_path / "3.png").write_text("no image")
-    cut = tmp_path / "4.png"
-    write_image(cut, np.random.default_rng(0).uniform(size=(24, 32, 3)))
-    cut.write_bytes(cut.read_bytes()[:500])
-    shallow = report_on(capture).problems
-    deep = report_on(capture, deep=True).problems
-    assert any("mask.png has 5x5" in line for line in shallow)
-    assert any("3.png" in line for line in shallow)
-    assert not any("4.png" in line for line in shallow)
-    assert any("4.png" in line for line in deep)
 
 
 def test_scene_faults(tmp_path: Path) -> None:
@@ -120,48 +88,10 @@ def test_scene_faults(tmp_path: Path) -> None:
     assert good.points is not None
     xyz = good.points.xyz.copy()
     xyz[0] = 1e5
-    xyz[1] = np.nan
     problems = report_on(good.replace(points=PointCloud(xyz, good.points.rgb))).problems
-    assert any("1 of 200 points hold NaN" in line for line in problems)
-    assert any("1 of 199 points lie more than 50 times" in line for line in problems)
+    assert any("1 of 200 points lie more than 50 times" in line for line in problems)
     still = _with_view(good, cam_from_world=good.splits["test"][0].cam_from_world)
     assert any("share their pose" in line for line in report_on(still).problems)
-
-
-def test_many_faults_of_a_kind_are_counted(tmp_path: Path) -> None:
-    capture = _capture(tmp_path, 12)
-    for view in capture.splits["train"]:
-        view.image_path.unlink()
-    problems = report_on(capture).problems
-    assert len(problems) == 6
-    assert "6 more" in problems[-1]
-
-
-def test_what_the_reader_refuses_is_reported_with_the_rest(tmp_path: Path) -> None:
-    root = write_still_capture(
-        tmp_path / "demo", StillOptions(size=8, num_train=4, num_test=2, samples=1)
-    )
-    file = root / "transforms_train.json"
-    document = json.loads(file.read_text())
-    document["frames"][0]["transform_matrix"][0][0] = float("nan")
-    document["frames"][3]["file_path"] = document["frames"][1]["file_path"]
-    file.write_text(json.dumps(document))
-    (root / "train" / "r_002.png").unlink()
-    report = inspect_capture(root)
-    text = format_report(report)
-    assert report.capture is None
-    for fault in ("NaN", "r_002", "occurs 2 times"):
-        assert fault in text, text
-
-
-@pytest.mark.parametrize("content", [None, "{", "[]", '{"frames": 3}'])
-def test_no_capture_at_all_is_a_problem_not_an_error(tmp_path: Path, content: str | None) -> None:
-    if content is not None:
-        (tmp_path / "transforms_train.json").write_text(content)
-    report = inspect_capture(tmp_path if content is not None else tmp_path / "none")
-    assert report.capture is None
-    assert report.problems
-    assert str(tmp_path) in format_report(report)
 
 
 def _sequence(root: Path, cameras: int, times: int) -> Capture:
@@ -199,53 +129,6 @@ def test_cameras_by_times(tmp_path: Path) -> None:
     assert dict(report_on(moving).facts)["sequence"].startswith("4 cameras (1 moving) x 3 times")
 
 
-def test_one_camera_at_rest_cannot_show_a_moving_scene(tmp_path: Path) -> None:
-    report = report_on(_sequence(tmp_path, 1, 5))
-    assert [line for line in report.problems if "cannot be reconstructed" in line]
-    assert not any("at one place" in line for line in report.problems), "said already"
-    assert not any("cannot be" in line for line in report_on(_sequence(tmp_path, 3, 5)).problems)
-    moved = _with_view(
-        _sequence(tmp_path, 1, 5),
-        cam_from_world=_capture(tmp_path).splits["train"][2].cam_from_world,
-    )
-    assert not any("cannot be reconstructed" in line for line in report_on(moved).problems)
-
-
-def test_videos_are_not_decoded_to_be_inspected(tmp_path: Path) -> None:
-    write_cameras_json(tmp_path, ("cam00", "cam01", "cam02", "cam03"), test=["cam00"])
-    for i in range(4):
-        write_video(tmp_path / f"cam0{i}.mp4", 3, fps=25)
-    before = sorted(tmp_path.iterdir())
-    report = inspect_capture(tmp_path)
-    assert not report.problems, report.problems
-    facts = dict(report.facts)
-    assert (facts["frame rate"], facts["sequence"]) == (
-        "25 per second",
-        "4 cameras x 3 times, 12 images",
-    )
-    assert facts["video frames"] == "0 of 12 are decoded already"
-    assert sorted(tmp_path.iterdir()) == before
-    edit_json(tmp_path / "cameras.json", lambda content: content.update(fps=24))
-    report = inspect_capture(tmp_path, deep=True)
-    assert not report.problems, report.problems
-    assert dict(report.facts)["frame rate"] == "24 per second"
-    assert dict(report.facts)["video frames"] == "12 of 12 are decoded already"
-
-
-def test_the_rate_in_a_transforms_file(blender_root: Path) -> None:
-    for split in ("train", "test"):
-        edit_json(
-            blender_root / f"transforms_{split}.json",
-            lambda content: content.update(
-                fps=15,
-                frames=[{**frame, "time": i / 16} for i, frame in enumerate(content["frames"])],
-            ),
-        )
-    facts = dict(inspect_capture(blender_root).facts)
-    assert facts["frame rate"] == "15 per second"
-    assert facts["sequence"] == "1 camera (moving) x 16 times, 18 images"
-
-
 def test_drawing_shows_cameras_and_points(tmp_path: Path) -> None:
     capture = _capture(tmp_path)
     draw_cameras(capture, tmp_path / "cameras.png", size=100)
@@ -258,12 +141,6 @@ def test_drawing_shows_cameras_and_points(tmp_path: Path) -> None:
         blue = (panel[..., 2] > 180) & (panel[..., 0] < 120)
         assert orange.any()
         assert blue.any()
-    bare = _with_view(capture, cam_from_world=np.full((4, 4), np.nan)).replace(points=None)
-    draw_cameras(bare, tmp_path / "bare.png", size=50)
-    lost = bare.replace(splits={"train": bare.splits["train"][:1]})
-    with pytest.raises(DyngsError, match="usable pose"):
-        draw_cameras(lost, tmp_path / "lost.png")
-    assert not (tmp_path / "lost.png").exists()
 
 
 def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
@@ -286,29 +163,3 @@ def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
     assert any(f"{image}: a link that leads out" in line for line in report.problems[1:])
     followed = inspect_capture(DataConfig(root=root, follow_links=True))
     assert followed.capture is not None
-
-
-def test_large_images_are_reported_by_a_deep_look(tmp_path: Path) -> None:
-    root = tmp_path / "capture"
-    write_still_capture(root, StillOptions(size=100, num_train=4))
-    report = inspect_capture(DataConfig(root=root, max_megapixels=0.005), deep=True)
-    assert any("100x100 pixels are 0.01 megapixels" in line for line in report.problems)
-
-
-@pytest.mark.parametrize(
-    ("light", "said"),
-    [
-        ((None, None), None),
-        ((0.02, 0.02), "the same"),
-        ((0.01, 0.03), "up to 3 times as much light"),
-        ((None, 1), "of 6"),
-    ],
-)
-def test_exposures_of_the_tags_are_a_fact(
-    tmp_path: Path, light: tuple[float | None, ...], said: str | None
-) -> None:
-    capture = _capture(tmp_path)
-    views = [replace(view, exposure=light[i % 2]) for i, view in enumerate(capture.splits["train"])]
-    facts = dict(report_on(capture.replace(splits={**capture.splits, "train": tuple(views)})).facts)
-    assert ("exposure" in facts) is (said is not None)
-    assert said is None or said in facts["exposure"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyngs.data.images.colour_space import BT2020, UNSPECIFIED, ColourTags, srgb_encoded, to_srgb
+from dyngs.data.images.colour_space import BT2020, ColourTags, srgb_encoded, to_srgb
 
 PQ, HLG, DISPLAY_P3, BT709 = 16, 18, 12, 1
 
@@ -57,18 +57,3 @@ def test_sdr_in_its_own_primaries_is_left_alone() -> None:
 def test_red_in_wider_primaries(primaries: int, red: tuple[float, float, float]) -> None:
     pixel = np.round(65535 * srgb_encoded(np.array([[red]]))).astype(np.uint16)
     assert np.abs(to_srgb(pixel, ColourTags(primaries)).astype(int) - (255, 0, 0)).max() <= 3
-
-
-def test_missing_tags_are_filled_and_present_ones_kept() -> None:
-    own = ColourTags(BT709, UNSPECIFIED, UNSPECIFIED)
-    assert own.or_else(ColourTags(BT2020, HLG, 9, True)) == ColourTags(BT709, HLG, 9, True)
-
-
-def test_what_is_done_is_said() -> None:
-    assert "HLG is tone-mapped" in ColourTags(BT2020, HLG).conversion
-    assert "PQ is tone-mapped to SDR (white: 203 cd/m2" in ColourTags(transfer=PQ).conversion
-    assert (
-        ColourTags(DISPLAY_P3, BT709).conversion
-        == "colours are converted from Display P3 to BT.709"
-    )
-    assert ColourTags(BT709, BT709, BT709).conversion == ""

@@ -39,17 +39,3 @@ def test_the_image_itself(parts: list[tuple[str, list[str]]], name: str) -> None
         ["R", "G", "B"],
         ["Y"],
     )
-
-
-@pytest.mark.parametrize(
-    "parts",
-    [
-        [("N", channels("", "RGB")), ("albedo", channels("", "RGB"))],
-        [("left", channels("")), ("right", channels(""))],
-        [("", channels("A.Combined") + channels("B.Combined"))],
-        [("", channels("Combined", "XYZ") + channels("Depth", "Z"))],
-        [("", channels("Combined", "RG") + channels("N", "RGB"))],
-    ],
-)
-def test_names_that_do_not_say_which(parts: list[tuple[str, list[str]]]) -> None:
-    assert beauty_pass(layers_of(parts)) is None

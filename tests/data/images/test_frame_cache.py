@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,22 +12,15 @@ import pytest
 from tiny_captures import (
     cached,
     level_of,
-    random_pixels,
-    truncate_video,
-    write_cameras_json,
-    write_frames,
-    write_image,
     write_video,
 )
 
-from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images import frame_cache
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import read_image
-from dyngs.data.read import read_capture
-from dyngs.io.temporary import cache_folder
+from dyngs.io.write import cache_folder
 
 
 @pytest.fixture
@@ -55,20 +47,6 @@ def forget() -> None:
     for mark in frame_cache._locked.values():
         mark.close()
     frame_cache._locked.clear()
-
-
-def test_planning_writes_nothing(root: Path) -> None:
-    frames = planned_frames(root / "cam00.mp4")
-    assert (frames.info.width, frames.info.height, frames.info.num_frames, frames.info.fps) == (
-        16,
-        12,
-        6,
-        30.0,
-    )
-    assert len(set(frames.paths)) == 6
-    assert all(cache_folder("frames") in path.parents for path in frames.paths)
-    assert [path.name for path in root.iterdir()] == ["cam00.mp4"]
-    assert not cache_folder("frames").exists()
 
 
 def test_only_wanted_frames_are_written_and_none_to_the_capture(root: Path) -> None:
@@ -124,24 +102,6 @@ def test_another_video_under_the_same_name(root: Path) -> None:
     assert (frames.info.width, frames.info.num_frames) == (32, 4)
     decode_frames(root, some(plan(video), 0, 1), 10)
     assert read_image(frames.paths[0]).shape == (16, 32, 3)
-
-
-def test_huge_videos_are_told_apart_by_samples_and_time(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(frame_cache, "WHOLE_BYTES", 10)
-    video = root / "cam00.mp4"
-    first = planned_frames(video).paths
-    assert planned_frames(video).paths == first
-    os.utime(video, ns=(0, 10**18))
-    assert not set(planned_frames(video).paths) & set(first)
-
-
-def test_cameras_that_saw_the_same_have_frames_of_their_own(root: Path) -> None:
-    shutil.copy(root / "cam00.mp4", root / "cam01.mp4")
-    assert not set(planned_frames(root / "cam00.mp4").paths) & set(
-        planned_frames(root / "cam01.mp4").paths
-    )
 
 
 def test_the_limit_is_refused_at_once(root: Path) -> None:
@@ -216,85 +176,3 @@ def test_nothing_but_our_own_is_removed_from_the_cache(root: Path, tmp_path: Pat
     assert (ours / "letter.txt").read_text() == "dear"
     assert (unmarked / "frame_000000.png").read_text() == "mine"
     assert len(files(linked)) == 6
-
-
-def test_a_foreign_capture_cannot_have_folders_removed(tmp_path: Path) -> None:
-    """An image named like a frame in our old cache, and that cache a link to the folder above
-    (folders vanished)."""
-    root = tmp_path / "Downloads" / "capture"
-    documents = tmp_path / "Downloads" / "z"
-    documents.mkdir(parents=True)
-    (documents.with_name("z.0123") / "a").mkdir(parents=True)
-    write_image(root / "cam00" / "0.png", random_pixels(12, 16, 3))
-    (root / ".dyngs_frames").symlink_to("..")
-    names = ["cam00/0.png", ".dyngs_frames/z/frame_000001.png"]
-    write_frames(root / "transforms.json", names, {"camera_angle_x": 0.7, "w": 16, "h": 12})
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(DyngsError, match="lies outside the capture"):
-        read_capture(DataConfig(root=root))  # type: ignore[call-arg]
-    read_capture(DataConfig(root=root, follow_links=True))  # type: ignore[call-arg]
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_frames_that_an_older_version_left_in_the_capture_are_left_alone(root: Path) -> None:
-    write_cameras_json(root, ["cam00"])
-    old = root / ".dyngs_frames" / "cam00.mp4.0123456789ab"
-    write_image(old / "frame_000000.png", random_pixels(12, 16, 3))
-    before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
-    capture = read_capture(DataConfig(root=root, test_every=0))  # type: ignore[call-arg]
-    assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
-    assert all(
-        cache_folder("frames") in view.image_path.parents for view in capture.splits["train"]
-    )
-
-
-def test_a_full_disk_is_refused_at_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = shutil.disk_usage(root)
-    monkeypatch.setattr(frame_cache.shutil, "disk_usage", lambda _: usage._replace(free=10))
-    with pytest.raises(DyngsError, match=r"the disk has only .* left"):
-        decode_frames(root, plan(root / "cam00.mp4"), 100)
-    assert len(cached()) == 1
-
-
-def test_where_the_cache_lies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert cache_folder("frames") == Path(os.environ["DYNGS_CACHE_DIR"]) / "frames"
-    monkeypatch.delenv("DYNGS_CACHE_DIR")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    if sys.platform == "linux":
-        assert cache_folder("frames") == tmp_path / "cache" / "dyngs" / "frames"
-    assert cache_folder("frames").is_absolute()
-
-
-def test_a_cache_that_cannot_be_written_is_one_line(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path / "file"))
-    with pytest.raises(
-        DyngsError,
-        match=r"frames of a video cannot be kept there .*; set DYNGS_CACHE_DIR to a folder",
-    ):
-        decode_frames(root, plan(root / "cam00.mp4"), 10)
-
-
-def test_a_damaged_mark_is_made_anew(root: Path) -> None:
-    frames = plan(root / "cam00.mp4")
-    decode_frames(root, some(frames, 0), 10)
-    mark = next(iter(frames)).parent / "video.json"
-    for text in ("", "[]", '{"width": "x"}', '{"width": 16}', "[" * 100_000):
-        mark.write_text(text)
-        assert list(plan(root / "cam00.mp4")) == list(frames)
-    decode_frames(root, some(frames, 1), 10)
-    assert '"width": 16' in mark.read_text()
-
-
-def test_a_truncated_video_is_named(root: Path) -> None:
-    video = root / "cam00.mp4"
-    truncate_video(video, 4)
-    frames = plan(video)
-    with pytest.raises(DyngsError, match=r"cam00\.mp4 breaks at frame \d"):
-        decode_frames(root, frames, 10)
-    for path in frames:
-        if path.is_file():
-            assert read_image(path).shape == (12, 16, 3)
-    assert not list(cache_folder("frames").rglob(".frame*"))

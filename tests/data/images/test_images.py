@@ -4,7 +4,6 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import OpenImageIO as oiio
@@ -13,16 +12,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
-from PIL.TiffImagePlugin import IFDRational
 from tiny_captures import random_pixels, write_image
 
-from dyngs.capture.photos import gather_photos, lay_out
+from dyngs.capture.sfm.photos import gather_photos, lay_out
+from dyngs.core.conventions import srgb_encoded
 from dyngs.core.errors import DyngsError
-from dyngs.data.images import images
-from dyngs.data.images.colour_space import srgb_encoded
 from dyngs.data.images.images import (
     area_downscale,
-    area_downscale_uint8,
     check_image,
     premultiplied,
     read_header,
@@ -32,7 +28,6 @@ from dyngs.data.images.images import (
     straight_uint8,
     target_size,
 )
-from dyngs.io.containment import images_up_to
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -43,55 +38,12 @@ def test_8_bit_png_comes_out_bit_for_bit(tmp_path: Path, channels: int) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / "a.png").numpy(), pixels)
 
 
-def test_grey_becomes_rgb(tmp_path: Path) -> None:
-    pixels = random_pixels(5, 7, 1)
-    write_image(tmp_path / "a.png", pixels)
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "a.png").numpy(), np.repeat(pixels, 3, axis=2)
-    )
-
-
-def test_16_bit_is_rounded(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 65536, (9, 9, 3), dtype=np.uint16)
-    write_image(tmp_path / "a.png", pixels)
-    np.testing.assert_allclose(
-        read_image(tmp_path / "a.png").numpy(), pixels / 257.0, atol=0.5 + 1e-6
-    )
-
-
-def test_jpeg_is_close(tmp_path: Path) -> None:
-    y, x = np.mgrid[:16, :24]
-    pixels = np.stack([5 * x, 10 * y, 128 + 0 * x], axis=-1).astype(np.uint8)
-    write_image(tmp_path / "a.jpg", pixels)
-    assert np.abs(read_image(tmp_path / "a.jpg").numpy().astype(int) - pixels).mean() < 3
-
-
 def test_exr_is_linear_and_clamped(tmp_path: Path) -> None:
     """0.18 linear is 117.8 in 8-bit sRGB; out of range and NaN become black or white."""
     values = [0.0, 0.18, 0.5, 1.0, 7.0, -1.0, np.nan, 0.002]
     pixels = np.repeat(np.array(values, np.float32)[None, :, None], 3, axis=2)
     write_image(tmp_path / "a.exr", pixels)
     assert read_image(tmp_path / "a.exr")[0, :, 0].tolist() == [0, 118, 188, 255, 255, 0, 0, 7]
-
-
-def test_exr_alpha_is_premultiplied(tmp_path: Path) -> None:
-    """Half-covered white is stored as 0.5 in EXR and must come out as straight white."""
-    write_image(tmp_path / "a.exr", np.full((1, 1, 4), 0.5, np.float32))
-    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [255, 255, 255, 128]
-
-
-@pytest.mark.parametrize(
-    ("name", "channels", "alpha"), [("a.png", 4, True), ("a.png", 3, False), ("a.jpg", 3, False)]
-)
-def test_header(tmp_path: Path, name: str, channels: int, alpha: bool) -> None:
-    write_image(tmp_path / name, random_pixels(5, 7, channels))
-    header = read_header(tmp_path / name)
-    assert (header.width, header.height, header.channels, header.has_alpha) == (
-        7,
-        5,
-        channels,
-        alpha,
-    )
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
@@ -109,26 +61,6 @@ def test_truncated_image_is_named_by_check_and_by_read(
             refuse(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("kept", [0.5, 1.0])
-@pytest.mark.parametrize(
-    ("content", "name"), [("jpg", "a.png"), ("png", "a.jpg"), ("webp", "a.jpg"), ("tif", "a.png")]
-)
-def test_files_are_read_and_checked_by_content(
-    tmp_path: Path, content: str, name: str, kept: float
-) -> None:
-    pixels = np.full((40, 50, 3), (200, 90, 30), np.uint8)
-    write_image(tmp_path / f"b.{content}", pixels)
-    data = (tmp_path / f"b.{content}").read_bytes()
-    path = tmp_path / name
-    path.write_bytes(data[: int(kept * len(data))])
-    if kept == 1.0:
-        assert check_image(path).size == (50, 40)
-        assert np.abs(read_image(path).numpy().astype(int) - pixels).max() <= 3
-    else:
-        with pytest.raises(DyngsError, match=name):
-            read_image(path)
 
 
 def write_exr(
@@ -158,17 +90,7 @@ def write_exr(
 
 
 RGB = {"R": 1.0, "G": 0.5, "B": 0.0}
-OTHER = {"R": 0.1, "G": 0.1, "B": 0.1}
 SHOWN = [255, 188, 0]
-
-
-@pytest.mark.parametrize("name", ["rgb", "RGBA", "C", "beauty", "Combined", "ViewLayer.Combined"])
-def test_the_beauty_pass_of_several_parts_is_found_by_name(tmp_path: Path, name: str) -> None:
-    path = tmp_path / "a.exr"
-    write_exr(path, [("N", OTHER), (name, RGB), ("albedo", OTHER), ("depth", {"Z": 3.0})])
-    assert read_image(path)[1, 1].tolist() == SHOWN
-    assert read_header(path).layer == name
-    assert check_image(path).size == (4, 3)
 
 
 @pytest.mark.parametrize("prefix", ["View Layer.Combined.", "Image.", "beauty.", ""])
@@ -180,50 +102,6 @@ def test_the_beauty_pass_of_several_layers_is_found_by_name(tmp_path: Path, pref
     assert read_image(path)[1, 1].tolist() == [*SHOWN, 128], (
         "colours are multiplied by the layer's own alpha"
     )
-
-
-@pytest.mark.parametrize(
-    "parts",
-    [
-        [("N", OTHER), ("albedo", RGB)],
-        [
-            (
-                "",
-                {
-                    "A.Combined.R": 1.0,
-                    "A.Combined.G": 1.0,
-                    "A.Combined.B": 1.0,
-                    "B.Combined.Y": 0.2,
-                },
-            )
-        ],
-    ],
-)
-def test_layers_that_are_not_clear_are_listed(
-    tmp_path: Path, parts: list[tuple[str, dict[str, float]]]
-) -> None:
-    path = tmp_path / "a.exr"
-    write_exr(path, parts)
-    names = [name for name, _ in parts if name] or ["A.Combined", "B.Combined"]
-    with pytest.raises(
-        DyngsError, match=rf"a\.exr: which layer .*The file has .*{names[0]} .*{names[1]} \("
-    ):
-        read_image(path)
-
-
-@pytest.mark.parametrize(
-    ("channels", "shown"),
-    [
-        ({"Y": 0.5}, [188] * 3),
-        ({"Y": 0.25, "A": 0.5}, [188] * 3 + [128]),
-        ({"Odd.R": 1.0, "Odd.G": 0.5, "Odd.B": 0.0}, SHOWN),
-    ],
-)
-def test_an_exr_with_one_layer_of_any_name(
-    tmp_path: Path, channels: dict[str, float], shown: list[int]
-) -> None:
-    write_exr(tmp_path / "a.exr", [("", channels)])
-    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == shown
 
 
 @pytest.mark.parametrize(
@@ -245,21 +123,6 @@ def test_an_exr_is_read_in_its_display_window(
     assert read_header(path).size == (4, 3)
     assert np.array_equal(read_image(path).numpy(), expected)
     assert np.array_equal(read_raw(path)[0][..., 3], expected[..., 3] / 255)
-
-
-def test_a_deep_exr_is_refused(tmp_path: Path) -> None:
-    spec = oiio.ImageSpec(4, 4, 4, "float")
-    spec.channelnames = ["R", "G", "B", "A"]
-    spec.deep = True
-    data = oiio.DeepData()
-    data.init(16, 4, "float", spec.channelnames)
-    output = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
-    assert output.open(str(tmp_path / "a.exr"), spec)
-    assert output.write_deep_image(data)
-    output.close()
-    for read in (read_header, read_image):
-        with pytest.raises(DyngsError, match=r"a\.exr: the image is deep.*flatten it"):
-            read(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("is_associated", [True, False])
@@ -284,11 +147,6 @@ def test_alpha_of_tiff_is_as_the_file_says(
     shown = 255 * (srgb_encoded(colour) if kind == "float" else colour)
     assert np.abs(image[..., :3] - shown).max() <= (2.5 if kind == "uint8" else 0.6)
     assert np.abs(image[..., 3:] - 255 * alpha).max() <= 0.6
-
-
-def test_missing_image(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"none\.png: no such image"):
-        read_image(tmp_path / "none.png")
 
 
 def test_mask_keeps_white(tmp_path: Path) -> None:
@@ -327,23 +185,6 @@ def test_area_filter_is_the_mean_over_the_covered_rectangle(
     np.testing.assert_allclose(found.mean(axis=(0, 1)), pixels.mean(axis=(0, 1)), atol=1e-12)
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([3, 4]), st.data())
-def test_strips_give_the_same_bytes(
-    height: int, width: int, channels: int, data: st.DataObject
-) -> None:
-    new_height = data.draw(st.integers(1, height))
-    new_width = data.draw(st.integers(1, width))
-    numbers = np.random.default_rng(height * 41 + width).integers(
-        0, 256, (height, width, channels), dtype=np.uint8
-    )
-    pixels = torch.from_numpy(numbers)
-    wanted = straight_uint8(area_downscale(premultiplied(pixels), new_width, new_height))
-    assert torch.equal(area_downscale_uint8(pixels, new_width, new_height), wanted)
-    with mock.patch.object(images, "_STRIP_PIXELS", data.draw(st.integers(1, 200))):
-        assert torch.equal(area_downscale_uint8(pixels, new_width, new_height), wanted)
-
-
 def test_colour_of_transparent_pixels_does_not_bleed() -> None:
     """Opaque red beside invisible green shrinks to half-covered red."""
     pixels = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8)
@@ -372,55 +213,6 @@ def test_target_size(
 
 
 # ---------------------------------------------------------------------------------------------------- damaged and huge
-
-
-def mutated(data: bytes, seed: int) -> bytes:
-    """``data`` with some bytes changed, removed or inserted, most of them near the beginning."""
-    rng = np.random.default_rng(seed)
-    changed = bytearray(data)
-    for _ in range(rng.choice([1, 2, 4, 16])):
-        at = int(rng.integers(min(len(changed), rng.choice([64, 200, len(changed)]))))
-        kind = rng.random()
-        if kind < 0.6:
-            changed[at] = rng.integers(256)
-        elif kind < 0.8:
-            changed[at : at + 4] = bytes([255, 255, 255, 127])
-        elif kind < 0.9 and len(changed) > 100:
-            del changed[at : at + 20]
-        else:
-            changed[at:at] = bytes(rng.integers(128, 256, 8, dtype=np.uint8))
-    return bytes(changed)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr", ".tif", ".webp", ".bmp"])
-def test_damaged_images_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str) -> None:
-    """One in fifty ended in a traceback, because OpenImageIO quotes bytes that are no text."""
-    pixels = random_pixels(20, 24, 3)
-    write_image(
-        tmp_path / f"a{suffix}", pixels.astype(np.float32) / 255 if suffix == ".exr" else pixels
-    )
-    data = (tmp_path / f"a{suffix}").read_bytes()
-    path = tmp_path / f"m{suffix}"
-    lines = []
-    for seed in range(200):
-        path.write_bytes(mutated(data, seed))
-        for read in (read_header, check_image, read_mask):
-            try:
-                read(path)
-            except DyngsError as error:
-                lines.append(str(error))
-    assert len(lines) > 50
-    assert [line for line in lines if not line.isprintable() or str(path) not in line] == []
-
-
-def test_texts_that_are_not_utf_8_are_shown_with_escapes(tmp_path: Path) -> None:
-    path = tmp_path / "a.exr"
-    write_image(path, random_pixels(4, 4, 3).astype(np.float32))
-    path.write_bytes(path.read_bytes().replace(b"channels\0chlist\0", b"channels\xe4chlist\0"))
-    with pytest.raises(
-        DyngsError, match=r"a\.exr: cannot be read as an image \(.*copy or convert it again"
-    ):
-        read_header(path)
 
 
 def write_empty_png(path: Path, side: int) -> None:
@@ -452,23 +244,6 @@ def test_a_small_file_with_a_huge_image_is_refused_before_it_is_decoded(tmp_path
         ):
             read(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
-
-
-def test_the_limit_can_be_raised_and_lowered(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.png", random_pixels(100, 100, 3))
-    with (
-        images_up_to(0.005),
-        pytest.raises(DyngsError, match=r"0\.01 megapixels, but .* is 0\.005"),
-    ):
-        read_image(tmp_path / "a.png")
-    with images_up_to(0.01):
-        assert read_image(tmp_path / "a.png").shape == (100, 100, 3)
-
-
-def test_many_channels_count_as_many_images(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.exr", np.zeros((100, 100, 40), np.float32))
-    with images_up_to(0.05), pytest.raises(DyngsError, match=r"of 40 channels are 0\.1 megapixels"):
-        read_image(tmp_path / "a.exr")
 
 
 _RNG = np.random.default_rng(0)
@@ -518,19 +293,3 @@ def test_photos_are_upright_for_colmap_and_for_us(tmp_path: Path, orientation: i
     stored = tmp_path / "images" / photos[0].name
     assert read_header(stored).size_for(size) == size
     assert np.array_equal(read_image(stored, size).numpy(), shown)
-
-
-def test_focal_length_and_exposure(tmp_path: Path) -> None:
-    pixels = np.zeros((300, 400, 3), np.uint8)
-    exposed = {0x829A: IFDRational(1, 100), 0x829D: IFDRational(2, 1), 0x8827: 400}
-    tags = read_header(_photo(tmp_path / "a.jpg", 1, pixels, exposed | {0xA405: 35})).tags
-    assert tags.focal_px == pytest.approx(35 / 43.2666 * 500, rel=1e-4), "by the diagonals"
-    assert tags.exposure == pytest.approx(0.01 * 4 / 4)
-    # 4 mm over 2,000 pixels an inch, of an image that was 800 px wide when it was taken
-    sensor = {0x920A: IFDRational(4, 1), 0xA20E: IFDRational(25400, 10), 0xA210: 2, 0xA002: 800}
-    assert read_header(
-        _photo(tmp_path / "b.jpg", 1, pixels, sensor)
-    ).tags.focal_px == pytest.approx(4 * 100 / 2)
-    absurd = {0xA405: 60000, 0x829A: IFDRational(0, 1)}
-    tags = read_header(_photo(tmp_path / "c.jpg", 9, pixels, absurd)).tags
-    assert (tags.focal_px, tags.exposure, tags.orientation) == (None, None, 1)

@@ -11,7 +11,6 @@ from dyngs.data.geometry import pinhole_matrix
 from dyngs.data.images.lens import (
     WIDEST_DEG,
     distort,
-    is_pinhole,
     kept_fraction,
     undistort,
     undistort_map,
@@ -24,12 +23,6 @@ FISHEYE = Lens("fisheye", (0.05, -0.02, 0.003, 0.0))
 INTRINSICS = pinhole_matrix(50.0, 52.0, 31.0, 23.5)
 
 
-def test_zero_coefficients_are_a_pinhole_except_for_a_fisheye() -> None:
-    assert is_pinhole(Lens())
-    assert is_pinhole(Lens("opencv", (0.0,) * 8))
-    assert not is_pinhole(Lens("fisheye", (0.0,) * 4))
-
-
 def test_known_points() -> None:
     """k1 alone: r = 0.5 goes to 0.5 (1 + k1 / 4). Fisheye without coefficients: to the angle."""
     point = torch.tensor([[0.3, 0.4]], dtype=torch.float64)
@@ -40,25 +33,6 @@ def test_known_points() -> None:
     torch.testing.assert_close(
         distort(Lens("fisheye", (0.0,) * 4), point), wanted, rtol=1e-12, atol=0
     )
-
-
-@pytest.mark.parametrize(
-    "lens", [BARREL, FISHEYE, Lens("opencv", (0.1, -0.05, 0.01, 0.02, 0.03, 0.01, 0.0, 0.01))]
-)
-def test_axis_stays_and_small_angles_are_undistorted(lens: Lens) -> None:
-    tiny = torch.tensor([[0.0, 0.0], [1e-6, -2e-6]], dtype=torch.float64)
-    torch.testing.assert_close(distort(lens, tiny), tiny, rtol=1e-6, atol=1e-12)
-
-
-def test_undistort_points_of_kornia_goes_back() -> None:
-    from kornia.geometry.calibration import undistort_points
-
-    points = torch.rand(1, 30, 2, dtype=torch.float64) - 0.5
-    coefficients = torch.tensor([BARREL.params], dtype=torch.float64)
-    back = undistort_points(
-        distort(BARREL, points), torch.eye(3).double()[None], coefficients, num_iters=50
-    )
-    torch.testing.assert_close(back, points, rtol=0, atol=1e-9)
 
 
 def test_map_of_no_distortion_is_the_identity() -> None:
@@ -102,14 +76,6 @@ def test_distorted_image_of_a_smooth_scene_becomes_the_pinhole_image(lens: Lens)
     assert float(error.max()) < 4e-3, "half a pixel would be 0.4 * 6 / 52 / 2 = 0.023"
 
 
-def test_pixels_from_outside_are_not_valid_and_black() -> None:
-    """Pincushion: the pinhole image's corners lie outside the stored one."""
-    lens_map = undistort_map(Lens("opencv", (0.3, 0.0, 0.0, 0.0)), INTRINSICS, 64, 48)
-    assert not bool(lens_map.valid[0, 0])
-    assert bool(lens_map.valid[24, 32])
-    assert float(undistort(torch.ones(48, 64, 1), lens_map)[0, 0]) == 0
-
-
 def test_no_ghosts_where_the_polynomial_turns_back() -> None:
     """k1 = -1 turns at r = 1/sqrt(3); beyond, positions fall back into the image but mean
     nothing."""
@@ -119,25 +85,6 @@ def test_no_ghosts_where_the_polynomial_turns_back() -> None:
     assert bool(inside[32, 60])
     assert not bool(lens_map.valid[32, 60]), "r = 0.95"
     assert bool(lens_map.valid[32, 45]), "r = 0.45"
-
-
-def test_share_of_a_fisheye_image_that_is_kept() -> None:
-    """Equidistant: a point at a distance r (in focal lengths) from the middle is seen at tan(r) by
-    the pinhole."""
-    intrinsics = pinhole_matrix(200, 200, 200, 200)
-    fraction = kept_fraction(Lens("fisheye", (0.0, 0.0, 0.0, 0.0)), intrinsics, 400, 400)
-    x, y = np.meshgrid(*[(np.arange(1000) + 0.5) / 500 - 1] * 2)
-    r = np.hypot(x, y)
-    inside = (np.maximum(abs(x), abs(y)) * np.tan(r) / r <= 1) & (r < np.pi / 2)
-    assert fraction == pytest.approx(inside.mean(), abs=0.01)
-
-
-def test_lenses_that_keep_everything() -> None:
-    intrinsics = pinhole_matrix(200, 200, 200, 200)
-    assert kept_fraction(Lens(), intrinsics, 400, 400) == 1
-    # a cushion: the pinhole sees more
-    assert kept_fraction(Lens("opencv", (0.1, 0, 0, 0)), intrinsics, 400, 400) == 1
-    assert kept_fraction(Lens("opencv", (-0.1, 0, 0, 0)), intrinsics, 400, 400) < 1
 
 
 def fisheye_matrix(degrees: float) -> np.ndarray:
@@ -170,29 +117,6 @@ def test_a_wide_pinhole_shows_all_that_the_lens_saw(degrees: float) -> None:
     assert bool(valid[20:100, 20:140].all())
 
 
-def test_a_image_through_a_wide_pinhole_shows_what_the_lens_saw() -> None:
-    """The stored image holds the angle from the axis and the direction; so must the pinhole's, at
-    its own places."""
-    intrinsics = fisheye_matrix(90.0)
-    v, u = np.mgrid[:120, :160] + 0.5
-    x = (u - 80) / intrinsics[0, 0]
-    y = (v - 60) / intrinsics[1, 1]
-    stored = torch.from_numpy(np.stack([np.hypot(x, y), 0.5 + x / 4, 0.5 + y / 4], -1)).float()
-    wide, pinhole = wide_pinhole(Lens("fisheye", (0.0,) * 4), intrinsics, 160, 120)
-    lens_map = undistort_map(wide, pinhole, 160, 120)
-    found = undistort(stored, lens_map)
-    x = (u - 80) / pinhole[0, 0]
-    y = (v - 60) / pinhole[1, 1]
-    angle = np.arctan(np.hypot(x, y))
-    wanted = np.stack(
-        [angle, 0.5 + angle * x / np.hypot(x, y) / 4, 0.5 + angle * y / np.hypot(x, y) / 4], -1
-    )
-    inner = lens_map.valid.numpy() & (angle < 0.98) & (angle > 0.05)
-    inner[1:-1, 1:-1] &= inner[:-2, 1:-1] & inner[2:, 1:-1]
-    assert inner.mean() > 0.6
-    assert np.abs(found.numpy() - wanted)[inner].max() < 5e-3
-
-
 @pytest.mark.parametrize("ratio", [1.0, 1.5])
 @pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["barrel", "fisheye"])
 def test_undistorted_points_go_back(lens: Lens, ratio: float) -> None:
@@ -202,25 +126,3 @@ def test_undistorted_points_go_back(lens: Lens, ratio: float) -> None:
     center = torch.tensor([31.0, 23.5]).double()
     straight = (undistorted_points(lens, INTRINSICS, points) - center) / focal
     torch.testing.assert_close(distort(lens, straight) * focal + center, points, rtol=0, atol=0.05)
-
-
-def test_lenses_that_need_no_wider_pinhole_keep_theirs() -> None:
-    for lens in (
-        Lens(),
-        Lens("opencv", (0.1, 0.02, 0.0, 0.0)),
-        Lens("opencv", (-1e-3, 0.0, 0.0, 0.0)),
-    ):
-        same, intrinsics = wide_pinhole(lens, INTRINSICS, 64, 48)
-        assert same == lens
-        assert intrinsics is INTRINSICS
-
-
-def test_where_a_lens_folds_back_nothing_is_valid() -> None:
-    """r (1 - r^6 / 2) falls from r = 3.5^(-1/6) = 0.81 on: beyond, the image would appear a second
-    time."""
-    intrinsics = np.array([[100.0, 0.0, 100.0], [0.0, 100.0, 100.0], [0.0, 0.0, 1.0]])
-    found = undistort_map(Lens("opencv", (0.0, 0.0, 0.0, 0.0, -0.5)), intrinsics, 200, 200)
-    place = (torch.arange(200) + 0.5 - 100) / 100
-    radius = torch.hypot(place[:, None], place[None])
-    assert not found.valid[radius > 0.82].any()
-    assert found.valid[radius < 0.8].all()

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tiny_captures import random_pixels, write_image
+from tiny_captures import write_image
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.capture import Lens, Silhouette, View
+from dyngs.data.capture import Lens, View
 from dyngs.data.images.lens import undistort_map, undistorted_points
 from dyngs.data.images.maps import (
-    cut_out,
     flow_at,
     nearest_positions,
     read_depth,
     read_flow,
-    read_labels,
-    resized,
     silhouette_box,
     taken_at,
 )
@@ -47,36 +43,6 @@ def test_floats_are_taken_as_they_are(tmp_path: Path, ending: str) -> None:
     assert read_depth(path).tolist() == [[2.5, 0], [0, 0]]
 
 
-def test_labels_of_sixteen_bits_are_not_rounded_away(tmp_path: Path) -> None:
-    write_image(tmp_path / "a.png", np.array([[[0], [1], [300]]], np.uint16))
-    assert read_labels(tmp_path / "a.png").tolist() == [[0, 1, 300]]
-
-
-def test_each_colour_of_a_label_image_is_a_label_and_alpha_is_none(tmp_path: Path) -> None:
-    colours = np.array([[[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 0, 0]]], np.uint8)
-    for image in (colours, np.pad(colours, ((0, 0), (0, 0), (0, 1)), constant_values=255)):
-        write_image(tmp_path / "a.png", image)
-        (labels,) = read_labels(tmp_path / "a.png").tolist()
-        assert labels[0] == 0
-        assert labels[1] == labels[4]
-        assert len(set(labels)) == 4
-
-
-@pytest.mark.parametrize("shape", [(4,), (0, 3), (2, 2, 2, 2)])
-def test_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    np.save(tmp_path / "a.npy", np.ones(shape))
-    with pytest.raises(DyngsError, match=r"a\.npy: a depth map must be"):
-        read_depth(tmp_path / "a.npy")
-
-
-def test_missing_and_ambiguous_files(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"a\.npy: no such file"):
-        read_depth(tmp_path / "a.npy")
-    np.savez(tmp_path / "a.npz", one=np.ones((2, 2)), two=np.ones((2, 2)))
-    with pytest.raises(DyngsError, match="depth"):
-        read_depth(tmp_path / "a.npz")
-
-
 def flo(width: int, height: int, values: np.ndarray) -> bytes:
     return struct.pack("<fii", 202021.25, width, height) + values.astype("<f4").tobytes()
 
@@ -90,79 +56,10 @@ def test_all_three_kinds_of_files_hold_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_flow(tmp_path / f"a.{ending}").numpy(), values)
 
 
-def test_huge_and_infinite_displacements_are_unknown(tmp_path: Path) -> None:
-    values = np.zeros((1, 3, 2), np.float32)
-    values[0, 1, 0] = 1e10
-    values[0, 2, 1] = np.inf
-    (tmp_path / "a.flo").write_bytes(flo(3, 1, values))
-    assert read_flow(tmp_path / "a.flo").isnan().all(-1).tolist() == [[False, True, True]]
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"no flow at all, but text", flo(5, 3, np.zeros(7)), flo(-1, 3, np.zeros(7))]
-)
-def test_damaged_files_are_refused(tmp_path: Path, data: bytes) -> None:
-    (tmp_path / "a.flo").write_bytes(data)
-    with pytest.raises(DyngsError, match=r"a\.flo"):
-        read_flow(tmp_path / "a.flo")
-
-
 def test_sizes_are_checked_before_memory_is_allocated(tmp_path: Path) -> None:
     (tmp_path / "a.flo").write_bytes(flo(2**30, 2**30, np.zeros(2)))
     with pytest.raises(DyngsError, match="megapixels"):
         read_flow(tmp_path / "a.flo")
-
-
-def test_arrays_that_are_no_flow(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((3, 5)))
-    with pytest.raises(DyngsError, match=r"must be \(height, width, 2\)"):
-        read_flow(tmp_path / "a.npy")
-
-
-@pytest.mark.parametrize(
-    ("person", "expected"),
-    [("white", [0, 1, 128, 255]), ("black", [255, 254, 127, 0]), ("nonzero", [0, 255, 255, 255])],
-)
-def test_silhouettes_become_alpha(tmp_path: Path, person: Any, expected: list[int]) -> None:
-    write_image(tmp_path / "m.png", np.array([[[0], [1], [128], [255]]], np.uint8))
-    pixels = torch.from_numpy(random_pixels(1, 4, 3))
-    cut = cut_out(pixels, Silhouette(tmp_path / "m.png", person))
-    assert cut[0, :, 3].tolist() == expected
-    assert torch.equal(cut[..., :3], pixels)
-
-
-def test_silhouettes_and_alpha_multiply(tmp_path: Path) -> None:
-    write_image(tmp_path / "m.png", np.array([[[0], [128], [255]]], np.uint8))
-    pixels = torch.tensor([[[9, 9, 9, 200]] * 3], dtype=torch.uint8)
-    assert cut_out(pixels, Silhouette(tmp_path / "m.png", "white"))[0, :, 3].tolist() == [
-        0,
-        100,
-        200,
-    ]
-
-
-def test_bad_silhouettes(tmp_path: Path) -> None:
-    write_image(tmp_path / "m.png", np.zeros((2, 3, 1), np.uint8))
-    with pytest.raises(DyngsError, match=r"m\.png: the mask is 3x2 but its image is 4x1"):
-        cut_out(torch.zeros(1, 4, 3, dtype=torch.uint8), Silhouette(tmp_path / "m.png", "white"))
-    with pytest.raises(DyngsError, match=r"n\.png: no such image"):
-        cut_out(torch.zeros(1, 4, 3, dtype=torch.uint8), Silhouette(tmp_path / "n.png", "white"))
-
-
-def test_silhouettes_in_hdf5(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
-    hdf5 = tmp_path / "m.hdf5"
-    masks = np.zeros((5, 2, 3), np.uint8)
-    masks[3, 1, 2] = 1
-    with h5py.File(hdf5, "w") as file:
-        file.create_dataset("masks", data=masks, compression="lzf")
-    pixels = torch.zeros(2, 3, 3, dtype=torch.uint8)
-    assert cut_out(pixels, Silhouette(hdf5, "nonzero", 3))[..., 3].tolist() == [
-        [0, 0, 0],
-        [0, 0, 255],
-    ]
-    with pytest.raises(DyngsError, match="'masks' must be a data set in an HDF5 file"):
-        cut_out(pixels, Silhouette(hdf5, "nonzero", 5))
 
 
 def test_the_box_holds_all_that_is_shown() -> None:
@@ -180,13 +77,6 @@ def test_nothing_is_averaged() -> None:
     values = torch.arange(24.0).reshape(4, 6, 1)
     torch.testing.assert_close(taken_at(values, nearest_positions(6, 4)), values)
     assert taken_at(values, nearest_positions(3, 2))[..., 0].tolist() == [[7, 9, 11], [19, 21, 23]]
-
-
-def test_flow_is_measured_in_pixels_of_the_smaller_image() -> None:
-    flow = torch.tensor([4.0, -2.0]).expand(8, 12, 2)
-    small = resized(flow, 6, 2)
-    assert small.shape == (2, 6, 2)
-    torch.testing.assert_close(small, torch.tensor([2.0, -0.5]).expand(2, 6, 2))
 
 
 def test_flow_through_a_lens_ends_where_the_pinhole_sees_the_point() -> None:

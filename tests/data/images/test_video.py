@@ -25,15 +25,12 @@ from hdr_clips import (
 from tiny_captures import level_of, packet_places, truncate_video, write_video
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.images import video as video_module
 from dyngs.data.images.video import (
     VideoInfo,
-    colour_notes,
     probe_video,
     read_frames,
     read_numbered_frames,
 )
-from dyngs.io.containment import images_up_to
 
 
 @pytest.fixture(scope="module")
@@ -65,23 +62,6 @@ def test_wanted_frames_in_order(video: Path, numbers: list[int]) -> None:
         np.testing.assert_array_equal(rgb, everything[number])
 
 
-def test_a_frame_behind_the_end(video: Path) -> None:
-    frames = read_numbered_frames(video, [8, 9])
-    assert next(frames)[0] == 8
-    with pytest.raises(DyngsError, match=r"cam00\.mp4 breaks at frame 9 "):
-        next(frames)
-
-
-def test_truncated_video(video: Path) -> None:
-    """The frames before the break can be had; the error says where it is."""
-    short = copy(video, "short.mp4")
-    truncate_video(short, 6)
-    assert probe_video(short).num_frames == 9
-    assert [number for number, _ in read_numbered_frames(short, [0, 1])] == [0, 1]
-    with pytest.raises(DyngsError, match=r"short\.mp4 breaks at frame [3-7] .*data\.frames"):
-        list(read_numbered_frames(short, range(9)))
-
-
 def test_video_damaged_in_the_middle(video: Path) -> None:
     broken = copy(video, "broken.mp4")
     data = bytearray(broken.read_bytes())
@@ -106,25 +86,6 @@ def test_no_video_at_all(video: Path) -> None:
         probe_video(empty)
 
 
-def test_a_title_in_latin_1(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    with av.open(str(path), "w") as container:
-        container.metadata["title"] = "Café"
-        stream = container.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 16, 12, "yuv420p"
-        for _ in range(3):
-            container.mux(
-                stream.encode(
-                    av.VideoFrame.from_ndarray(np.zeros((12, 16, 3), np.uint8), format="rgb24")
-                )
-            )
-        container.mux(stream.encode(None))
-    path.write_bytes(path.read_bytes().replace("Café".encode(), b"Caf\xe9 "))
-    assert b"Caf\xe9 " in path.read_bytes()
-    assert probe_video(path).num_frames == 3
-    assert len(list(read_frames(path))) == 3
-
-
 @pytest.mark.parametrize(
     "content",
     ["ffconcat version 1.0\nfile cam00.mp4\n", "#EXTM3U\n#EXTINF:1,\n{video}\n#EXT-X-ENDLIST\n"],
@@ -134,40 +95,6 @@ def test_playlists_which_name_other_files_are_no_videos(video: Path, content: st
     path.write_text(content.format(video=video))
     with pytest.raises(DyngsError, match=r"cannot read the video .*list\.mp4"):
         probe_video(path)
-
-
-def test_large_videos_are_refused_before_they_are_decoded(
-    video: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with (
-        images_up_to(0.0005),
-        pytest.raises(DyngsError, match=r"32x24 .*data\.max_megapixels is 0\.0005"),
-    ):
-        probe_video(video)
-    monkeypatch.setattr(video_module, "MAX_FRAMES", 8)
-    with pytest.raises(
-        DyngsError,
-        match=r"cam00\.mp4: the video has 9 frames, of which 8 are read at most; cut it up",
-    ):
-        probe_video(video)
-
-
-def test_mutated_videos_are_read_or_refused_in_one_line(video: Path) -> None:
-    data = video.read_bytes()
-    path = video.with_name("mutated.mp4")
-    lines = []
-    for seed in range(150):
-        rng = np.random.default_rng(seed)
-        changed = bytearray(data)
-        for _ in range(rng.choice([1, 4, 16])):
-            changed[int(rng.integers(rng.choice([200, 1000, len(data)])))] = rng.integers(256)
-        path.write_bytes(changed)
-        try:
-            for _ in read_numbered_frames(path, range(min(probe_video(path).num_frames, 20))):
-                pass
-        except DyngsError as error:
-            lines.append(str(error))
-    assert all(line.isprintable() for line in lines)
 
 
 MATRICES = {1: (1, 0, 0, 1), 2: (-1, 0, 0, 1), 3: (-1, 0, 0, -1), 4: (1, 0, 0, -1)}
@@ -263,25 +190,6 @@ def test_tags_of_the_container_alone(tmp_path: Path, codec: str, is_full_range: 
     assert "HLG is tone-mapped" in probe_video(path).colours
 
 
-def test_hdr_in_8_bits_without_primaries_and_matrix(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    rgb = patches()
-    write_clip(path, encoded(rgb, BT2020, HLG), (UNSPECIFIED, HLG, UNSPECIFIED), bits=8)
-    assert levels_off(path, rgb) < 3
-
-
-def test_brighter_than_white_is_clipped(tmp_path: Path) -> None:
-    """Black, diffuse white, the brightest signal of HLG."""
-    path = tmp_path / "a.mp4"
-    signal = np.zeros((48, 64, 3))
-    signal[:, 32:48] = 0.75
-    signal[:, 48:] = 1.0
-    write_clip(path, signal, (BT2020, HLG, BT2020))
-    (frame, _) = read_frames(path)
-    assert frame[:, :30].max() <= 1
-    assert frame[:, 34:].min() >= 254
-
-
 @pytest.mark.parametrize(
     ("size", "matrix"), [((576, 64), BT601), ((720, 64), BT709), ((64, 1280), BT709)]
 )
@@ -295,26 +203,3 @@ def test_untagged_video_is_bt601_in_sd_and_bt709_in_hd(
     assert levels_off(path, rgb) < 2.5
     note = "HD without colour tags is read as BT.709" if matrix == BT709 else ""
     assert probe_video(path).colours == note
-
-
-def test_tagged_hd_follows_its_tags(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    rgb = np.full((720, 64, 3), (0.2, 0.7, 0.3))
-    write_clip(path, rgb, (UNSPECIFIED, UNSPECIFIED, BT601), matrix=BT601, bits=8)
-    assert levels_off(path, rgb) < 2.5
-    assert probe_video(path).colours == ""
-
-
-def test_a_matrix_that_cannot_be_converted_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    ictcp = 14
-    write_clip(path, patches(), (BT2020, PQ, ictcp))
-    with pytest.raises(
-        DyngsError, match=r"a\.mp4: its colours have the matrix 14 .* export .*HDR10"
-    ):
-        probe_video(path)
-
-
-def test_colour_notes_count_the_videos_of_each_kind() -> None:
-    videos = [VideoInfo(4, 4, 1, 30.0, colours) for colours in ("PQ", "", "HLG", "PQ", "PQ")]
-    assert colour_notes(videos) == ["3 videos: PQ", "1 video: HLG"]

@@ -15,7 +15,7 @@ from tiny_fields import cloud
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.deform.bodies.paths import Shots, one_camera, shots_of
+from dyngs.deform.bodies.paths import FrameStack, frame_stack_of, one_camera
 from dyngs.gaussians.rendering import RenderOptions
 
 
@@ -41,7 +41,7 @@ def test_pixels_on_a_ball_see_its_surface() -> None:
     inside = shots.differences()[3, rows, columns]
     assert inside.mean() > 2 * shots.differences()[3].mean()
     values = {name: x for name, x in vars(shots).items() if name != "centers"}
-    hidden = Shots(**values | {"depths": np.full_like(shots.depths, 0.1)})
+    hidden = FrameStack(**values | {"depths": np.full_like(shots.depths, 0.1)})
     assert not len(hidden.on_ball(3, centers[3], 0.28)[0])
     assert not len(shots.on_ball(3, np.array([50.0, 0, 0]), 0.28)[0])
 
@@ -66,7 +66,7 @@ def test_masked_pixels_are_as_the_static_model_has_them() -> None:
     mask = torch.zeros(8, 8)
     mask[:4] = 1
     image = Image("a", camera, rgb, torch.ones(8, 8), mask, 0.5)
-    shots = shots_of([image], gaussians, RenderOptions(), torch.ones(3))
+    shots = frame_stack_of([image], gaussians, RenderOptions(), torch.ones(3))
     assert np.array_equal(shots.alphas[0, :4], np.ones((4, 8)))
     assert np.array_equal(shots.alphas[0, 4:], shots.still_alphas[0, 4:])
     assert np.array_equal(shots.images[0, :4], rgb[:4].numpy())

@@ -8,7 +8,7 @@ from rolling_ball import hopping, rolling
 from dyngs.deform.bodies.paths import Path
 from dyngs.deform.bodies.start import (
     angles_deg,
-    found_turning,
+    estimate_rotation,
 )
 
 RADIUS = 0.28
@@ -25,7 +25,7 @@ def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
     """It turns by more than a full turn; of its turn from image to image nothing is known
     beforehand."""
     shots, centers, truth = rolling()
-    turning = found_turning(shots, Path(centers, RADIUS, 1.0))
+    turning = estimate_rotation(shots, Path(centers, RADIUS, 1.0))
     errors = errors_deg(turning.rotations, truth)
     assert np.median(errors) < 4
     assert errors.max() < 12
@@ -35,13 +35,13 @@ def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
 def test_two_turns_about_any_axis_are_followed() -> None:
     """No rolling and no heading says beforehand how fast."""
     shots, centers, truth = hopping()
-    errors = errors_deg(found_turning(shots, Path(centers, RADIUS, 1.0)).rotations, truth)
+    errors = errors_deg(estimate_rotation(shots, Path(centers, RADIUS, 1.0)).rotations, truth)
     assert np.median(errors) < 6
     assert errors.max() < 20
 
 
 def test_what_slides_does_not_turn() -> None:
     shots, centers, _ = rolling(turns=False)
-    turning = found_turning(shots, Path(centers, RADIUS, 1.0))
+    turning = estimate_rotation(shots, Path(centers, RADIUS, 1.0))
     assert angles_deg(turning.rotations).max() < 10
     assert turning.disagreement > 0.85 * turning.standing

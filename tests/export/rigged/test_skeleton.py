@@ -23,8 +23,7 @@ from dyngs.export.rigged.skeleton import (
     rest_vertices,
     rig_of,
 )
-from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.posing import Skeleton, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import apply_shape

@@ -51,33 +51,6 @@ def test_masked_pixels_and_those_of_weight_0_do_not_count() -> None:
     torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)
 
 
-def test_channels_that_are_brighter_than_white_are_left_out_one_by_one() -> None:
-    """As least squares over the pixels of each channel that are kept, with the ridge as two more
-    equations."""
-    image, rendering = image_and_rendering()
-    target = (1.5 * rendering.rgb[0] * torch.tensor([1.0, 1.2, 0.9])).clamp_max(1.0)
-    seen = torch.cat([rendering.rgb[0], torch.ones(60, 80, 1)], -1).reshape(-1, 4).double()
-    affine = torch.eye(3, 4, dtype=torch.float64)
-    kept = torch.zeros(0)
-    for _ in range(3):
-        kept = ~((target.reshape(-1, 3) >= 254.5 / 255) & (seen @ affine.T > 1))
-        rows = []
-        for channel in range(3):
-            weights = torch.full((4,), 1e-2 * len(seen), dtype=torch.float64)
-            weights[channel] = 1e-5 * len(seen)
-            ridge = weights.sqrt().diag()
-            of_identity = weights.sqrt() * torch.eye(3, 4).double()[channel]
-            left = torch.cat([seen[kept[:, channel]], ridge])
-            right = torch.cat(
-                [target.reshape(-1, 3)[kept[:, channel], channel].double(), of_identity]
-            )
-            rows.append(torch.linalg.lstsq(left, right[:, None]).solution[:, 0])
-        affine = torch.stack(rows)
-    assert 0.05 < float((~kept).double().mean()) < 0.5
-    found = fitted_affine([(replace(image, rgb_premultiplied=target), rendering)], BLACK)
-    torch.testing.assert_close(found, affine.float(), atol=1e-5, rtol=0)
-
-
 def test_a_background_behind_a_cut_out_object_keeps_its_colour() -> None:
     """Exposure makes the object twice as bright; the white that we put behind it stays white."""
     image, rendering = image_and_rendering()

@@ -5,21 +5,16 @@ N Gaussians, J joints.
 
 from __future__ import annotations
 
-import math
 from functools import cache
 
 import pytest
 import torch
 from torch import Tensor
 
-from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import (
+from dyngs.human.avatar.posing import (
     FINER,
     Anchors,
-    heaviest_joints,
-    pixel_size,
     skinning_weights,
     surface_gaussians,
     surface_texels,
@@ -29,7 +24,6 @@ from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.motion.motion import MotionClip
 from dyngs.ops.quaternions import rotation_matrices
 
 RESOLUTION = 48
@@ -78,16 +72,6 @@ def test_gradients_by_corrections_are_those_of_the_formula() -> None:
     assert torch.autograd.gradcheck(lambda c: skinning_weights(anchors, 4, c), corrections)
 
 
-def test_the_heaviest_joints_are_kept_and_normalised() -> None:
-    weights = torch.tensor([[0.05] * 8 + [0.3, 0.3], [0.0] * 9 + [1.0]])
-    joints, fractions = heaviest_joints(weights)
-    assert joints.shape == (2, 8)
-    assert joints[0, :2].tolist() == [8, 9]
-    assert joints[1, 0] == 9
-    torch.testing.assert_close(fractions.sum(1), torch.ones(2))
-    torch.testing.assert_close(fractions[0, 0], torch.tensor(0.3 / 0.9))
-
-
 def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:
     texels = atlas_texels(default_template(), RESOLUTION)
     gaussians, anchors = texel_gaussians(texels, (0.0, 0.03), 1)
@@ -100,20 +84,6 @@ def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:
     assert gaussians.log_scales.argmin(1).eq(2).all()
     assert gaussians.opacities[0] > 0.5 > gaussians.opacities[-1]
     assert gaussians.sh.shape == (2 * len(texels), 4, 3)
-
-
-def test_anchors_know_their_place_on_the_template() -> None:
-    body = default_template()
-    _, anchors = texel_gaussians(atlas_texels(body, RESOLUTION), (0.0, 0.02), 0)
-    corners = (anchors.barycentric[..., None] * body.vertices[body.faces[anchors.face]]).sum(1)
-    skin = anchors.height == 0
-    torch.testing.assert_close(corners[skin], anchors.points[skin])
-    distances = (anchors.points - corners)[~skin].norm(dim=1)
-    torch.testing.assert_close(distances, anchors.height[~skin], rtol=1e-4, atol=0)
-    assert body.uv is not None
-    assert body.uv_faces is not None
-    uv = (anchors.barycentric[..., None] * body.uv[body.uv_faces[anchors.face]]).sum(1)
-    torch.testing.assert_close(anchors.uv, uv, rtol=0, atol=1e-5)
 
 
 FINE = 64
@@ -138,28 +108,6 @@ def test_hands_and_feet_have_smaller_texels_of_the_same_surface_where_pixels_are
     assert torch.equal(normals, torch.cat([coarse.normals, fine.normals]))
 
 
-def test_nothing_is_finer_where_a_texel_is_hardly_wider_than_a_pixel() -> None:
-    body = default_template()
-    (only,) = surface_texels(body, FINE, body.vertices, 0.05)
-    assert torch.equal(only.index, atlas_texels(body, FINE).index)
-
-
-def test_a_pixel_is_as_large_on_the_person_as_the_camera_is_far() -> None:
-    pose = torch.eye(4)
-    clip = MotionClip(
-        torch.zeros(1, dtype=torch.float64),
-        torch.zeros(1, 55, 3),
-        torch.zeros(1, 3),
-        torch.tensor([2.0]),
-    )
-    pose[2, 3] = 8.0
-    camera = Cameras(
-        pose[None], torch.tensor([[[400.0, 0, 50], [0, 400.0, 50], [0, 0, 1]]]), 100, 100
-    )
-    assert pixel_size([camera], clip, torch.zeros(3)) == pytest.approx(8.0 / 400 / 2)
-    assert pixel_size([], clip, torch.zeros(3)) == torch.inf
-
-
 def test_scaffolds_are_displaced_by_exactly_their_height() -> None:
     body = default_template()
     heights = (0.0, 0.01, 0.04)
@@ -171,9 +119,3 @@ def test_scaffolds_are_displaced_by_exactly_their_height() -> None:
         apart = (anchors.points[rows] - texels.points).double()
         torch.testing.assert_close(apart, height * texels.normals.double(), rtol=0, atol=2e-7)
     assert torch.equal(anchors.points[: len(texels)], texels.points)
-
-
-@pytest.mark.parametrize("heights", [(), (0.0, math.nan), (math.inf,)])
-def test_heights_are_numbers(heights: tuple[float, ...]) -> None:
-    with pytest.raises(DyngsError, match="one or more finite numbers"):
-        texel_gaussians(atlas_texels(default_template(), 8), heights, 0)

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.avatar.neighbours import (
+from dyngs.human.avatar.observations import (
     filled,
     linked_neighbours,
     mirror_images,
@@ -25,10 +19,10 @@ from dyngs.human.avatar.neighbours import (
     sightings,
     smoothed,
     strains,
-    trust_in,
 )
+from dyngs.human.avatar.posing import Anchors
 from dyngs.human.body.atlas import atlas_texels
-from dyngs.human.body.body_reader import default_template, load_template
+from dyngs.human.body.body_reader import load_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.keys import HumanModel
 
@@ -50,29 +44,6 @@ def test_neighbours_are_the_nearest_others(positions: np.ndarray, count: int) ->
         assert len(set(row.tolist())) == columns
         others = torch.cat([apart[i, :i], apart[i, i + 1 :]]).sort().values
         torch.testing.assert_close(apart[i, row], others[:columns])
-
-
-def test_neighbours_on_the_skin_are_next_texels() -> None:
-    texels = atlas_texels(default_template(), 64)
-    found = nearest_neighbours(texels.points)
-    assert found.shape == (len(texels), 5)
-    apart = (texels.points[found] - texels.points[:, None]).norm(dim=-1)
-    assert bool((apart.diff(dim=1) >= 0).all())
-    assert float((apart[:, 0] / texels.size).median()) == pytest.approx(1, abs=0.3)
-
-
-def test_neighbours_need_finite_points() -> None:
-    points = torch.rand(10, 3)
-    points[4, 1] = math.nan
-    with pytest.raises(DyngsError, match="not finite"):
-        nearest_neighbours(points)
-
-
-def test_neighbours_that_follow_other_joints_are_not_linked() -> None:
-    points = torch.tensor([[0.0, 0, 0], [0.001, 0, 0], [0.01, 0, 0], [0.012, 0, 0]])
-    weights = torch.tensor([[1.0, 0, 0], [0.0, 1, 0], [0.8, 0.2, 0], [0.0, 0.9, 0.1]])
-    assert linked_neighbours(points, weights, 2).tolist() == [[2, 0], [3, 1], [0, 2], [1, 3]]
-    assert linked_neighbours(points[:1], weights[:1]).shape == (1, 0)
 
 
 def test_no_gaussian_of_an_arm_is_linked_to_the_trunk_or_of_a_finger_to_another() -> None:
@@ -128,10 +99,6 @@ def sheet(width: int = 12, height: int = 10) -> tuple[Gaussians, Anchors]:
     return gaussians, anchors
 
 
-def one_part(count: int) -> Tensor:
-    return torch.ones(count, 1)
-
-
 def camera(distance: float = 1.0, size: int = 60, focal: float = 300.0) -> Cameras:
     pose = torch.eye(4)
     pose[2, 3] = distance
@@ -164,23 +131,6 @@ def test_a_view_counts_as_about_one_whatever_its_size_and_what_is_behind_counts_
     torch.testing.assert_close(
         twice, 2 * sightings([(opaque, camera())], sizes, 1.0, RenderOptions())
     )
-
-
-def test_what_was_made_too_faint_to_be_drawn_is_left_as_it_is() -> None:
-    gaussians, anchors = sheet()
-    faint = gaussians.replace(logit_opacities=torch.full((len(anchors),), -9.0))
-    trust = trust_in(sightings([(faint, camera())], anchors.size, 1.0, RenderOptions()))
-    assert bool((trust == 1).all())
-
-
-def test_where_all_is_trusted_nothing_changes() -> None:
-    gaussians, anchors = sheet()
-    torch.manual_seed(0)
-    gaussians = gaussians.replace(sh=torch.randn(len(anchors), 1, 3), means=gaussians.means + 0.003)
-    new = filled(gaussians, anchors, one_part(len(anchors)), 0.0, torch.ones(len(anchors)))
-    torch.testing.assert_close(new["sh"], gaussians.sh, rtol=0, atol=2e-3)
-    torch.testing.assert_close(new["means"], gaussians.means)
-    torch.testing.assert_close(new["logit_opacities"], gaussians.logit_opacities)
 
 
 def test_the_unseen_half_of_a_symmetric_body_is_that_of_the_other_side() -> None:
@@ -247,15 +197,3 @@ def test_strains_are_those_of_a_loop_and_so_are_their_gradients() -> None:
     torch.testing.assert_close(found[1].item(), sum(unlike) / 7)
     leaves = means.requires_grad_(), moved.requires_grad_()
     assert torch.autograd.gradcheck(lambda a, b: strains(a, b, points, near, scale), leaves)
-
-
-def test_a_rigid_motion_strains_nothing() -> None:
-    generator = torch.Generator().manual_seed(1)
-    points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
-    near = torch.arange(9).roll(1)
-    turned = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
-    moved = 2 * (points + 0.1) @ turned.T + 5
-    offset = points + torch.tensor([0.1, 0.1, 0.1])
-    strain, uneven = strains(offset, moved, points, near, torch.tensor(2.0, dtype=torch.float64))
-    assert strain < 1e-20
-    assert uneven < 1e-20

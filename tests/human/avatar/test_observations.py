@@ -5,13 +5,9 @@ from __future__ import annotations
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import SH_C0
 from dyngs.data.loader import Image
-from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.avatar.observations import Subject, in_colours_of, observed_colours
+from dyngs.human.avatar.observations import observed_colours
 from dyngs.human.avatar.posing import BodyPose, Skeleton
-from dyngs.human.motion.motion import CapturedMotion, MotionClip
 
 STILL = BodyPose(torch.eye(3)[None], torch.zeros(3), torch.tensor(1.0))
 SKELETON = Skeleton(torch.zeros(1, 3), (-1,))
@@ -69,53 +65,3 @@ def test_colours_are_those_of_the_cameras_in_front() -> None:
     torch.testing.assert_close(colours([[0.0, 0, 0]], *shown)[0], torch.tensor([1.0, 0.2, 0.0]))
     back = colours([[0.0, 0, 0]], *shown, normal=(0.0, 0.0, 1.0))
     torch.testing.assert_close(back[0], torch.tensor([0.0, 0.0, 1.0]))
-
-
-def test_what_nobody_faces_is_grey_and_without_alpha_the_full_image_counts() -> None:
-    grey = torch.full((3,), 0.5)
-    aside = colours([[0.0, 0, 0]], (image((1, 0, 0), 0.5), STILL), normal=(1.0, 0.0, 0.0))
-    torch.testing.assert_close(aside[0], grey)
-    opaque = image((1, 0, 0), 0.5, with_alpha=False)
-    cut = image((1, 0, 0), 0.5)
-    torch.testing.assert_close(colours([[0.8, 0, 0]], (opaque, STILL))[0], torch.zeros(3))
-    torch.testing.assert_close(colours([[0.8, 0, 0]], (cut, STILL))[0], grey)
-
-
-def test_first_colours_of_what_nobody_faces_are_those_around_it() -> None:
-    """A strip of texels that face a camera, which sees red, or not, and some of another joint,
-    which stay grey."""
-    count, away, apart = 20, 6, 16
-    points = torch.zeros(count, 3)
-    points[:, 0] = 0.01 * torch.arange(count)
-    normals = torch.tensor([[0.0, 0, -1]]).repeat(count, 1)
-    normals[away:, 2] = 1.0
-    joints = torch.zeros(count, 1, dtype=torch.long)
-    joints[apart:] = 1
-    anchors = Anchors(
-        points=points,
-        size=torch.full((count,), 0.01),
-        joints=joints,
-        weights=torch.ones(count, 1),
-        face=joints[:, 0],
-        barycentric=torch.ones(count, 3) / 3,
-        uv=points[:, :2],
-        height=torch.zeros(count),
-    )
-    clip = MotionClip(
-        torch.zeros(1).double(), torch.zeros(1, 2, 3), torch.zeros(1, 3), torch.ones(1)
-    )
-    # far from the plane of symmetry, so that nothing is a mirror image
-    subject = Subject(
-        Skeleton(torch.full((2, 3), 5.0), (-1, 0)), anchors, CapturedMotion(clip, (0,))
-    )
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    wide = torch.full((count, 3), -5.0)
-    grey = Gaussians(points, quats, wide, torch.zeros(count), torch.zeros(count, 1, 3))
-    coloured = in_colours_of(grey, normals, subject, [image((1.0, 0.0, 0.0), 0.5)] * 20)
-    found = coloured.sh[:, 0] * SH_C0 + 0.5
-    torch.testing.assert_close(
-        found[:apart], torch.tensor([[1.0, 0, 0]]).repeat(apart, 1), atol=0.02, rtol=0
-    )
-    torch.testing.assert_close(
-        found[apart:], torch.full((count - apart, 3), 0.5), atol=1e-3, rtol=0
-    )

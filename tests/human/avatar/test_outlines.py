@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.data.capture import Capture, Silhouette, View
 from dyngs.data.loader import ImageLoader
-from dyngs.human.avatar.outlines import OutlineLoss, outline_loss
+from dyngs.human.avatar.training import OutlineLoss, outline_loss
 from dyngs.human.keys import HumanModel
 from dyngs.io.write import write_image
 from dyngs.models.kind import RunStart
@@ -103,35 +103,3 @@ def test_the_opacity_is_moved_towards_the_true_one(tmp_path: Path) -> None:
         > 0
         > float(alpha.grad[torch.from_numpy(person(2, -2))].mean())
     )
-
-
-def test_a_line_says_how_much_is_known(tmp_path: Path) -> None:
-    loss = outline_loss(run(views(tmp_path, 1)))
-    assert loss is not None
-    assert "100% of the pixels at their outlines" in loss.finding
-
-
-@pytest.mark.parametrize(
-    "case", ["moving camera", "one frame", "alpha", "light", "random", "exposure", "no mask"]
-)
-def test_masks_decide_where_nothing_is_known_behind_them(tmp_path: Path, case: str) -> None:
-    seen = views(tmp_path, 1, light=20.0 if case == "light" else 0.0)
-    background = "white"
-    train = {}
-    if case == "moving camera":
-        seen = [
-            replace(x, cam_from_world=x.cam_from_world + 0.01 * i * np.eye(4)[3])
-            for i, x in enumerate(seen)
-        ]
-    elif case == "one frame":
-        seen = seen[:1]
-    elif case == "alpha":
-        for view in seen:
-            write_image(view.image_path, np.full((SIDE, SIDE, 4), 128, np.uint8))
-    elif case == "random":
-        background = "random"
-    elif case == "exposure":
-        train = {"exposure": "always"}
-    elif case == "no mask":
-        seen[0] = replace(seen[0], silhouette=None)
-    assert outline_loss(run(seen, background, **train)) is None

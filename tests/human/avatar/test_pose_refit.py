@@ -13,7 +13,7 @@ from posed_person import WHITE, Shown, disturbed, images_of, joints_of, person_a
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import ImageLoader
-from dyngs.human.avatar.pose_refit import LEAST_GAIN, LEAST_MOVE, PoseRefit
+from dyngs.human.avatar.pose_fit import LEAST_GAIN, LEAST_MOVE, PoseRefit
 from dyngs.human.avatar.scene import HumanScene
 
 
@@ -68,13 +68,3 @@ def test_one_row_comes_nearer_to_the_truth_and_all_else_stays(
         assert found.learned[name].abs().amax(-1)[1].max() == 0
         assert found.learned[name][::2].abs().min() > 0
     assert found.gaussians is start.gaussians
-
-
-def test_one_view_of_each_time_does_not_suit(truth: tuple[HumanScene, list[Cameras]]) -> None:
-    scene, cameras = truth
-    alone = refit_to(scene, cameras[:1])
-    assert not alone.suits(scene)
-    assert alone.refitted(scene, 0) is scene
-    assert not refit_to(scene, cameras).suits(
-        replace(scene, clip=scene.clip.select(torch.tensor([0, 1])))
-    )

@@ -18,28 +18,28 @@ from torch import Tensor
 
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import Anchors, skinning_weights, texel_gaussians
 from dyngs.human.avatar.posing import (
     TERMS,
+    Anchors,
     BodyPose,
     Light,
     Skeleton,
     blended_rotations,
-    difference_of_sides,
     pose_blend_shapes,
     pose_gaussians,
-    rest_normals,
     rest_offsets,
     rotate_sh,
+    skinning_weights,
+    texel_gaussians,
 )
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.ops.harmonics import evaluate_harmonics, light_harmonics
+from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.quaternions import rotation_matrices
-from tests.bare_person import atlas, bare_scene
+from tests.bare_person import bare_scene
 
 
 def from_the_left() -> Tensor:
@@ -61,31 +61,6 @@ def colours(sh: Tensor) -> Tensor:
     return 0.5 + SH_C0 * sh[:, 0]
 
 
-def test_colours_follow_where_the_surface_faces() -> None:
-    albedo = torch.tensor([[0.4, 0.3, 0.2]])
-    sh = ((albedo - 0.5) / SH_C0)[:, None]
-    light = Light(torch.tensor([[2.0, 0, 0]]), from_the_left())
-    for angle in (0.0, 0.7, math.pi / 2, math.pi):
-        found = colours(light.on(sh, 3 * turned(angle)[None]))
-        expected = albedo * torch.tensor([1 + math.cos(angle), 1.0, 1.0])
-        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
-
-
-def test_no_harmonic_brightens_a_person_as_a_whole() -> None:
-    """Each is 0 in the mean over all directions, for which that over the six along axes stands."""
-    axes = torch.cat([torch.eye(3), -torch.eye(3)])
-    torch.testing.assert_close(light_harmonics(axes).mean(0), torch.zeros(8))
-
-
-def test_higher_harmonics_are_dimmed_with_the_colour() -> None:
-    sh = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(0))
-    light = Light(torch.tensor([[0.0, 1, 0]]).expand(5, 3), 0.3 * torch.ones(TERMS, 3))
-    found = light.on(sh, torch.eye(3).expand(5, 3, 3))
-    factor = 1 + 0.3 * light_harmonics(torch.tensor([[0.0, 1, 0]])).sum()
-    torch.testing.assert_close(found[:, 1:], factor * sh[:, 1:])
-    torch.testing.assert_close(colours(found), factor * colours(sh))
-
-
 def test_gradients_are_those_of_finite_differences() -> None:
     make = torch.Generator().manual_seed(1)
     shapes = ((3, 1, 3), (3, 3, 3), (3, 3), (TERMS, 3))
@@ -95,12 +70,6 @@ def test_gradients_are_those_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(
         lambda sh, linear, normals, light: Light(normals, light).on(sh, linear), values
     )
-
-
-def test_normals_of_the_first_gaussians_point_away_from_the_body() -> None:
-    texels = atlas()
-    gaussians, _ = texel_gaussians(texels, [0.0], 0)
-    torch.testing.assert_close(rest_normals(gaussians), texels.normals, atol=1e-5, rtol=0)
 
 
 def test_a_person_is_lit_in_the_world() -> None:
@@ -117,18 +86,7 @@ def test_a_person_is_lit_in_the_world() -> None:
     assert dark.means[left, 0].median() > middle > dark.means[right, 0].median()
 
 
-def test_sides_of_other_colours_differ() -> None:
-    gaussians = bare_scene().gaussians.select(torch.arange(4))
-    sh = torch.tensor([0.1, 0.4, 0.4, 0.0])[:, None, None].expand(4, 1, 3) / SH_C0
-    images = torch.tensor([1, 0, 1, 2])
-    known = torch.tensor([True, True, True, False])
-    found = difference_of_sides(gaussians.replace(sh=sh), images, known)
-    torch.testing.assert_close(found, torch.tensor(3 * 2 * 0.09 / 4))
-
-
 RESOLUTION = 48
-LEFT_ELBOW = JOINT_NAMES.index("left_elbow")
-LEFT_WRIST = JOINT_NAMES.index("left_wrist")
 
 
 @cache
@@ -164,42 +122,6 @@ def test_the_template_at_rest_is_canonical() -> None:
     torch.testing.assert_close(found.means, rest.means, rtol=0, atol=1e-6)
     torch.testing.assert_close(covariances(found), covariances(rest), rtol=1e-3, atol=1e-9)
     assert found.sh is rest.sh
-
-
-def test_size_and_place_are_applied_last() -> None:
-    body, rest, _, weights = person()
-    nothing = torch.eye(3).expand(len(body.joints), 3, 3)
-    posing = BodyPose(nothing, torch.tensor([1.0, 2.0, 3.0]), torch.tensor(2.0))
-    found = pose_gaussians(rest, weights, Skeleton(body.joints, body.parents), posing)
-    torch.testing.assert_close(found.means, 2 * rest.means + posing.trans)
-    torch.testing.assert_close(covariances(found), 4 * covariances(rest), rtol=1e-3, atol=1e-9)
-
-
-def test_a_bent_elbow_moves_exactly_its_texels() -> None:
-    body, rest, _, weights = person()
-    found = in_pose({LEFT_ELBOW: (0.0, 0.0, math.pi / 2)})
-    below = torch.tensor([j for j in range(len(body.joints)) if LEFT_ELBOW in ancestors(body, j)])
-    fraction = weights[:, below].sum(1)
-    moved = (found.means - rest.means).norm(dim=1)
-    assert bool((moved[fraction == 0] < 1e-6).all())
-    assert bool((moved[fraction > 0.5] > 0.005).all())
-    elbow = body.joints[LEFT_ELBOW]
-    turn = axis_angle_to_matrix(torch.tensor([0.0, 0.0, math.pi / 2]))
-    forearm = fraction > 1 - 1e-6
-    assert int(forearm.sum()) > 20
-    wanted = (rest.means[forearm] - elbow) @ turn.T + elbow
-    torch.testing.assert_close(found.means[forearm], wanted, rtol=0, atol=1e-5)
-    turned = turn @ covariances(rest)[forearm] @ turn.T
-    torch.testing.assert_close(covariances(found)[forearm], turned, rtol=1e-3, atol=1e-9)
-
-
-def ancestors(body: BodyTemplate, joint: int) -> set[int]:
-    """The joint and all above it."""
-    found = set()
-    while joint >= 0:
-        found.add(joint)
-        joint = body.parents[joint]
-    return found
 
 
 def test_a_mirrored_pose_mirrors_the_result() -> None:
@@ -245,38 +167,6 @@ def test_colours_turn_with_what_they_are_on() -> None:
     after = evaluate_harmonics(turned, eye, rotate_sh(sh, turns), radii, 1)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
     assert float((evaluate_harmonics(turned, eye, sh, radii, 1) - before).abs().max()) > 0.05
-
-
-def test_blended_rotations_are_those_of_single_joints_and_never_vanish() -> None:
-    """Between two joints they lie on the shorter way, wherever both turn together; opposite turns
-    blend, too."""
-    generator = torch.Generator().manual_seed(4)
-    turns = axis_angle_to_matrix(2 * torch.randn(5, 3, dtype=torch.float64, generator=generator))
-    moves = torch.cat(
-        [turns, torch.randn(5, 3, 1, dtype=torch.float64, generator=generator)], dim=-1
-    )
-    torch.testing.assert_close(blended_rotations(torch.eye(5, dtype=torch.float64), moves), turns)
-    weights = torch.rand(40, 5, dtype=torch.float64, generator=generator)
-    blended = blended_rotations(weights, moves)
-    torch.testing.assert_close(
-        blended @ blended.mT, torch.eye(3, dtype=torch.float64).expand(40, 3, 3)
-    )
-    assert bool((torch.linalg.det(blended) > 0).all())
-    both = torch.cat([turns[0] @ moves[..., :3], moves[..., 3:]], dim=-1)
-    torch.testing.assert_close(blended_rotations(weights, both), turns[0] @ blended)
-    eye = torch.eye(3, dtype=torch.float64)
-    about = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    half = torch.tensor([[0.5, 0.5]], dtype=torch.float64)
-    for angle in (0.1, 3.0, torch.pi):
-        pair = torch.stack([eye, axis_angle_to_matrix(angle * about)])
-        found = blended_rotations(
-            half, torch.cat([pair, torch.zeros(2, 3, 1, dtype=torch.float64)], dim=-1)
-        )[0]
-        way = (
-            found - axis_angle_to_matrix(angle / 2 * about),
-            found - axis_angle_to_matrix(-angle / 2 * about),
-        )
-        assert min(float(x.abs().max()) for x in way) < 1e-9
 
 
 def test_blended_rotations_have_the_gradients_of_differences() -> None:
@@ -340,25 +230,6 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
         gaussians, weights, Skeleton(body.joints, body.parents), posing, exact
     ).means
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-6)
-
-
-def test_offsets_of_the_template_reach_the_pose() -> None:
-    body = rigid_body()
-    _, anchors = texel_gaussians(atlas_texels(body, 16), (0.0, 0.02), 0)
-    shapes = pose_blend_shapes(body)
-    generator = torch.Generator().manual_seed(0)
-    poses = (0.5 * torch.randn(24, 3, generator=generator)).requires_grad_()
-    posing = BodyPose(axis_angle_to_matrix(poses), torch.zeros(3), torch.tensor(1.0))
-    given = rest_offsets(anchors, posing, shapes)
-    assert given is not None
-    half = len(anchors) // 2
-    assert torch.equal(given[:half], given[half:]), "both scaffolds follow the skin beneath"
-    given.sum().backward()
-    assert poses.grad is not None
-    assert not poses.grad[0].any(), "the root does not count"
-    assert bool(poses.grad[1:].ne(0).any(1).all())
-    assert rest_offsets(anchors, posing, None) is None
-    assert pose_blend_shapes(replace(body, pose_dirs=None)) is None
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1])

@@ -14,22 +14,18 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import part_of, tensors_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
-from dyngs.gaussians.schedule import Rates
-from dyngs.human.avatar.anchors import texel_gaussians
-from dyngs.human.avatar.corrections import (
+from dyngs.human.avatar.observations import Subject
+from dyngs.human.avatar.posing import (
     SharedCorrection,
+    Skeleton,
     corrected_clip,
     corrected_pose,
-    correction_penalties,
+    texel_gaussians,
 )
-from dyngs.human.avatar.observations import Subject
-from dyngs.human.avatar.posing import Skeleton
-from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 
 
@@ -45,9 +41,6 @@ def random_clip(frames: int, seed: int = 0) -> MotionClip:
     )
 
 
-OPTIONS = HumanModel(sh_degree=0)
-
-
 def stirred() -> HumanScene:
     """A person whose corrections are not zero."""
     body = default_template()
@@ -58,7 +51,7 @@ def stirred() -> HumanScene:
     subject = Subject(
         Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3))
     )
-    scene = HumanTraining(OPTIONS, subject.motion.frames, Rates(10)).first_scene(gaussians, subject)
+    scene = first_scene(gaussians, subject)
     generator = torch.Generator().manual_seed(2)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)
@@ -115,40 +108,3 @@ def test_other_clips_get_what_holds_for_all_poses() -> None:
     assert found.poses[0, 1].tolist() == pytest.approx(wanted.tolist(), abs=1e-6)
     assert float(found.scale[0]) == pytest.approx(2)
     assert torch.equal(found.trans, clip.trans)
-
-
-def test_parts_are_all_or_nothing() -> None:
-    scene = reloaded(stirred())
-    assert len(scene.part("moving")) == len(scene)
-    assert len(scene.part("still")) == 0
-    still = scene.playing(random_clip(1))
-    assert still.is_static
-    assert still.moving_fraction == 0
-    assert len(still.part("still")) == len(scene)
-
-
-def test_one_pose_is_posed_once_and_the_same_at_all_times() -> None:
-    still = reloaded(stirred()).playing(random_clip(1))
-    with torch.no_grad():
-        first = still.time_step(0.0)
-        later = still.time_step(0.7)
-        assert first.gaussians is later.gaussians
-        assert (first.time, later.time) == (0.0, 0.7)
-    fresh = still.time_step(0.7)
-    assert fresh.gaussians is not later.gaussians
-    for name, x in fresh.gaussians.detach().tensors().items():
-        assert torch.equal(x, later.gaussians.tensors()[name])
-    still.changed()
-    with torch.no_grad():
-        assert still.time_step(0.0).gaussians is not first.gaussians
-
-
-def test_penalties_pull_corrections_back() -> None:
-    learned = stirred().learned
-    terms = correction_penalties(learned)
-    assert set(terms) == {"pose", "skinning weights"}
-    torch.stack(list(terms.values())).sum().backward()
-    for name in ("poses", "turns", "joints", "weights"):
-        grad = learned[name].grad
-        assert grad is not None
-        assert bool((grad * learned[name].detach() >= 0).all())

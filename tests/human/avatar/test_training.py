@@ -18,7 +18,6 @@ from dyngs.config import (
     Config,
     DataConfig,
     DefaultStrategy,
-    NetworkColour,
     OptimConfig,
     RunConfig,
     TrainConfig,
@@ -26,8 +25,7 @@ from dyngs.config import (
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.gaussians import TopologyEdit
-from dyngs.human.avatar import pose_refit
+from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints
 from dyngs.human.keys import HumanModel
@@ -51,7 +49,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes: object) -> Config:
     model = {
         "resolution": 24,
-        "refine_from": 0.2,
         "sh_degree": 0,
         "fit": False,
     } | changes
@@ -133,21 +130,8 @@ def test_what_is_played_back_is_what_was_trained(
     assert len(scene.rows) == len(scene)
 
 
-def test_anchors_and_weights_follow_the_set(capture: Path) -> None:
-    trainer = assemble(tiny(capture))
-    tensors_after(trainer, 3)
-    scene = human(trainer)
-    points = scene.anchors.points
-    weights = scene.learned["weights"].detach().clone()
-    source = torch.tensor([5, 2, 2, 9])
-    edited = scene.edited(TopologyEdit(source, torch.tensor([False, False, True, False])))
-    assert torch.equal(edited.anchors.points, points[source])
-    assert torch.equal(edited.learned["weights"].detach(), weights[source])
-    assert len(edited.state()["model.anchors.size"].tensor) == 4
-
-
 def test_what_all_frames_share_is_learned_before_poses_of_single_ones(capture: Path) -> None:
-    trainer = assemble(tiny(capture, steps=20, refine_from=0.05))
+    trainer = assemble(tiny(capture, steps=20))
     early = tensors_after(trainer, 5)
     names = [f"model.learned.{name}" for name in ("turns", "joints", "poses", "trans")]
     assert [bool(early[name].any()) for name in names] == [True, True, False, False]
@@ -155,39 +139,6 @@ def test_what_all_frames_share_is_learned_before_poses_of_single_ones(capture: P
     assert all(late[name].any() for name in names)
     other = late["model.learned.joints"][list(mirrored_joints(55))] * torch.tensor([-1.0, 1, 1])
     torch.testing.assert_close(late["model.learned.joints"], other)
-
-
-def test_colours_of_both_sides_and_light_are_learned(capture: Path) -> None:
-    found = tensors_after(assemble(tiny(capture, light=True, steps=10)), 10)
-    assert found["model.learned.light"].any()
-    for config in (tiny(capture, light=False), tiny(capture, refine=False)):
-        assert "model.learned.light" not in tensors_after(assemble(config), 1)
-    config = tiny(capture, light=True).model_copy(update={"colour": NetworkColour()})
-    assert "model.learned.light" not in tensors_after(assemble(config), 1)
-
-
-def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> None:
-    found = tensors_after(assemble(tiny(capture, refine=False)), 6)
-    assert not any(
-        bool(found[f"model.learned.{name}"].any()) for name in ("poses", "trans", "turns", "joints")
-    )
-
-
-def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) -> None:
-    trainer = assemble(tiny(capture))
-    scene = human(trainer)
-    image = trainer.images[0]
-    options = trainer.config.model
-    assert isinstance(options, HumanModel)
-    first = trainer.model.training.time_step(scene, image, 1).penalties
-    assert first["offset"].item() == 0
-    assert first["smoothness"].item() == 0
-    away = scene.gaussians.replace(
-        means=scene.gaussians.means.detach() + torch.tensor([0.01, 0.0, 0.0])
-    )
-    later = trainer.model.training.time_step(scene.with_gaussians(away), image, 1).penalties
-    assert later["offset"].item() == pytest.approx(options.offset_weight, rel=1e-4)
-    assert later["smoothness"].item() == pytest.approx(0, abs=1e-9)
 
 
 def test_a_capture_without_bodies_is_an_error(capture: Path, tmp_path: Path) -> None:
@@ -198,11 +149,6 @@ def test_a_capture_without_bodies_is_an_error(capture: Path, tmp_path: Path) -> 
     )
     with pytest.raises(DyngsError, match="has no body parameters"):
         assemble(tiny(tmp_path / "still"))
-
-
-def test_colours_beyond_degree_1_are_refused(capture: Path) -> None:
-    with pytest.raises(DyngsError, match="give 0 or 1"):
-        assemble(tiny(capture, sh_degree=2))
 
 
 def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> None:
@@ -281,8 +227,8 @@ def turned(capture: Path, out: Path) -> Path:
 def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240,))
-    config = tiny(turned(capture, tmp_path / "turned"), steps=240, refine_from=0.1)
+    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240,))
+    config = tiny(turned(capture, tmp_path / "turned"), steps=240)
     trainer = assemble(config)
     lines = [trainer.step().finding or "" for _ in range(16)]
     assert "poses are fitted to the images again" in lines[9]
@@ -297,29 +243,10 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     assert same(straight, tensors_after(second, 5))
 
 
-@pytest.mark.parametrize(("refine", "minutes"), [(False, None), (True, 1.0)])
-def test_poses_stay_on_request_and_in_previews(
-    capture: Path,
-    tmp_path: Path,
-    refine: bool,
-    minutes: float | None,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240,))
-    config = tiny(turned(capture, tmp_path / "turned"), steps=240, refine_from=0.1, refine=refine)
-    config = config.model_copy(
-        update={"train": config.train.model_copy(update={"minutes": minutes})}
-    )
-    trainer = assemble(config)
-    given = human(trainer).clip.poses.clone()
-    assert all(trainer.step().finding is None for _ in range(12))
-    assert torch.equal(human(trainer).clip.poses, given)
-
-
 def test_poses_that_views_gain_nothing_from_stay_for_good(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240, 14 / 240))
+    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240, 14 / 240))
     trainer = assemble(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
     lines = [trainer.step().finding or "" for _ in range(12)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dyngs.human.body.mesh import interpolate, normalized, rasterize, vertex_normals
+from dyngs.human.body.mesh import interpolate, rasterize, vertex_normals
 
 
 def test_the_nearer_triangle_is_seen() -> None:
@@ -26,12 +26,6 @@ def test_the_nearer_triangle_is_seen() -> None:
     assert len(np.unique(fragments.index)) == len(fragments.index)
 
 
-def test_triangles_without_area_or_outside_cover_nothing() -> None:
-    line = [[0.0, 0.0, 1.0], [4.0, 4.0, 1.0], [2.0, 2.0, 1.0]]
-    outside = [[-9.0, -9.0, 1.0], [-8.0, -9.0, 1.0], [-9.0, -8.0, 1.0]]
-    assert len(rasterize(np.array([line, outside]), 5, 5).index) == 0
-
-
 def test_normals_of_a_pyramid() -> None:
     """The tip's points up, by symmetry; those of a single triangle along its own."""
     vertices = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 2]])
@@ -39,9 +33,3 @@ def test_normals_of_a_pyramid() -> None:
     np.testing.assert_allclose(vertex_normals(vertices, faces)[4], [0, 0, 1], atol=1e-15)
     flat = vertex_normals(np.eye(3), np.array([[0, 1, 2]]))
     np.testing.assert_allclose(flat, np.full((3, 3), 3**-0.5))
-
-
-def test_unit_leaves_zero() -> None:
-    np.testing.assert_array_equal(
-        normalized(np.array([[0.0, 0, 0], [0, 3, 4]])), [[0, 0, 0], [0, 0.6, 0.8]]
-    )

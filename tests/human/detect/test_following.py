@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.following import PATIENCE, followed, with_sides
+from dyngs.human.detect.find_person import followed, with_sides
 from tests.detections import person
 
 LEFT = [1, 3, 5, 7, 9, 11, 13, 15]
@@ -21,47 +21,12 @@ def columns_of(track: list[Detection | None]) -> list[float | None]:
     return [None if x is None else round(float(x.keypoints[0, 0]), 3) for x in track]
 
 
-@given(st.permutations([0, 1, 2]), st.floats(-12, 12))
-@settings(max_examples=20, deadline=None)
-def test_people_are_followed_whatever_the_order_of_detections(
-    order: list[int], speed: float
-) -> None:
-    ways = [(100.0, speed, 200.0), (300.0, -speed, 190.0), (700.0, 5.0, 120.0)]
-    images = []
-    for t in range(12):
-        people = [person(start + velocity * t, height) for start, velocity, height in ways]
-        images.append([people[i] for i in (order if t % 2 else [0, 1, 2])])
-    tracks = followed(images)
-    assert len(tracks) == 3
-    found = {tuple(columns_of(track)) for track in tracks}
-    assert found == {
-        tuple(round(start + velocity * t, 3) for t in range(12)) for start, velocity, _ in ways
-    }
-    assert [max(x.height for x in track if x is not None) for track in tracks] == sorted(
-        (200, 190, 120), reverse=True
-    )
-
-
-def test_who_is_hidden_for_a_while_is_the_same_one() -> None:
-    images = [[] if 4 <= t < 8 else [person(100 + 6 * t)] for t in range(12)]
-    tracks = followed(images)
-    assert len(tracks) == 1
-    assert [x is None for x in tracks[0]] == [4 <= t < 8 for t in range(12)]
-    gone = [[person(100)], *[[]] * (PATIENCE + 1), [person(100)]]
-    assert len(followed(gone)) == 2
-
-
-def test_who_jumps_or_grows_is_another_one() -> None:
-    assert len(followed([[person(100)], [person(100 + 200)]])) == 2
-    assert len(followed([[person(100)], [person(100, 340)]])) == 2
-
-
-def test_nobody() -> None:
-    assert followed([[], []]) == []
-    unsure = person(100).keypoints * np.array([1, 1, 0], np.float32)
-    assert followed([[Detection(unsure, NOBODY)]]) == [], (
-        "where no key point is sure there is no box"
-    )
+def test_the_largest_person_is_followed_and_may_be_hidden_for_a_while() -> None:
+    images = [[person(700, 120.0), person(100 + 6 * t)] for t in range(12)]
+    found = followed([people[::-1] if t % 2 else people for t, people in enumerate(images)])
+    assert columns_of(found) == columns_of([people[1] for people in images])
+    hidden = [[] if 4 <= t < 8 else people for t, people in enumerate(images)]
+    assert [x is None for x in followed(hidden)] == [4 <= t < 8 for t in range(12)]
 
 
 @pytest.mark.parametrize("sides", [(LEFT, RIGHT), ARMS], ids=["all", "arms"])

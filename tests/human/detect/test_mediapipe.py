@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.human.detect.mediapipe import LANDMARKS, VARIABLE, MediaPipe
+from dyngs.human.detect.detector import LANDMARKS, VARIABLE, MediaPipe
 from dyngs.io.write import write_image
 
 SCRIPT = """#!{python}
@@ -88,18 +88,6 @@ def _has_mediapipe() -> bool:
     from importlib.util import find_spec
 
     return find_spec("mediapipe") is not None and find_spec("cv2") is not None
-
-
-def test_without_an_interpreter_it_says_how_to_get_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
-    with pytest.raises(DyngsError, match="no detector finds the person: install MediaPipe with"):
-        MediaPipe()
-    with pytest.raises(DyngsError, match="no such Python interpreter"):
-        MediaPipe(tmp_path / "python")
-    monkeypatch.setenv(VARIABLE, sys.executable)
-    assert MediaPipe().name == "MediaPipe"
 
 
 @pytest.mark.skipif(

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.warnings import warnings_of
+from dyngs.human.detect.find_person import warnings_of
 from tests.detections import person
 
 SIZE = 400
@@ -27,34 +27,19 @@ def turning(count: int, height: float = 200.0) -> list[Detection | None]:
 
 def test_a_good_clip_has_no_warning() -> None:
     people = turning(12)
-    assert warnings_of(clip(people), people, []) == []
+    assert warnings_of(clip(people), people) == []
 
 
 @pytest.mark.parametrize(
-    ("people", "others", "said"),
+    ("people", "said"),
     [
-        ([person(200)] * 12, [], "never turns around"),
-        (turning(12), [[None] * 8 + [person(60)] * 4], "other people in 4 of 12 images"),
-        (turning(12)[:9] + [None] * 2 + turning(12)[11:], [], "nobody is found in 2 of 12 images"),
-        (turning(12, 100), [], "100 px high"),
-        (turning(12, 380), [], "feet are cut off or hidden in 12 of 12 images"),
+        ([person(200)] * 12, "never turns around"),
+        (turning(12)[:9] + [None] * 2 + turning(12)[11:], "nobody is found in 2 of 12 images"),
+        (turning(12, 100), "100 px high"),
+        (turning(12, 380), "feet are cut off or hidden in 12 of 12 images"),
     ],
 )
-def test_what_is_bad_is_said(
-    people: list[Detection | None], others: list[list[Detection | None]], said: str
-) -> None:
-    found = warnings_of(clip(people), people, others)
+def test_what_is_bad_is_said(people: list[Detection | None], said: str) -> None:
+    found = warnings_of(clip(people), people)
     assert len(found) == 1
     assert said in found[0]
-
-
-def test_blur_is_said() -> None:
-    people = turning(12)
-    assert warnings_of(clip(people, 4), people, []) == [
-        "4 images blurred; more light, or slower motion, helps"
-    ]
-
-
-def test_who_stands_among_several_cameras_need_not_turn() -> None:
-    people = [person(200)] * 12
-    assert warnings_of(clip(people), people, [], alone=False) == []

@@ -21,24 +21,22 @@ from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.human.body.body_reader import default_template, read_body, rest_shape
 from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
-from dyngs.human.fit import capture_fit, start
+from dyngs.human.fit import capture_fit
 from dyngs.human.fit.capture_fit import (
     GAIN,
     RESOLUTION,
-    TRIAL,
     CaptureFit,
     FitEffort,
     TriedFit,
+    body_fit,
     fit_capture,
     fitted_clips,
-    look_at,
+    new_fit,
     placed_clip,
-    simplest_of_the_best,
     split_views,
+    surface_of,
 )
-from dyngs.human.fit.known_person import with_shape
-from dyngs.human.fit.silhouettes import surface_of
-from dyngs.human.fit.solve import VIEWS, InTurn, body_fit, new_fit
+from dyngs.human.fit.fitted_capture import with_shape
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.write import write_image
@@ -125,13 +123,6 @@ def test_a_body_file_finds_its_own_shape(
     assert away.norm(dim=1).mean() < 0.5 * before.norm(dim=1).mean()
 
 
-def test_the_fit_is_judged_on_views_that_it_did_not_see(wrong: tuple[Capture, Capture]) -> None:
-    fit = found(wrong[1].root)
-    assert fit.held_out == 4
-    assert len(fit.tried) == 4
-    assert fit.chosen.iou > fit.tried[0].iou + 0.03
-
-
 def test_the_same_capture_gives_the_same_fit(wrong: tuple[Capture, Capture]) -> None:
     options = DataConfig(root=wrong[1].root)
     effort = FitEffort(side=32, steps=2, visits=0)
@@ -142,63 +133,6 @@ def test_the_same_capture_gives_the_same_fit(wrong: tuple[Capture, Capture]) -> 
     )
     assert torch.equal(first["betas"], again["betas"])
     assert torch.equal(first["trans"], again["trans"])
-
-
-def test_small_images_are_looked_at_by_a_few_cameras_in_turn(
-    wrong: tuple[Capture, Capture],
-) -> None:
-    capture = wrong[1]
-    body = default_template()
-    assert capture.body is not None
-    motion = captured_motion(
-        capture.root, capture.body["train"], capture.splits["train"], body.joints
-    )
-    seen = look_at(capture, motion, DataConfig(root=capture.root), FitEffort(side=32), {})
-    look = InTurn(seen.halves)
-    whole = seen.halves[2]
-    assert whole is not None
-    shown = [part for _ in range(len(whole)) if (part := look(2)) is not None]
-    assert [len(part) for part in shown] == [VIEWS] * len(whole)
-    alphas = torch.cat([part.alpha for part in shown])
-    assert all(int((alphas == own).all(2).all(1).sum()) == VIEWS for own in whole.alpha), (
-        "each as often"
-    )
-    assert InTurn({0: None})(0) is None
-
-
-@pytest.mark.parametrize(("gain", "steps"), [(2.0, 1 + 1), (-2.0, 1 + TRIAL + 1 + TRIAL)])
-def test_more_gets_all_its_steps_only_where_a_trial_gains(
-    wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch, gain: float, steps: int
-) -> None:
-    monkeypatch.setattr(capture_fit, "GAIN", gain)
-    told = []
-    effort = FitEffort(side=32, steps=TRIAL, visits=0)
-
-    def report(name: str, done: int, total: int) -> None:
-        told.append(name)
-
-    fit_capture(wrong[1], DataConfig(root=wrong[1].root), default_template(), report, effort=effort)
-    assert told.count("poses") == steps
-    assert told.count("shape") == 3 * TRIAL
-
-
-@pytest.mark.parametrize(
-    ("ious", "wanted"), [((0.8, 0.9, 0.905), 1), ((0.8, 0.9, 0.92), 2), ((0.8, 0.82, 0.81), 0)]
-)
-def test_more_is_learned_only_where_it_pays(
-    wrong: tuple[Capture, Capture], ious: tuple[float, ...], wanted: int
-) -> None:
-    given = found(wrong[1].root).tried[0]
-    tried = [replace(given, iou=iou) for iou in ious]
-    assert simplest_of_the_best(tried) is tried[wanted]
-
-
-def test_poses_of_a_person_whose_shape_is_known_are_changed_for_less(
-    wrong: tuple[Capture, Capture],
-) -> None:
-    tried = [replace(found(wrong[1].root).tried[0], iou=iou) for iou in (0.9, 0.912)]
-    assert simplest_of_the_best(tried) is tried[0]
-    assert simplest_of_the_best(tried, GAIN) is tried[1]
 
 
 def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> None:
@@ -220,8 +154,8 @@ def test_one_view_of_each_frame_is_left_out(wrong: tuple[Capture, Capture]) -> N
 def test_without_given_poses_every_frame_has_its_own(
     wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(start, "STEPS", 1)
-    monkeypatch.setattr(start, "ARMS", ())
+    monkeypatch.setattr(capture_fit, "STEPS", 1)
+    monkeypatch.setattr(capture_fit, "ARMS", ())
     capture = wrong[1].replace(body=None)
     effort = FitEffort(side=32, steps=1, visits=0)
     fit = fit_capture(
@@ -317,11 +251,3 @@ def test_a_clip_that_stands_elsewhere_is_moved_to_its_silhouettes(capture: Captu
         clip.trans - given.trans, found.shift.expand_as(given.trans), atol=1e-6, rtol=0
     )
     assert torch.equal(clip.poses, given.poses)
-
-
-def test_without_another_clip_nothing_is_placed(capture: Capture, tmp_path: Path) -> None:
-    alone = capture.replace(splits={**capture.splits, "pose": ()})
-    assert (
-        placed_clip(alone, DataConfig(root=tmp_path), default_template(), as_given(capture), print)
-        is None
-    )

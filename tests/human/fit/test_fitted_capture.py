@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,18 +18,15 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.readers.transforms import read_frame_file, read_views
 from dyngs.human.body.body_reader import load_template, rest_shape
-from dyngs.human.fit import fitted_capture, start
 from dyngs.human.fit.fitted_capture import (
     FitInputs,
     has_guessed_lens,
     read_person,
     with_fitted_body,
-    with_lens,
     write_body,
     write_fitted_capture,
     write_split,
 )
-from dyngs.human.fit.solve import LensFit
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -75,64 +71,10 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
     assert "the fit of before" in said[-1]
 
 
-def test_other_cameras_are_another_fit(data: DataConfig) -> None:
-    fits = {
-        with_fitted_body(data.model_copy(update={"train_cameras": x})).body
-        for x in (None, (0,), (0, 1))
-    }
-    assert len(fits) == 3
-
-
-def test_given_poses_are_left_alone_unless_asked_for(data: DataConfig) -> None:
-    assert with_fitted_body(data, only_if_needed=True, say=pytest.fail) == data
-
-
-def test_what_is_a_fit_is_not_fitted_again(data: DataConfig, tmp_path: Path) -> None:
-    out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None).root
-    given = DataConfig(root=out)
-    assert with_fitted_body(given, say=pytest.fail) == given
-    named = data.model_copy(update={"body": out})
-    assert with_fitted_body(named, say=pytest.fail) == named
-
-
 @pytest.fixture
 def smpl(smpl_files: tuple[Path, Path]) -> HumanModel:
     """Names a body file of 24 joints."""
     return HumanModel(body=smpl_files[0], uv=smpl_files[1])
-
-
-def test_a_template_that_is_named_is_fitted_instead_of_the_free_one(
-    data: DataConfig, smpl: HumanModel
-) -> None:
-    said: list[str] = []
-    fitted = with_fitted_body(data, smpl, say=said.append)
-    assert "smpl (smpl.npz) is fitted to the silhouettes first" in said[0]
-    assert fitted.body is not None
-    assert (
-        json.loads((fitted.body / "fit_report.json").read_text())["template"] == "smpl (smpl.npz)"
-    )
-    body = read_capture(fitted).body
-    assert body is not None
-    assert {frames.poses.shape for frames in body.values()} == {(2, 24, 3)}
-    assert {frames.fitted_to for frames in body.values()} == {load_template(smpl).fingerprint}
-    assert with_fitted_body(data, smpl, say=said.append) == fitted
-    assert "the fit of before" in said[-1]
-    assert with_fitted_body(data, say=said.append).body != fitted.body, (
-        "the free template has a fit of its own"
-    )
-
-
-def test_a_capture_without_body_parameters_gets_a_fit_of_the_named_template(
-    data: DataConfig, smpl: HumanModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for path in (*data.root.glob("body_*.npz"), data.root / "transforms_pose.json"):
-        path.unlink()
-    monkeypatch.setattr(start, "STEPS", 1)
-    monkeypatch.setattr(start, "ARMS", ())
-    body = read_capture(with_fitted_body(data, smpl, only_if_needed=True, say=lambda _: None)).body
-    assert body is not None
-    assert body["train"].poses.shape == (2, 24, 3)
-    assert np.abs(body["train"].betas).max() > 0
 
 
 def test_a_fit_is_fitted_again_only_for_another_template(
@@ -176,16 +118,6 @@ def test_the_fit_begins_with_a_given_shape_of_the_template(
     assert torch.equal(found.found.motion.clip.trans, clip.trans), "of the shaped body"
 
 
-def test_a_template_without_texture_coordinates_is_refused(
-    data: DataConfig, smpl: HumanModel, tmp_path: Path
-) -> None:
-    with pytest.raises(DyngsError, match=r"smpl\.npz: has no texture coordinates.*--uv FILE"):
-        write_fitted_capture(
-            data, tmp_path / "out", lambda *_: None, FitInputs(template=HumanModel(body=smpl.body))
-        )
-    assert not list(tmp_path.glob("*out*"))
-
-
 def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path) -> None:
     out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None).root
     before = read_capture(data)
@@ -199,19 +131,6 @@ def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path
             assert (old.time, old.width) == (new.time, new.width)
             assert np.allclose(old.intrinsics, new.intrinsics)
     assert not list(tmp_path.glob(".fitted*")), "nothing is left beside it"
-
-
-def test_without_silhouettes_poses_are_taken_as_given(
-    data: DataConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    capture = read_capture(data).replace(has_alpha=False)
-    monkeypatch.setattr(fitted_capture, "read_capture", lambda _: capture)
-    said: list[str] = []
-    assert with_fitted_body(data, say=said.append) == data
-    assert "taken as given" in said[0]
-    monkeypatch.setattr(fitted_capture, "read_capture", lambda _: capture.replace(body=None))
-    with pytest.raises(DyngsError, match="neither silhouettes nor body parameters"):
-        with_fitted_body(data)
 
 
 def clip(folder: Path, empty: int = 2, count: int = 12) -> Path:
@@ -266,18 +185,6 @@ def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
         assert 0 < float(alpha.mean()) < 0.5
 
 
-def test_a_refined_lens_moves_the_cameras(tmp_path: Path) -> None:
-    capture = read_person(
-        DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", lambda _: None
-    )
-    lens = LensFit(1.5, 3.0, (0.2, 0.1), True)
-    before, after = (c.splits["train"][0] for c in (capture, with_lens(capture, lens)))
-    assert after.intrinsics[0, 0] == 1.5 * before.intrinsics[0, 0]
-    assert after.cam_from_world[2, 3] == pytest.approx(1.5)
-    assert with_lens(capture, LensFit(1.5, 3.0, (0.1, 0.1), False)) is capture
-    assert with_lens(capture, None) is capture
-
-
 def test_masks_of_a_folder_replace_those_of_a_capture(tmp_path: Path) -> None:
     options = HumanOptions(
         size=32, num_frames=2, num_new=0, num_cameras=2, num_test=0, seed=1, samples=1
@@ -296,13 +203,6 @@ def test_masks_of_a_folder_replace_those_of_a_capture(tmp_path: Path) -> None:
         read_person(
             DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w"
         )
-
-
-def test_no_capture_and_no_clip_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no capture found"):
-        read_person(DataConfig(root=tmp_path), FitInputs(), tmp_path / "m")
-    with pytest.raises(DyngsError, match="no such folder"):
-        read_person(DataConfig(root=tmp_path / "none.mp4"), FitInputs(), tmp_path / "m")
 
 
 def test_a_fit_far_from_the_origin_is_written_exactly(data: DataConfig, tmp_path: Path) -> None:

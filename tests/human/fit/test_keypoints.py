@@ -18,7 +18,7 @@ from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
-from dyngs.human.fit.keypoints import INNER, JOINTS, ORDERS, read_joints, read_keypoints
+from dyngs.human.fit.keypoints import JOINTS, ORDERS, read_joints, read_keypoints
 
 
 def view(name: str) -> View:
@@ -46,15 +46,6 @@ def test_openpose(tmp_path: Path, count: int, knee: int, wrist: int) -> None:
     assert found["a"][JOINTS["left_knee"]].tolist() == [knee, 2 * knee, 0.5]
     assert found["a"][JOINTS["right_wrist"]].tolist() == [wrist, 2 * wrist, 0.5]
     assert set(found["a"][:, 2].nonzero()[:, 0].tolist()) <= set(JOINTS.values())
-
-
-def test_the_most_confident_person_is_taken(tmp_path: Path) -> None:
-    openpose(
-        tmp_path / "k", "a", points(25, 0.2), points(25, 0.9) + np.array([5, 0, 0]), points(25, 0.1)
-    )
-    assert read_keypoints(tmp_path / "k", [view("a")])["a"][
-        JOINTS["left_hip"]
-    ].tolist() == pytest.approx([17, 24, 0.9])
 
 
 @pytest.mark.parametrize("count", [17, 133])
@@ -87,15 +78,6 @@ def test_points_are_undistorted(tmp_path: Path) -> None:
     assert found["a"][JOINTS["left_knee"]].tolist() == pytest.approx([60, 20, 1], abs=1e-3)
 
 
-def test_views_of_the_same_name_need_their_folders(tmp_path: Path) -> None:
-    views = [view("c0/a"), view("c1/a")]
-    (tmp_path / "k").mkdir()
-    openpose(tmp_path / "k" / "c1", "a", points(25))
-    assert list(read_keypoints(tmp_path / "k", views)) == ["c1/a"]
-    openpose(tmp_path / "k", "a", points(25))
-    assert list(read_keypoints(tmp_path / "k", views)) == ["c1/a"]
-
-
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [
@@ -114,15 +96,7 @@ def test_what_is_no_openpose_file_is_refused(tmp_path: Path, text: str, wanted: 
         read_keypoints(tmp_path, [view("a")])
 
 
-def test_no_key_points_at_all_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no key points for any image"):
-        read_keypoints(tmp_path, [view("a")])
-    with pytest.raises(DyngsError, match="no such file or folder"):
-        read_keypoints(tmp_path / "k.json", [view("a")])
-
-
 KNEE = JOINT_NAMES.index("left_knee")
-SPINE = JOINT_NAMES.index("spine2")
 
 
 def capture(count: int = 3) -> Capture:
@@ -142,15 +116,6 @@ def joints(order: str, frames: int = 3) -> np.ndarray:
     return np.stack([frame, joint, frame + joint], axis=-1)
 
 
-@pytest.mark.parametrize("order", list(ORDERS))
-def test_all_orders_have_the_knee(tmp_path: Path, order: str) -> None:
-    np.savez(tmp_path / "a.npz", joints=joints(order), order=order)
-    found = read_joints(tmp_path / "a.npz", capture(), default_template())
-    row = ORDERS[order].index("left_knee")
-    # less the offset of the recentred world
-    assert found[2][KNEE].tolist() == [1.5, row, 2.0 + row, 1.0]
-
-
 def test_joints_far_from_the_origin(tmp_path: Path) -> None:
     offset = np.array([500_000.0, 4_600_000.0, 120.0])
     np.savez(tmp_path / "a.npz", joints=joints("smpl") + offset)
@@ -159,23 +124,6 @@ def test_joints_far_from_the_origin(tmp_path: Path) -> None:
     )
     row = ORDERS["smpl"].index("left_knee")
     assert found[2][KNEE].tolist() == [2.0, row, 2.0 + row, 1.0]
-
-
-def test_posed_vertices_far_from_the_origin(tmp_path: Path) -> None:
-    body = default_template()
-    offset = np.array([500_000.0, 4_600_000.0, 120.0])
-    vertices = posed(body)[0].double().numpy()
-    np.savez(tmp_path / "near.npz", vertices=vertices)
-    np.savez(tmp_path / "far.npz", vertices=vertices + offset)
-    near = read_joints(tmp_path / "near.npz", capture(1).replace(world_offset=np.zeros(3)), body)
-    far = read_joints(tmp_path / "far.npz", capture(1).replace(world_offset=offset), body)
-    torch.testing.assert_close(far[0], near[0], rtol=0, atol=1e-6)
-
-
-def test_joints_of_the_trunk_count_less(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", joints=joints("smpl"))
-    found = read_joints(tmp_path / "a.npz", capture(), default_template())
-    assert found[0][SPINE, 3] == pytest.approx(INNER)
 
 
 def test_json_names_images_or_frames(tmp_path: Path) -> None:
@@ -254,10 +202,3 @@ def test_what_is_refused(tmp_path: Path, fields: dict[str, np.ndarray], said: st
     np.savez(tmp_path / "a.npz", **fields)  # pyright: ignore[reportArgumentType]
     with pytest.raises(DyngsError, match=said):
         read_joints(tmp_path / "a.npz", capture(), default_template())
-
-
-def test_no_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no such file"):
-        read_joints(tmp_path / "a.npz", capture(), default_template())
-    with pytest.raises(DyngsError, match="files of SAM 3D Body there"):
-        read_joints(tmp_path, capture(), default_template())

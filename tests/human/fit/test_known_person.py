@@ -19,18 +19,17 @@ from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body_reader import default_template, read_body
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.fit.known_person import (
+from dyngs.human.fit.fitted_capture import (
     AvatarPoses,
     KnownAvatar,
     known_shape,
     posed_by_avatar,
     shape_of,
-    template_of_run,
     with_shape,
 )
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.io.write import write_image, write_text
+from dyngs.io.write import write_image
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
@@ -59,14 +58,6 @@ def test_the_template_gets_the_shape(tmp_path: Path) -> None:
     assert shaped.num_shapes == body.num_shapes
 
 
-def test_a_run_names_the_capture_it_was_trained_on(tmp_path: Path) -> None:
-    folder = fitted(tmp_path / "a")
-    run = tmp_path / "run"
-    run.mkdir()
-    write_text(run / "config.yaml", f"data:\n  root: {folder}\nmodel:\n  kind: human\n")
-    assert known_shape(run, default_template()).betas[-1] == 1
-
-
 def test_others_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no fitted person there"):
         known_shape(tmp_path, default_template())
@@ -84,33 +75,6 @@ def test_a_body_of_smpl_has_the_first_ten_shapes_and_no_expressions(tmp_path: Pa
         assert (cut.num_shapes, cut.num_expressions) == (10, 0)
         assert torch.equal(cut.vertices, template.vertices)
     assert with_shape(default_template(), None).num_shapes == default_template().num_shapes
-
-
-def test_a_person_of_a_file_is_known_to_that_file_alone(tmp_path: Path) -> None:
-    body, other = (
-        read_body(write_npz(tmp_path / f"{i}.npz", model("smpl", seed=i))) for i in (0, 1)
-    )
-    for folder, own in (("given", {}), ("fit", {"fitted_to": body.fingerprint})):
-        path = fitted(tmp_path / folder, "smpl") / "body_train.npz"
-        np.savez(path, **(dict(np.load(path)) | own))  # pyright: ignore[reportArgumentType]
-        assert np.allclose(known_shape(path.parent, body).betas[:10], np.linspace(-1, 1, 44)[:10])
-    assert known_shape(tmp_path / "given", other).fitted_to == "", "whose shape it is nobody says"
-    with pytest.raises(
-        DyngsError,
-        match="is of another template than smpl; name that of the person with --template",
-    ):
-        known_shape(tmp_path / "fit", other)
-
-
-def test_a_run_names_its_template(tmp_path: Path) -> None:
-    write_text(
-        tmp_path / "config.yaml",
-        "data:\n  root: a\nmodel:\n  kind: human\n  body: s.npz\n  uv: s.obj\n",
-    )
-    assert template_of_run(tmp_path) == HumanModel(body=Path("s.npz"), uv=Path("s.obj"))
-    assert template_of_run(tmp_path / "none") == HumanModel()
-    write_text(tmp_path / "config.yaml", "data:\n  root: a\n")
-    assert template_of_run(tmp_path) == HumanModel()
 
 
 SIZE = 64
@@ -196,18 +160,6 @@ def test_disturbed_poses_are_found_again(
     assert torch.equal(after.times, start.times)
 
 
-def test_poses_that_fit_stay(
-    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
-    found = posed(avatar, views, avatar.clip)
-    assert found.before > 0.98
-    if not found.taken:
-        assert found.clip.clip is avatar.clip
-        assert "not taken" in found.summary()
-    assert error(found.clip.clip, avatar.clip).max() < 2e-3
-
-
 def test_worse_poses_are_not_taken(
     avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,31 +184,3 @@ def _shifted(cam_from_world: np.ndarray, by: Tensor) -> np.ndarray:
     shift = np.eye(4)
     shift[:3, 3] = by.numpy()
     return cam_from_world @ shift
-
-
-def test_the_size_of_training_is_taken_where_it_fits(
-    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
-    clip = avatar.clip
-    larger = 1.1 * avatar.clip.scale
-    wrong = replace(
-        clip,
-        scale=larger,
-        trans=clip.trans + (clip.scale - larger)[:, None] * avatar.skeleton.joints[0],
-    )
-    found = posed(avatar, views, wrong)
-    assert found.taken
-    torch.testing.assert_close(found.clip.clip.scale[:2], clip.scale[:2])
-
-
-def test_one_view_of_a_moment_only_moves_the_person(
-    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
-    start = turned(avatar.clip)
-    found = posed(avatar, views[::3], start)
-    assert found.left_out == 0
-    assert "on the views fitted to" in found.summary()
-    torch.testing.assert_close(found.clip.clip.poses, start.poses, rtol=0, atol=1e-6)
-    assert not torch.equal(found.clip.clip.trans, start.trans)

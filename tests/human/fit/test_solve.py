@@ -13,29 +13,24 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.fit import solve
-from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
-from dyngs.human.fit.solve import (
-    BETAS_WEIGHT,
+from dyngs.human.fit import capture_fit
+from dyngs.human.fit.capture_fit import (
     KEYPOINT,
     LIMIT_WEIGHT,
-    LR,
-    LR_DECAY,
     MISTAKEN,
-    PLACE,
     Fitting,
+    ObservedFrame,
     PosePrior,
+    Surface,
     drawn_frame,
     fit_lens,
     frame_pose_of,
     keypoint_error,
     near_given,
     new_fit,
-    place_error,
     prior,
     refined,
-    silhouette_error,
-    spread_order,
+    surface_of,
     usual,
     with_lens,
 )
@@ -84,16 +79,6 @@ def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
     assert float(keypoint_error(joints, moved, camera())) == pytest.approx(0, abs=1e-6)
 
 
-def test_silhouettes_count_where_they_are_known() -> None:
-    seen = ObservedFrame(camera(), torch.ones(1, SIZE, SIZE), torch.ones(1, SIZE, SIZE))
-    assert float(silhouette_error(torch.zeros(1, SIZE, SIZE), seen)) == 1 / (1 + 1 / MISTAKEN)
-    half = torch.ones(1, SIZE, SIZE)
-    half[:, : SIZE // 2] = 0
-    drawn = torch.zeros(1, SIZE, SIZE)
-    drawn[:, SIZE // 2 :] = 1
-    assert float(silhouette_error(drawn, ObservedFrame(camera(), seen.alpha, half))) == 0
-
-
 def test_a_wrong_mask_among_right_ones_moves_the_person_less(
     surface: Surface, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,7 +95,7 @@ def test_a_wrong_mask_among_right_ones_moves_the_person_less(
     fitting = Fitting(given, surface, near_given(given))
     moved = []
     for scale in (MISTAKEN, 1e9 * MISTAKEN):
-        monkeypatch.setattr(solve, "MISTAKEN", scale)
+        monkeypatch.setattr(capture_fit, "MISTAKEN", scale)
         found = fitting.run(new_fit(given, surface), ("trans",), 80, lambda _: seen)
         moved.append(abs(float(found["trans"][0, 0].detach())))
     assert moved[0] < 0.5 * moved[1]
@@ -141,13 +126,6 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> No
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_frames_are_taken_from_all_over_the_clip() -> None:
-    for count in (1, 2, 7, 20, 33):
-        order = spread_order(count)
-        assert sorted(order) == list(range(count))
-    assert max(spread_order(20)[:4]) - min(spread_order(20)[:4]) > 9
-
-
 def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     given = clip()
     view = camera()
@@ -160,62 +138,6 @@ def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     )
     changed = {name for name, value in found.values().items() if value.any()}
     assert changed == {"betas"}
-
-
-def test_rates_begin_where_they_have_fallen_to(surface: Surface) -> None:
-    """Nobody is seen: the person shrinks all the time, by the rate of each step."""
-    given = clip()
-    view = camera()
-    alpha = torch.zeros(1, SIZE, SIZE)
-    seen = ObservedFrame(view, alpha, alpha + 1)
-    start = new_fit(given, surface)
-    fitting = Fitting(given, surface, near_given(given))
-    sums = []
-    for fallen in (0.0, 0.75):
-        moved = fitting.run(start, ("log_scale",), 4, lambda _: seen, fallen=fallen)["log_scale"]
-        sums.append(-float(moved.detach()) / LR["log_scale"])
-    assert sums[0] == pytest.approx(sum(LR_DECAY ** (i / 4) for i in range(1, 5)), rel=0.02)
-    assert sums[1] == pytest.approx(sum(LR_DECAY ** (0.75 + i / 16) for i in range(1, 5)), rel=0.02)
-
-
-def test_joints_given_in_3d_are_robust_distances() -> None:
-    joints = torch.zeros(55, 3)
-    given = torch.zeros(55, 4)
-    assert float(place_error(joints, given, torch.ones(()))) == 0
-    given[4] = torch.tensor([3 * PLACE, 4 * PLACE, 0.0, 0.5])
-    given[5] = torch.tensor([0.0, 0.0, 0.0, 0.5])
-    assert float(place_error(joints, given, torch.ones(()))) == pytest.approx(0.5 * (26**0.5 - 1))
-    assert float(place_error(joints, given, torch.tensor(5.0))) == pytest.approx(0.5 * (2**0.5 - 1))
-
-
-@pytest.mark.parametrize(
-    ("count", "row", "name"), [(24, 21, "right_wrist"), (52, 22, "left_index1")]
-)
-def test_joints_of_other_bodies_are_compared_by_name(count: int, row: int, name: str) -> None:
-    """The last two joints of SMPL have no counterpart, and SMPL-H has fingers where SMPL-X has a
-    face."""
-    joints = torch.zeros(count, 3)
-    given = torch.zeros(55, 4)
-    joints[row] = joints[-1] = torch.tensor([3 * PLACE, 4 * PLACE, 0.0])
-    given[JOINT_NAMES.index(name), 3] = given[JOINT_NAMES.index("jaw"), 3] = 1.0
-    assert float(place_error(joints, given, torch.ones(()))) == pytest.approx(26**0.5 - 1)
-    marked = torch.zeros(1, 55, 3)
-    marked[0, :, 2] = given[:, 3]
-    marked[0, JOINT_NAMES.index(name), :2] = torch.tensor([0.5, 0.5])
-    joints[row] = 0.0
-    assert float(keypoint_error(joints, marked, camera())) == pytest.approx(0, abs=1e-6)
-
-
-def test_shapes_cost_their_mean_square_with_and_without_directions_of_bones(
-    surface: Surface,
-) -> None:
-    expected = usual(clip())
-    for count, parts in ((surface.body.num_shapes, 2), (10, 1)):
-        learned = new_fit(clip(), surface).values() | {"betas": torch.zeros(count)}
-        flat = float(prior(Parameters(learned, {}, 1.0), expected).detach())
-        learned |= {"betas": torch.full((count,), 2.0)}
-        cost = float(prior(Parameters(learned, {}, 1.0), expected).detach()) - flat
-        assert cost == pytest.approx(4 * parts * BETAS_WEIGHT, rel=1e-3)
 
 
 def test_a_longer_lens_from_further_away_shows_the_same_size(surface: Surface) -> None:
@@ -297,14 +219,3 @@ def test_a_wrong_guess_is_corrected() -> None:
     assert len(ticks) == 5 * STEPS
     assert "taken" in lens.summary()
     assert float(start["poses"].detach().abs().max()) == 0
-
-
-def test_where_the_guess_stays_nothing_is_fitted_again() -> None:
-    surface, clip, seen = filmed(0.0)
-    start = new_fit(clip, surface)
-    found, lens = fit_lens(
-        Fitting(clip, surface, near_given(clip)), start, (), seen.__getitem__, STEPS
-    )
-    assert not lens.taken
-    assert found is start
-    assert "the guess stays" in lens.summary()

@@ -17,21 +17,22 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.camera import Cameras
 from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.body.body_reader import default_template
-from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
-from dyngs.human.fit.solve import drawn_frame, frame_pose_of, new_fit, usual_pose
-from dyngs.human.fit.start import (
+from dyngs.human.fit.capture_fit import (
     NUM_HEADINGS,
-    PELVIS_FRACTION,
     STATURE,
-    angle_between,
+    ObservedFrame,
+    Surface,
+    drawn_frame,
     first_poses,
-    heading,
+    frame_pose_of,
     likely_path,
+    new_fit,
     num_ticks,
     place_and_height,
-    roots_between,
     standing_clip,
+    surface_of,
     up_of,
+    usual_pose,
 )
 from dyngs.human.motion.motion import MotionClip
 
@@ -65,23 +66,6 @@ def test_a_turn_goes_on_where_single_frames_cannot_tell() -> None:
         errors[row, facing], errors[row, mirrored] = 0.2, 0.2
     errors[0, 4], errors[4, 0], errors[2, 3] = 0.5, 0.5, 0.19
     assert likely_path(errors.tolist()) in (true, [(-x) % 8 for x in true])
-
-
-def test_the_root_turns_on_between_anchors() -> None:
-    ends = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]])
-    roots = roots_between([1, 4], ends, 6)
-    torch.testing.assert_close(roots[:, 1], torch.tensor([0.0, 0.0, 0.4, 0.8, 1.2, 1.2]))
-    assert torch.equal(roots_between([0], ends[1:], 3), ends[1:].expand(3, 3))
-
-
-def test_headings_are_evenly_spread_and_angles_are_the_shortest() -> None:
-    assert [heading(i) for i in range(NUM_HEADINGS)] == pytest.approx(
-        [2 * math.pi * i / NUM_HEADINGS for i in range(NUM_HEADINGS)]
-    )
-    a = Rotation.from_rotvec([0, 3.0, 0])
-    b = Rotation.from_rotvec([0, -3.0, 0])
-    vectors = [torch.from_numpy(x.as_rotvec()) for x in (a, b)]
-    assert angle_between(vectors[0], vectors[1]) == pytest.approx(2 * math.pi - 6)
 
 
 SIZE = 48
@@ -137,26 +121,9 @@ def test_place_and_size_of_who_stands_somewhere(surface: Surface) -> None:
     assert float(clip.scale[0]) == pytest.approx(1.2, rel=0.1)
 
 
-def test_one_camera_leaves_the_size_open(surface: Surface) -> None:
-    place = torch.tensor([0.0, 1.0, 0.0])
-    seen = seen_by(surface, standing(place, 0.3), ring(1, place))
-    found, height = place_and_height(seen, up_of(seen))
-    assert height is None
-    assert found == pytest.approx(place, abs=0.25)
-    assert 0.5 < PELVIS_FRACTION < 0.56
-
-
-def test_nobody_has_the_place_of_the_frame_before(surface: Surface) -> None:
-    place = torch.tensor([0.0, 1.0, 0.0])
-    seen = seen_by(surface, standing(place, 0.0), ring(4, place))
-    times = torch.tensor([0.0, 1.0], dtype=torch.float64)
-    clip = standing_clip(times, surface, lambda row: seen if row == 0 else None)
-    assert torch.equal(clip.trans[0], clip.trans[1])
-
-
 def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 15)
-    monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 15)
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.ARMS", ())
     place = torch.tensor([0.0, 1.0, 0.0])
     heading = 2.0
     seen = seen_by(surface, standing(place, heading), ring(3, place))
@@ -170,18 +137,13 @@ def test_the_heading_is_found(surface: Surface, monkeypatch: pytest.MonkeyPatch)
     assert len(ticks) == num_ticks(1, marked=False)
 
 
-def test_nobody_at_all_is_an_error(surface: Surface) -> None:
-    with pytest.raises(ValueError, match="nobody is seen"):
-        first_poses(torch.zeros(1, dtype=torch.float64), surface, lambda _: None)
-
-
 def test_who_turns_before_one_camera_is_followed(
     surface: Surface, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From frame to frame a body would rather twist than turn: outlines of front and back are
     alike."""
-    monkeypatch.setattr("dyngs.human.fit.start.STEPS", 10)
-    monkeypatch.setattr("dyngs.human.fit.start.ARMS", ())
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 10)
+    monkeypatch.setattr("dyngs.human.fit.capture_fit.ARMS", ())
     place = torch.tensor([0.0, 1.0, 0.0])
     camera = ring(1, torch.tensor([0.0, 1.0, 0.0]))
     # towards the camera, then sideways, then away from it

@@ -19,7 +19,6 @@ from dyngs.human.motion.motion import Motion, UpAxis
 
 SHARED = Path(__file__).parents[3] / "../shared/data"
 BODY = tiny_body()
-MODELS = {24: "smpl", 52: "smplh", 55: "smplx"}
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 FRAMES = 4
 
@@ -72,15 +71,6 @@ def test_z_up_files_are_turned_vertex_by_vertex(tmp_path: Path, count: int, shap
     assert len(motion.betas) == shapes
 
 
-@pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_turning_heeds_the_scale(tmp_path: Path, scale: float) -> None:
-    arrays = numbers(scale=scale)
-    expected = slow_vertices(tiny_body(), as_written(arrays, 55, scale)) @ Y_FROM_Z.T
-    motion = read(tmp_path, arrays, up="z")
-    np.testing.assert_allclose(slow_vertices(tiny_body(), motion), expected, atol=4e-6)
-    assert motion.scale.tolist() == [scale] * FRAMES
-
-
 @pytest.mark.parametrize(
     ("changes", "up", "is_turned"),
     [
@@ -105,23 +95,6 @@ def test_which_files_are_turned(
     assert torch.equal(motion.poses[:, 1:], plain.poses[:, 1:])
     assert torch.equal(motion.poses[:, 0], plain.poses[:, 0]) == (not is_turned)
     assert torch.equal(motion.trans, plain.trans) == (not is_turned)
-
-
-def test_motions_of_another_body_land_on_the_floor(tmp_path: Path) -> None:
-    """A file of SMPL-H on SMPL-X: its pelvis lies elsewhere, and its shape means nothing here."""
-    body = tiny_body(55, 10)
-    motion = read(tmp_path, numbers(52), 55, shapes=10)
-    assert slow_vertices(body, motion)[..., 1].min() == pytest.approx(0, abs=1e-6)
-    assert not motion.betas.any()
-    exact = read(tmp_path, numbers(55), 55, shapes=10)
-    assert abs(slow_vertices(body, exact)[..., 1].min()) > 0.01
-    assert exact.betas.any()
-
-
-def test_own_files_stay_where_they_are_on_any_body(tmp_path: Path) -> None:
-    arrays = numbers(scale=0.9)
-    motion = read(tmp_path, arrays, 24)
-    assert torch.equal(motion.trans, as_written(arrays, 55).trans)
 
 
 # --- layouts
@@ -168,24 +141,6 @@ def test_parts_instead_of_poses(tmp_path: Path, left_out: tuple[str, ...]) -> No
         read(tmp_path, {**arrays, **parts}).poses.reshape(FRAMES, -1).numpy(),
         expected.astype(np.float32),
     )
-
-
-@pytest.mark.parametrize("key", ["mocap_framerate", "mocap_frame_rate"])
-def test_both_names_of_the_frame_rate(tmp_path: Path, key: str) -> None:
-    assert read(tmp_path, numbers(mocap_framerate=None) | {key: np.array(59.94)}).fps == 59.94
-
-
-def test_a_file_without_shape(tmp_path: Path) -> None:
-    assert read(tmp_path, numbers(betas=None, up_axis="y")).betas.tolist() == [0.0] * 10
-
-
-def test_scales_per_frame(tmp_path: Path) -> None:
-    assert read(tmp_path, numbers(scale=np.arange(1.0, 5.0))).scale.tolist() == [1, 2, 3, 4]
-
-
-def test_objects_beside_the_numbers_are_not_touched(tmp_path: Path) -> None:
-    """Some releases hold labels as Python objects."""
-    assert len(read(tmp_path, numbers(labels=np.array([{"a": 1}, None], dtype=object)))) == FRAMES
 
 
 def test_the_motions_at_hand() -> None:
@@ -255,56 +210,6 @@ def test_fits_are_turned_so_that_the_pelvis_is_upright(tmp_path: Path, axis: str
     np.testing.assert_allclose(chosen.trans.numpy(), np.asarray(given["transl"]), atol=1e-6)
 
 
-def test_what_fits_may_lack_and_spell_otherwise(tmp_path: Path) -> None:
-    """Parts after the body, rows of joints, SMPL's 23 joints, one more axis."""
-    whole = named()
-    short = {
-        key: x for key, x in whole.items() if key in ("global_orient", "body_pose", "transl", "fps")
-    }
-    body = np.asarray(whole["body_pose"])
-    padded = {**short, "body_pose": np.concatenate([body, np.ones((FRAMES, 6))], axis=1)}
-    rows = {
-        **short,
-        "body_pose": body.reshape(FRAMES, 21, 3),
-        "global_orient": np.asarray(short["global_orient"])[:, None],
-    }
-    first = read(tmp_path, short)
-    np.testing.assert_allclose(first.poses[:, 1:22].reshape(FRAMES, -1).numpy(), body, atol=1e-6)
-    assert not bool(first.poses[:, 22:].any())
-    for other in (padded, rows):
-        np.testing.assert_array_equal(read(tmp_path, other).poses.numpy(), first.poses.numpy())
-
-
-@pytest.mark.parametrize(
-    ("changes", "problem"),
-    [
-        (
-            {"left_hand_pose": np.zeros((4, 6))},
-            "'left_hand_pose' must hold .* of 15 joints per frame, has 4 x 6;.*use_pca",
-        ),
-        ({"body_pose": None}, "the key 'body_pose' is missing"),
-        (
-            {"body_pose": np.zeros((4, 21, 3, 3))},
-            "'body_pose' must hold .* 21 or 23 joints .*has 4 x 21 x 3 x 3;",
-        ),
-        ({"transl": None}, "the key 'trans' is missing"),
-        ({"fps": None}, "has no frame rate; .*dyngs data motion FILE OUT.npz --fps 30"),
-        ({"global_orient": np.float64(1)}, "'global_orient' must hold .*has one number"),
-        (
-            {"global_orient": np.zeros((3, 3))},
-            "'body_pose' must have 3 frames as 'global_orient' has, has 4 x 63",
-        ),
-    ],
-)
-def test_broken_fits_say_what_is_wrong(
-    tmp_path: Path, changes: dict[str, object], problem: str
-) -> None:
-    with pytest.raises(DyngsError, match=problem) as caught:
-        read(tmp_path, named(**changes))
-    assert str(caught.value).startswith(str(tmp_path / "x.npz"))
-    assert "\n" not in str(caught.value)
-
-
 # --- files of other programs
 # -----------------------------------------------------------------------------------------
 
@@ -343,22 +248,6 @@ def test_layouts_of_the_same_motion(tmp_path: Path, changes: dict[str, object]) 
     assert other.notes == ()
 
 
-def test_half_precision_and_the_22_joints_of_the_body(tmp_path: Path) -> None:
-    """Any model has these joints, so the shape is dropped as that of another model."""
-    halves = {key: np.asarray(SMPL[key]).astype(np.float16) for key in ("poses", "trans", "betas")}
-    plain = read(tmp_path, SMPL, 24, shapes=10)
-    np.testing.assert_allclose(
-        read(tmp_path, SMPL | halves, 24, shapes=10).poses, plain.poses, atol=2e-3
-    )
-    halves["poses"] = MATRICES.astype(np.float16)
-    np.testing.assert_allclose(
-        read(tmp_path, SMPL | halves, 24, shapes=10).poses, plain.poses, atol=4e-3
-    )
-    body_only = read(tmp_path, SMPL | {"poses": ROTVECS[:, :22]}, 24, shapes=10)
-    assert torch.equal(body_only.poses, plain.poses)
-    assert not body_only.betas.any()
-
-
 @pytest.mark.parametrize("as_matrices", [False, True])
 def test_files_of_romp_and_hmr(tmp_path: Path, as_matrices: bool) -> None:
     """In the axes of a camera, y down: upright as the same numbers with the names of smplx are."""
@@ -381,42 +270,6 @@ def test_files_of_romp_and_hmr(tmp_path: Path, as_matrices: bool) -> None:
     assert "does not say what is up; -y is taken" in motion.notes[0]
     thetas = read(tmp_path, {"smpl_thetas": rotvecs} | rest, 24, shapes=10)
     np.testing.assert_allclose(thetas.poses, motion.poses, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("count", "said"), [(24, "the mean is taken"), (55, "dropped as the template is 'smplx'")]
-)
-def test_the_mean_of_shapes_per_frame(tmp_path: Path, count: int, said: str) -> None:
-    betas = SHAPES + np.arange(FRAMES)[:, None]
-    motion = read(tmp_path, SMPL | {"betas": betas}, count, shapes=10)
-    np.testing.assert_allclose(motion.betas, (SHAPES + 1.5) * (count == 24), atol=1e-6)
-    assert len(motion.notes) == 1
-    assert "'betas' differ between frames by up to 3" in motion.notes[0]
-    assert said in motion.notes[0]
-
-
-def test_a_file_without_rate(tmp_path: Path) -> None:
-    """The rate of the caller; a file that has one keeps it."""
-    given = {key: value for key, value in SMPL.items() if key != "mocap_framerate"}
-    np.savez(tmp_path / "y.npz", **given)  # pyright: ignore[reportArgumentType]
-    motion = read_amass(tmp_path / "y.npz", tiny_body(24, 10), fps=12.5)
-    plain = read(tmp_path, SMPL, 24, shapes=10)
-    assert torch.equal(motion.poses, plain.poses)
-    assert torch.equal(motion.trans, plain.trans)
-    assert motion.fps == 12.5
-    assert "z is taken, as in files of AMASS" in " ".join(motion.notes)
-    assert read_amass(tmp_path / "x.npz", tiny_body(24, 10), fps=12.5).fps == 120
-    for rate in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(DyngsError, match="is not the rate of a motion"):
-            read_amass(tmp_path / "y.npz", tiny_body(24, 10), fps=rate)
-
-
-def test_positions_in_millimetres(tmp_path: Path) -> None:
-    """A walk of 1 m/s in millimetres is too fast for a person."""
-    walk = np.linspace([0, 0, 0], [1, 0, 0], FRAMES) * 3 / 120
-    assert read(tmp_path, SMPL | {"trans": walk}, 24).notes == ()
-    (note,) = read(tmp_path, SMPL | {"trans": 1000 * walk}, 24).notes
-    assert "the root moves at 1000 m/s" in note
 
 
 # --- broken files
@@ -505,30 +358,6 @@ def test_broken_files_say_what_is_wrong(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\3\4", b"not an archive", b"\x93NUMPY\1\0"])
-def test_files_of_another_kind(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "x.npz").write_bytes(content)
-    with pytest.raises(DyngsError, match=r"x\.npz: ") as caught:
-        read_amass(tmp_path / "x.npz", tiny_body())
-    assert "\n" not in str(caught.value)
-
-
-def test_a_single_array_and_a_missing_file(tmp_path: Path) -> None:
-    np.save(tmp_path / "x.npy", np.zeros(3))
-    for name in ("x.npy", "none.npz"):
-        with pytest.raises(DyngsError, match=name):
-            read_amass(tmp_path / name, tiny_body())
-
-
-def test_the_turned_root_of_a_person_lying_on_the_back(tmp_path: Path) -> None:
-    """In a z-up world, a standing SMPL body is turned by 90 degrees about x: that becomes no turn
-    at all."""
-    poses = np.zeros((FRAMES, 165))
-    poses[:, 0] = np.pi / 2
-    motion = read(tmp_path, numbers(poses=poses))
-    assert motion.poses.abs().max() < 1e-6
-
-
 # --- writing
 # ----------------------------------------------------------------------------------------------------------
 
@@ -545,24 +374,3 @@ def test_saved_motions_are_read_exactly(tmp_path: Path, fps: float) -> None:
         assert found.fps == fps
     write_amass(found, tmp_path / "y.npz")
     assert (tmp_path / "y.npz").read_bytes() == (tmp_path / "new" / "x.npz").read_bytes()
-
-
-def test_saved_files_are_those_of_amass(tmp_path: Path) -> None:
-    write_amass(random_motion(), tmp_path / "x.npz")
-    with np.load(tmp_path / "x.npz", allow_pickle=False) as file:
-        assert file["poses"].shape == (4, 165)
-        assert {str(file[key]) for key in ("surface_model_type", "gender", "up_axis")} == {
-            "smplx",
-            "neutral",
-            "y",
-        }
-
-
-def test_what_cannot_be_saved(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"x\.bvh: a motion is written as \.npz"):
-        write_amass(random_motion(), tmp_path / "x.bvh")
-    with pytest.raises(ValueError, match="must be"):
-        write_amass(random_motion().for_joints(24), tmp_path / "x.npz")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DyngsError, match="cannot write"):
-        write_amass(random_motion(), tmp_path / "file" / "x.npz")

@@ -9,10 +9,8 @@ from torch import Tensor
 
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.motion.feet import feet_kept, foot_contact, sole_points
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.motion.placement import moved
 
 FPS = 30.0
 BODY = default_template()
@@ -58,19 +56,6 @@ def test_a_person_who_stands_and_is_pushed_stays_where_it_is() -> None:
     assert again.slide == pytest.approx(after.slide, abs=1e-6), "measured anew"
 
 
-def test_size_up_direction_and_rate_are_those_of_the_clip() -> None:
-    clip = clip_of(steps(20, (0.004, 0.0, 0.003)))
-    turn = axis_angle_to_matrix(torch.tensor([0.3, -0.7, 1.1]))
-    there = moved(clip, turn, 3.0, torch.tensor([5.0, 1.0, 2.0]), BODY.joints[0])
-    _, before, after = feet_kept(there, soles_of(there), turn @ Y, FPS)
-    assert before.frames == 20
-    assert before.slide == pytest.approx(0.005, rel=1e-3), "metres of the person"
-    assert after.slide < 1e-5
-    assert foot_contact(clip, soles_of(clip), Y, 10 * FPS).frames == 0, (
-        "too fast to stand at ten times the rate"
-    )
-
-
 def walk(stride: float, root: float) -> MotionClip:
     """Legs that swing by turns as stilts, 20 frames each; the root moves by ``root`` over what
     would keep the feet."""
@@ -105,33 +90,6 @@ def test_a_walk_with_a_root_that_is_too_fast_is_slowed_down_to_the_feet() -> Non
     assert length[2] == pytest.approx(length[0], rel=0.1)
     assert torch.equal(kept.trans[:, 1], fast.trans[:, 1]), "along the floor alone"
     assert torch.equal(kept.poses, fast.poses)
-
-
-def test_in_the_air_the_root_carries_on() -> None:
-    trans = steps(40, (0.01, 0.0, 0.0))
-    trans[15:25, 1] = 0.3
-    clip = clip_of(trans)
-    kept, before, after = feet_kept(clip, soles_of(clip), Y, FPS)
-    assert not before.touching[15:25].any()
-    assert before.touching[:14].all()
-    assert after.slide < 1e-5
-    torch.testing.assert_close(kept.trans[:, 0], kept.trans[:1, 0].expand(40), rtol=0, atol=1e-4)
-
-
-def test_what_cannot_slide_is_left_as_it_is() -> None:
-    for clip in (clip_of(torch.zeros(1, 3)), clip_of(steps(20, (0.2, 0.0, 0.0)))):
-        kept, before, _ = feet_kept(clip, soles_of(clip), Y, FPS)
-        assert kept is clip
-        assert before.frames == 0
-        assert "stays as it is" in before.compared(before)
-
-
-def test_the_line_says_how_far_feet_slide() -> None:
-    clip = clip_of(steps(20, (0.004, 0.0, 0.003)))
-    _, before, after = feet_kept(clip, soles_of(clip), Y, FPS)
-    line = before.compared(after)
-    assert "20 of 20 frames" in line
-    assert "5.0 mm per frame; with the root moved 0.0 mm" in line
 
 
 def test_feet_that_sink_into_the_floor_while_other_legs_bend_still_touch_it() -> None:

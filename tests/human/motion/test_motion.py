@@ -10,27 +10,20 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from motion_files import random_motion, tiny_body
+from motion_files import random_motion
 from scipy.spatial.transform import Rotation
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import body_frames
 from dyngs.data.capture import BodyFrames, View
-from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.motion.motion import (
     MAX_JOINT_POSES,
     Motion,
     MotionClip,
     captured_motion,
-    frame_chunks,
-    motion_clip,
     require_frame_count,
-    require_frame_rate,
-    same_bodies,
-    sample_times,
 )
-
-BODY = tiny_body()
 
 
 def matrices(motion: Motion) -> np.ndarray:
@@ -92,18 +85,6 @@ def test_between_frames() -> None:
     assert len(motion.resampled(0.1)) == 1
 
 
-def test_times_that_float32_rounds_down_keep_their_last_frame() -> None:
-    assert [len(sample_times(float(np.float32(k / 30)), 1.0, 30.0)) for k in range(500)] == list(
-        range(1, 501)
-    )
-
-
-@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf"), 1e9])
-def test_rates_that_make_no_sense(fps: float) -> None:
-    with pytest.raises(DyngsError, match="ask for 30 or the like"):
-        random_motion().resampled(fps)
-
-
 # --- limits
 # -----------------------------------------------------------------------------------------------------------
 
@@ -122,33 +103,6 @@ def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatc
             require_frame_count(Path("x.glb"), frames, joints)
     monkeypatch.setenv("DYNGS_LIMITS", "2")
     require_frame_count(Path("x.glb"), 2 * MAX_JOINT_POSES // 100, 100)
-
-
-def test_resampling_has_the_same_limit() -> None:
-    motion = replace(random_motion(), fps=1e-3)
-    with pytest.raises(
-        DyngsError, match=r"more than 90,909 frames; ask for 30 or the like, or set DYNGS_LIMITS=N"
-    ):
-        motion.resampled(30.0)
-
-
-@pytest.mark.parametrize("fps", [0.0, 1e-310, 1e-9, 1e6, float("inf"), float("nan")])
-def test_rates_of_no_motion(fps: float) -> None:
-    with pytest.raises(
-        DyngsError, match=r"x\.bvh: .* frames per second is not the rate of a motion"
-    ):
-        require_frame_rate(Path("x.bvh"), fps)
-
-
-def test_long_motions_are_worked_on_in_parts() -> None:
-    """As if they were not."""
-    motion = random_motion(2500)
-    whole = motion.resampled(24.0)
-    parts = frame_chunks(2500)
-    assert [(part.start, part.stop) for part in parts] == [(0, 1024), (1024, 2048), (2048, 2500)]
-    expected = motion._interpolated(sample_times(2499, 30.0, 24.0), 24.0)
-    for name in ("poses", "trans", "scale"):
-        torch.testing.assert_close(getattr(whole, name), getattr(expected, name))
 
 
 def three_frames() -> MotionClip:
@@ -172,18 +126,6 @@ def test_a_clip_is_exact_at_its_frames_and_turns_evenly_between() -> None:
     assert float(between.poses[0, 1, 2]) == pytest.approx(1.75)
     assert float(between.trans[0, 0]) == pytest.approx(3.0)
     assert float(between.scale[0]) == pytest.approx(1.5)
-
-
-@pytest.mark.parametrize(("time", "row"), [(None, 0), (-3.0, 0), (7.0, 2)])
-def test_moments_outside_are_those_of_the_ends(time: float | None, row: int) -> None:
-    clip = three_frames()
-    torch.testing.assert_close(clip.at(time).poses[0], clip.poses[row], rtol=0, atol=0)
-
-
-def test_a_motion_of_one_frame_is_a_clip() -> None:
-    poses = torch.zeros(1, len(JOINT_NAMES), 3)
-    one = motion_clip(Motion(poses, torch.zeros(1, 3), torch.zeros(0), 30.0, torch.ones(1)))
-    assert one.times.tolist() == [0.0]
 
 
 WHERE = Path("capture")
@@ -225,28 +167,6 @@ def test_who_never_moves_has_one_pose_for_all_frames() -> None:
     assert moving.rows == {3: 0, 4: 1, 7: 2}
 
 
-def test_a_captured_motion_without_times_is_spread_by_frame_number() -> None:
-    filmed = captured_motion(
-        WHERE, bodies([0, 1, 2]), [view(2, None), view(1, None)], torch.zeros(55, 3)
-    )
-    assert filmed.frames == (1, 2)
-    assert filmed.clip.times.tolist() == [0.5, 1.0]
-
-
 def test_a_view_without_parameters_is_named() -> None:
     with pytest.raises(DyngsError, match="no body parameters for 1 frames that have images"):
         captured_motion(WHERE, bodies([0, 1]), [view(5, 0.0)], torch.zeros(55, 3))
-
-
-def test_poses_of_smpl_move_a_body_of_55_joints() -> None:
-    given = bodies([0], joints=24)
-    poses = captured_motion(WHERE, given, [view(0, 0.0)], torch.zeros(55, 3)).clip.poses[0]
-    np.testing.assert_allclose(poses[:22].numpy(), given.poses[0, :22], rtol=1e-6)
-    assert not poses[22:].any()
-
-
-def test_clips_are_told_apart() -> None:
-    one = bodies([0, 1])
-    other = bodies([0, 2])
-    assert same_bodies(one, bodies([0, 1]))
-    assert not same_bodies(one, other)

@@ -21,7 +21,6 @@ from dyngs.human.motion.motion import MotionClip, motion_clip
 from dyngs.human.motion.placement import (
     place_like,
     place_on_floor,
-    rest_clip,
     up_direction,
     upright,
 )
@@ -62,29 +61,6 @@ def test_a_motion_is_put_where_the_person_was(up: int) -> None:
     alone = joint_places(clip, body.joints, body.parents)
     wanted = 2 * (alone - alone[:1, :1]) @ turn.T
     torch.testing.assert_close(ours - ours[:1, :1], wanted, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("up", [0, 1, 2])
-def test_what_is_placed_like_the_upright_pose_is_placed_like_the_clip_it_comes_from(
-    up: int,
-) -> None:
-    body = tiny_body()
-    generator = torch.Generator().manual_seed(up)
-    axis = torch.nn.functional.one_hot(torch.tensor((up + 1) % 3), 3).float()
-    roots = 2.0 * axis + 0.05 * torch.randn(4, 3, generator=generator)
-    poses = torch.cat([roots[:, None], 0.3 * torch.randn(4, 54, 3, generator=generator)], dim=1)
-    trans = torch.randn(4, 3, generator=generator)
-    times = torch.linspace(0, 1, 4, dtype=torch.float64)
-    like = MotionClip(times, poses, trans, torch.tensor([1.9, 2.0, 2.0, 2.1]))
-    clip = MotionClip(
-        times, 0.2 * torch.randn(4, 55, 3, generator=generator), trans.flip(0), torch.ones(4)
-    )
-    rest = rest_clip(like, body.joints, body.parents)
-    assert len(rest) == 1
-    assert not rest.poses[:, 1:].any()
-    one, other = (place_like(clip, x, body.joints, body.parents) for x in (like, rest))
-    for name in ("poses", "trans", "scale"):
-        torch.testing.assert_close(getattr(other, name), getattr(one, name), rtol=0, atol=1e-4)
 
 
 def test_upright_turns_a_world_whose_z_is_up() -> None:

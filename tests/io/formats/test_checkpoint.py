@@ -12,7 +12,6 @@ import pytest
 import torch
 from splat_scenes import cloud
 
-from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import format_of, read_splats
@@ -76,20 +75,6 @@ def test_nerfstudio(tmp_path: Path) -> None:
     torch.save(state, tmp_path / "step-000029999.ckpt")
     moved = state["pipeline"]["_model.gauss_params.means"]
     same(read_splats(tmp_path / "step-000029999.ckpt").gaussians, cloud(50, 3).replace(means=moved))
-
-
-def test_a_checkpoint_is_converted_upright(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = cloud(50, 1)
-    torch.save({"step": 1, "splats": parameters(scene, False).state_dict()}, tmp_path / "a.pt")
-    assert main(["convert", str(tmp_path / "a.pt"), str(tmp_path / "a.ply")]) == 0
-    assert "up is -y in the file, it was z" in capsys.readouterr().out
-    x, y, z = scene.means.unbind(1)
-    found = read_splats(tmp_path / "a.ply").gaussians.means
-    torch.testing.assert_close(found, torch.stack([x, -z, y], 1), rtol=0, atol=1e-6)
-    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.pt")]) == 2
-    assert "names no format of Gaussians" in capsys.readouterr().err
 
 
 class Attack:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.formats.edit_note import note_path, read_note, write_note
+from dyngs.io.formats.formats import note_path, read_note, write_note
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 
 EDITED = Similarity((0.6, 0.0, 0.8, 0.0), 0.1, (1.0, -2.0, 3e-7))

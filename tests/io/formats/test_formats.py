@@ -20,21 +20,19 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import splat_options
-from dyngs.io.formats.edit_note import note_path
+from dyngs.io.fields import VARIABLE
 from dyngs.io.formats.formats import (
     FORMATS,
     Format,
     moved_file,
+    note_path,
     read_splats,
     undone_file,
     upright,
     write_splats,
 )
-from dyngs.io.formats.gltf import add_gaussians
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.io.gltf import GlbDocument
-from dyngs.io.limits import VARIABLE
 
 LEAST_PSNR = {
     "ply": 99,
@@ -186,27 +184,6 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
         assert (back.world_offset, back.turned) == (FAR, turn.turn)
 
 
-@pytest.mark.parametrize("suffix", [".glb", pytest.param(".usda", marks=without_usd)])
-def test_nodes_far_from_the_origin_lose_nothing(suffix: str, tmp_path: Path) -> None:
-    """Of other programs, which say nothing of an offset."""
-    path = tmp_path / f"a{suffix}"
-    near = cloud(100, 0)
-    write_splats(path, SplatFile(near, up="y"))
-    if suffix == ".glb":
-        document = GlbDocument()
-        meshes = [{"primitives": [add_gaussians(document, near)]}]
-        document.json |= {"nodes": [{"mesh": 0, "translation": FAR}], "meshes": meshes}
-        document.write(path)
-    else:
-        head = 'def ParticleField3DGaussianSplat "Gaussians"\n{\n'
-        moved = f"double3 xformOp:translate = {FAR}\n"
-        order = 'uniform token[] xformOpOrder = ["xformOp:translate"]\n'
-        path.write_text(path.read_text().replace(head, head + moved + order))
-    back = read_splats(path)
-    found = back.gaussians.means.double().numpy() + back.world_offset
-    np.testing.assert_allclose(found, near.means.double().numpy() + FAR, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("kind", readable(), ids=str)
 def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
     """In comments, or in a note beside the file; turned for viewers or not."""
@@ -226,19 +203,6 @@ def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
     assert float(order.amin(1).max()) < 0.02  # of a cloud of size 1, in the coarsest format
     path.write_bytes(write_splats(tmp_path / f"b{kind.suffixes[0]}", before).path.read_bytes())
     assert read_splats(path).edited == UNMOVED  # another file by that name
-
-
-def test_spz_holds_small_scenes_and_says_where_it_does_not(tmp_path: Path) -> None:
-    """Its steps are absolute: sizes from 4.5e-5 to 380."""
-    scene = cloud(400)
-    shown = {}
-    for factor in (1e-3, 1e-4):
-        written = write_splats(tmp_path / "a.spz", SplatFile(scaled(scene, factor)))
-        back = read_splats(written.path)
-        shown[factor] = psnr(seen(scaled(back.gaussians, 1 / factor)), seen(scene))
-        assert bool(written.notes) is (factor == 1e-4)
-    assert shown[1e-3] > LEAST_PSNR["spz"]
-    assert written.notes[0].startswith("spz holds sizes from 4.5e-05 to 3.8e+02, those of ")
 
 
 @every

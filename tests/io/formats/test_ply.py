@@ -151,17 +151,6 @@ def test_any_property_order_type_and_extras(tmp_path_factory, data, fmt) -> None
     assert_same(gaussians, read_splats(path).gaussians)
 
 
-def test_other_elements_are_skipped(tmp_path) -> None:
-    gaussians = make_gaussians(3, 0)
-    header, body = written(tmp_path / "a.ply", gaussians).read_bytes().split(b"end_header\n", 1)
-    header = header.replace(
-        b"element vertex", b"element camera 2\nproperty double f\nproperty uchar g\nelement vertex"
-    )
-    faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    (tmp_path / "b.ply").write_bytes(header + faces + bytes(18) + body + bytes(13))
-    assert_same(gaussians, read_splats(tmp_path / "b.ply").gaussians)
-
-
 def test_non_finite_values_are_refused_or_skipped(tmp_path) -> None:
     gaussians = make_gaussians(6, 1)
     columns = {name: x.copy() for name, x in plain_columns(gaussians).items()}

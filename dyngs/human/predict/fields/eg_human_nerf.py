@@ -23,40 +23,51 @@ from torch.nn.functional import interpolate, pad
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human.predict.fields.boundaries import OUTWARDS, Boundaries
-from dyngs.human.predict.fields.features import (
+from dyngs.human.predict.fields.network import (
+    CHUNK,
     FINE,
-    Look,
+    NEAR,
+    EncodedPerson,
+    FieldNetwork,
+    FieldPicture,
     Perceptron,
-    Seen,
+    PointFeatures,
+    SourceFeatures,
     at_pixels,
     begin,
     between,
     blended,
     mean_and_variance,
 )
-from dyngs.human.predict.fields.keys import EgHumanNerfModel
-from dyngs.human.predict.fields.network import CHUNK, NEAR, FieldNetwork, Known, Picture
-from dyngs.human.predict.fields.people import Body
+from dyngs.human.predict.fields.people import OUTWARDS, Boundaries, PosedBody
 from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Rays
 
-# Of guided samples from where the surface is expected, m
-OFFSETS = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01)
-LIMIT = 0.05  # Signed ray distances are learned up to here, m
-CLEAR = 0.01  # Signed ray distances from which a ray that misses the person is learned no more, m
-HIDDEN_BY = 0.03  # What lies so far behind the body is hidden by it, m
-SHARPNESS = 200.0  # Of the first surfaces, per m
-# Half of where rays are looked at without boundaries, m before and behind the middle of the key
-# points
-AROUND = 0.5
-GEOMETRY = 16  # Features of what is known about the surface at a sample
+
+@dataclass(frozen=True)
+class EgHumanNerfParams:
+    """Sizes and weights that are not published; lengths in m."""
+
+    features: int = 32  # of a pixel of the images
+    width: int = 64  # features of hidden layers
+    samples: int = 16  # of a ray, that say where the surface is
+    # of guided samples from where the surface is expected
+    offsets: tuple[float, ...] = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01)
+    srdf_weight: float = 0.2  # of the error of signed ray distances, over ``limit``
+    limit: float = 0.05  # signed ray distances are learned up to here
+    clear: float = 0.01  # signed ray distances from which a ray that misses is learned no more
+    hidden_by: float = 0.03  # what lies so far behind the body is hidden by it
+    sharpness: float = 200.0  # of the first surfaces, per m
+    geometry: int = 16  # features of what is known about the surface at a sample
+
+
+PARAMS = EgHumanNerfParams()
 HINTS = 8  # What is known of a sample and its ray from the body and the silhouettes
 _FAR = 1e3  # Stands for no depth, m
 
 
 @dataclass(frozen=True)
-class Guided:
+class GuidedSamples:
     """Samples of R rays with their signed ray distances, of both stages."""
 
     rays: Tensor  # (R,) index of the pixel
@@ -65,7 +76,7 @@ class Guided:
 
 
 @dataclass(frozen=True)
-class Ray:
+class RayContext:
     """What is known of R rays, (R, 1) each, lengths in m."""
 
     begin: Tensor  # where they are looked at from
@@ -77,7 +88,7 @@ class Ray:
 
 
 @dataclass(frozen=True)
-class Shape:
+class BodyDepths:
     """A body, and its depths (V, 1, H, W) in the images, m."""
 
     boundaries: Boundaries
@@ -87,38 +98,33 @@ class Shape:
 class EgHumanNerf(FieldNetwork):
     """See the module."""
 
-    def __init__(self, model: EgHumanNerfModel, generator: torch.Generator) -> None:
-        super().__init__(model.features)
-        self.model = model
-        width = model.width
-        pixel = model.features + FINE
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__(PARAMS.features)
+        width = PARAMS.width
+        pixel = PARAMS.features + FINE
         self.guide = Perceptron(2 * pixel + HINTS, width, width, 1)
         self.attention = Perceptron(pixel + 5, width, 1)
-        self.surface = Perceptron(2 * pixel + HINTS, width, width, 1 + GEOMETRY)
+        self.surface = Perceptron(2 * pixel + HINTS, width, width, 1 + PARAMS.geometry)
         colours = 3 + FINE
-        self.blend = Perceptron(3 * colours + GEOMETRY + 5, width, width // 2, 1)
-        self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS), device="cpu"))
+        self.blend = Perceptron(3 * colours + PARAMS.geometry + 5, width, width // 2, 1)
+        self.sharpness = nn.Parameter(torch.tensor(math.log(PARAMS.sharpness), device="cpu"))
         self.refine = Refinement()
         begin(self, generator)
         with torch.no_grad():  # begin with the distance to the body, and with colours as they are
             for layer in (self.guide.layers[-1], self.surface.layers[-1], self.refine.last):
                 layer.weight.mul_(0.1)  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
 
-    @property
-    def needs_depth(self) -> bool:
-        return self.model.srdf_weight > 0
+    needs_depth = True
 
-    def prepared(self, seen: Seen, body: Body) -> Shape:
+    def prepared(self, seen: SourceFeatures, body: PosedBody) -> BodyDepths:
         boundaries = Boundaries(body)
         sources = seen.sources
-        if not self.model.visibility:
-            return Shape(boundaries, torch.full_like(sources.rgba[:, :1], _FAR))
         depths = torch.stack([boundaries.depth(sources.camera(i)) for i in range(len(sources))])
-        return Shape(boundaries, depths[:, None].clamp(max=_FAR).to(sources.rgba))
+        return BodyDepths(boundaries, depths[:, None].clamp(max=_FAR).to(sources.rgba))
 
     def picture(
-        self, known: Known, camera: Cameras, generator: torch.Generator | None = None
-    ) -> Picture:
+        self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
+    ) -> FieldPicture:
         rays, z = rays_of(camera)
         begin_at, end, body = self._limits(known, camera, rays, z)
         which = (end > begin_at).nonzero()[:, 0]
@@ -133,28 +139,25 @@ class EgHumanNerf(FieldNetwork):
         depth = like.new_zeros(shape)
         through = like.new_ones(shape)
         if not len(which):
-            return Picture(colour, through, depth)
+            return FieldPicture(colour, through, depth)
         parts = [torch.cat(x) for x in zip(*(part[:3] for part in found), strict=True)]
         colour, through, depth = (
             whole.flatten(0, 1).index_copy(0, which, own).view(whole.shape)
             for whole, own in zip((colour, through, depth), parts, strict=True)
         )
         guided = (
-            [Guided(which, at, signed) for at, signed in found[0][3]]
+            [GuidedSamples(which, at, signed) for at, signed in found[0][3]]
             if torch.is_grad_enabled()
             else []
         )
         middle = float((known.body.key_points.mean(0) - rays.origins[0]).norm())
-        return Picture(self.refine(colour, through, depth, middle), through, depth, guided)
+        return FieldPicture(self.refine(colour, through, depth, middle), through, depth, guided)
 
     def _limits(
-        self, known: Known, camera: Cameras, rays: Rays, z: Tensor
+        self, known: EncodedPerson, camera: Cameras, rays: Rays, z: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return where rays are looked at from (R,), to (R,), and where they meet the body (R,),
         distances in m."""
-        if not self.model.boundaries:
-            middle = ((known.body.key_points.mean(0) - rays.origins) * rays.directions).sum(1)
-            return (middle - AROUND).clamp_min(NEAR), middle + AROUND, middle
         interval = known.own.boundaries.interval(camera)
         begin_at, end, body = (
             (x.flatten() / z).clamp(max=_FAR) for x in (interval.begin, interval.end, interval.body)
@@ -163,7 +166,7 @@ class EgHumanNerf(FieldNetwork):
 
     def _along(
         self,
-        known: Known,
+        known: EncodedPerson,
         rays: Rays,
         limits: tuple[Tensor, Tensor, Tensor],
         generator: torch.Generator | None,
@@ -171,21 +174,23 @@ class EgHumanNerf(FieldNetwork):
         """Return colours before black (R, 3), transmittance (R,), sums of weight times distance
         (R,), and samples."""
         first, last, body = (x[:, None] for x in limits)
-        count = self.model.samples
+        count = PARAMS.samples
         shifts = torch.full((len(rays), count), 0.5, device="cpu")
         if generator is not None:
             shifts = torch.rand(shifts.shape, generator=generator, device="cpu")
         at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
         points = (rays.origins[:, None] + rays.directions[:, None] * at[..., None]).flatten(0, 1)
         looked = known.seen.look(points)
-        prior = self._prior(known, points, at, body)
+        prior = _heights(known, points, at)
         closest = prior.amin(1, keepdim=True)
         held = looked.alpha.amin(0).view(at.shape).amax(1, keepdim=True)
-        whole = Ray(first, last, body, closest, held)
+        whole = RayContext(first, last, body, closest, held)
         hints = self._hints(looked, prior, at, whole)
         guide = self.guide(torch.cat([mean_and_variance(looked.features), hints], -1))
-        signed = prior + LIMIT * guide.view(at.shape)
-        near = expected_surface(at.detach(), signed.detach())[:, None] + at.new_tensor(OFFSETS)
+        signed = prior + PARAMS.limit * guide.view(at.shape)
+        near = expected_surface(at.detach(), signed.detach())[:, None] + at.new_tensor(
+            PARAMS.offsets
+        )
         closer, colours = self._surface(known, rays, near, (at, signed), whole)
         opacity = opacities(near, closer, self.sharpness.exp())
         through = torch.cumprod(torch.cat([torch.ones_like(opacity[:, :1]), 1 - opacity], 1), 1)
@@ -194,7 +199,12 @@ class EgHumanNerf(FieldNetwork):
         return colour, through[:, -1], (weights * near).sum(1), [(at, signed), (near, closer)]
 
     def _surface(
-        self, known: Known, rays: Rays, at: Tensor, guide: tuple[Tensor, Tensor], whole: Ray
+        self,
+        known: EncodedPerson,
+        rays: Rays,
+        at: Tensor,
+        guide: tuple[Tensor, Tensor],
+        whole: RayContext,
     ) -> tuple[Tensor, Tensor]:
         """Return signed ray distances (R, K), m, and colours (R, K, 3) of samples at distances (R,
         K)."""
@@ -206,15 +216,15 @@ class EgHumanNerf(FieldNetwork):
         hidden = (
             depth
             > at_pixels(known.own.depths, grid, "nearest")[..., 0].where(looked.alpha > 0, _FAR)
-            + HIDDEN_BY
+            + PARAMS.hidden_by
         )
         apart = between(rays.directions.repeat_interleave(at.shape[1], 0), points, centers)
         facts = torch.cat([hidden[..., None].to(apart), apart], -1)
         logits = self.attention(torch.cat([looked.features, facts], -1))[..., 0]
         weights = (logits - 1e4 * (hidden & ~hidden.all(0))).softmax(0)
-        hints = self._hints(looked, self._prior(known, points, at, whole.body), at, whole)
+        hints = self._hints(looked, _heights(known, points, at), at, whole)
         found = self.surface(torch.cat([mean_and_variance(looked.features, weights), hints], -1))
-        signed = interpolated(*guide, at) + LIMIT * found[:, 0].view(at.shape)
+        signed = interpolated(*guide, at) + PARAMS.limit * found[:, 0].view(at.shape)
         own = torch.cat([looked.rgb, looked.features[..., -FINE:]], -1)
         both = torch.cat([mean_and_variance(own, weights), found[:, 1:]], -1).expand(
             len(own), -1, -1
@@ -222,32 +232,27 @@ class EgHumanNerf(FieldNetwork):
         colours = blended(self.blend(torch.cat([own, both, facts], -1))[..., 0], looked.rgb, hidden)
         return signed, colours.view(*at.shape, 3)
 
-    def _prior(self, known: Known, points: Tensor, at: Tensor, body: Tensor) -> Tensor:
-        """Return the signed ray distances (R, K) that learning begins with, of points (R K, 3) at
-        distances (R, K).
-
-        Their heights above the body, which also say something where a ray passes beside it; without
-        boundaries the distances to the middle of the key points.
-        """
-        if not self.model.boundaries:
-            return (body - at).clamp(-AROUND, AROUND)
-        return known.own.boundaries.height(points).view(at.shape).clamp(-LIMIT, LIMIT)
-
-    def _hints(self, looked: Look, prior: Tensor, at: Tensor, ray: Ray) -> Tensor:
+    def _hints(self, looked: PointFeatures, prior: Tensor, at: Tensor, ray: RayContext) -> Tensor:
         """Return (R K, HINTS): the distance to the body in any direction and along the ray, where
         in its interval a sample is, how near the ray comes to the body, and if silhouettes hold the
         sample, and any of the ray."""
-        limit = OUTWARDS if self.model.boundaries else AROUND
-        along = (ray.body - at).clamp(-limit, limit) / OUTWARDS
+        along = (ray.body - at).clamp(-OUTWARDS, OUTWARDS) / OUTWARDS
         place = (at - ray.begin) / (ray.end - ray.begin)
-        parts = [prior / LIMIT, prior.abs() / LIMIT, along, place, ray.closest / LIMIT, ray.held]
+        parts = [
+            prior / PARAMS.limit,
+            prior.abs() / PARAMS.limit,
+            along,
+            place,
+            ray.closest / PARAMS.limit,
+            ray.held,
+        ]
         known = torch.stack([x.expand_as(at) for x in parts], -1).flatten(0, 1)
         return torch.cat([known, looked.alpha.amin(0)[:, None], looked.alpha.mean(0)[:, None]], -1)
 
-    def penalty(self, picture: Picture, image: Image, scale: float) -> Tensor:
+    def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
         """Return the mean error of signed ray distances; rays meet the person where alpha is above
         a half."""
-        if not self.needs_depth or not picture.samples:
+        if not picture.samples:
             return picture.colour.new_zeros(())
         assert image.depth is not None
         assert image.alpha is not None
@@ -257,14 +262,26 @@ class EgHumanNerf(FieldNetwork):
             truth, alpha = (x.flatten()[samples.rays][:, None] for x in (image.depth, image.alpha))
             surface = truth / (scale * z[samples.rays][:, None])
             meets = alpha > 0.5
-            off = (samples.signed - (surface - samples.at).clamp(-LIMIT, LIMIT)).abs()
+            off = (samples.signed - (surface - samples.at).clamp(-PARAMS.limit, PARAMS.limit)).abs()
             # a ray that misses has no distance: one that is large would outweigh those of rays that
             # just meet a limb
-            error = torch.where(meets, off, (CLEAR - samples.signed).relu())
+            error = torch.where(meets, off, (PARAMS.clear - samples.signed).relu())
             counts = ~meets | (truth > 0)
             error = torch.where(counts, error, 0.0)
-            total = total + error.sum() / (LIMIT * samples.at.shape[1] * counts.sum().clamp_min(1))
-        return self.model.srdf_weight * total
+            total = total + error.sum() / (
+                PARAMS.limit * samples.at.shape[1] * counts.sum().clamp_min(1)
+            )
+        return PARAMS.srdf_weight * total
+
+
+def _heights(known: EncodedPerson, points: Tensor, at: Tensor) -> Tensor:
+    """Return the signed ray distances (R, K) that learning begins with, of points (R K, 3) at
+    distances (R, K).
+
+    Their heights above the body, which also say something where a ray passes beside it.
+    """
+    height = known.own.boundaries.height(points).view(at.shape)
+    return height.clamp(-PARAMS.limit, PARAMS.limit)
 
 
 def expected_surface(at: Tensor, signed: Tensor) -> Tensor:

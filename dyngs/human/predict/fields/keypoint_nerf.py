@@ -20,32 +20,47 @@ from torch.nn.functional import grid_sample, max_pool2d, softplus
 
 from dyngs.core.camera import Cameras
 from dyngs.human.body.joints import JOINT_PARENTS
-from dyngs.human.predict.fields.features import (
+from dyngs.human.predict.fields.network import (
+    CHUNK,
     FINE,
+    NEAR,
+    EncodedPerson,
+    FieldNetwork,
+    FieldPicture,
     Perceptron,
-    Seen,
+    SourceFeatures,
     begin,
     between,
     blended,
     mean_and_variance,
 )
-from dyngs.human.predict.fields.keys import KeypointNerfModel
-from dyngs.human.predict.fields.network import CHUNK, NEAR, FieldNetwork, Known, Picture
-from dyngs.human.predict.fields.people import KEY_POINTS, Body, Sources
+from dyngs.human.predict.fields.people import KEY_POINTS, PosedBody, Sources
 from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
 from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
 
-OCTAVES = 3
-CODE = KEY_POINTS * (1 + 2 * OCTAVES)
-REACH = 0.1  # Standard deviation of how far a key point counts, m
+
+@dataclass(frozen=True)
+class KeypointNerfParams:
+    """Sizes and lengths (m)."""
+
+    features: int = 32  # of a pixel of the images
+    width: int = 64  # features of hidden layers
+    step: float = 0.015  # length of a sample of a ray
+    octaves: int = 3  # of sines and cosines of relative depths
+    reach: float = 0.1  # standard deviation of how far a key point counts
+    cells: int = 32  # of the cube around a person, along an axis
+    visible: float = 0.1  # alpha from which an image shows the person
+    densest: float = 100.0  # density, per m, that the network's output is a multiple of
+    thick: float = 0.065  # distance of the surface from the bones at first
+    steep: float = 60.0  # by how much raw densities fall at first, per m from the bones
+    pooled: int = 32  # features of a sample per image
+    geometry: int = 24  # features of what is known about the surface at a sample
+
+
+PARAMS = KeypointNerfParams()
 AROUND = 0.3  # m around the bones that a person fills
-CELLS = 32  # Of the cube around a person, along an axis
-VISIBLE = 0.1  # Alpha from which an image shows the person
-DENSEST = 100.0  # Density, per m, that the network's output is a multiple of
-THICK = 0.065  # How far the surface is from the bones at first, m
-STEEP = 60.0  # By how much raw densities fall at first, per m from the bones
+CODE = KEY_POINTS * (1 + 2 * PARAMS.octaves)
 HINTS = 4  # What is known of a sample from the bones and the silhouettes
-POOLED, GEOMETRY = 32, 24  # Features of a sample per image, and of what is known about its surface
 
 
 @dataclass(frozen=True)
@@ -59,22 +74,21 @@ class Hull:
 class KeypointNerf(FieldNetwork):
     """See the module."""
 
-    def __init__(self, model: KeypointNerfModel, generator: torch.Generator) -> None:
-        super().__init__(model.features)
-        width = model.width
-        colours = 3 + FINE + GEOMETRY
-        self.step = model.step
-        self.per_image = Perceptron(CODE + model.features + FINE, width, width, POOLED)
-        self.geometry = Perceptron(2 * POOLED + HINTS, width, width, 1 + GEOMETRY)
+    def __init__(self, generator: torch.Generator) -> None:
+        super().__init__(PARAMS.features)
+        width = PARAMS.width
+        colours = 3 + FINE + PARAMS.geometry
+        self.per_image = Perceptron(CODE + PARAMS.features + FINE, width, width, PARAMS.pooled)
+        self.geometry = Perceptron(2 * PARAMS.pooled + HINTS, width, width, 1 + PARAMS.geometry)
         self.blend = Perceptron(3 * colours + 4, width, width // 2, 1)
         begin(self, generator)
 
-    def prepared(self, seen: Seen, body: Body) -> Hull:
+    def prepared(self, seen: SourceFeatures, body: PosedBody) -> Hull:
         return hull(seen, body.key_points)
 
     def picture(
-        self, known: Known, camera: Cameras, generator: torch.Generator | None = None
-    ) -> Picture:
+        self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
+    ) -> FieldPicture:
         rays, _ = rays_of(camera)
         if generator is None:
             shifts = rays.origins.new_full((len(rays),), 0.5)
@@ -89,18 +103,20 @@ class KeypointNerf(FieldNetwork):
             first += size
         colour, through, depth = (torch.cat(x) for x in zip(*found, strict=True))
         shape = camera.height, camera.width
-        return Picture(colour.view(*shape, 3), through.view(shape), depth.view(shape))
+        return FieldPicture(colour.view(*shape, 3), through.view(shape), depth.view(shape))
 
-    def _along(self, known: Known, rays: Rays, shifts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _along(
+        self, known: EncodedPerson, rays: Rays, shifts: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return colours before black (R, 3), transmittance (R,), and sums of weight times distance
         (R,)."""
         seen = known.seen
         own = known.own
-        samples = march(rays, shifts, own.space, own.occupied, Steps(NEAR, self.step))
+        samples = march(rays, shifts, own.space, own.occupied, Steps(NEAR, PARAMS.step))
         learns = torch.is_grad_enabled()
         with torch.no_grad():  # which samples are worth it takes their densities alone
             samples = kept_samples(
-                samples, (seen.alpha(places(samples, own.space)) > VISIBLE).all(0)
+                samples, (seen.alpha(places(samples, own.space)) > PARAMS.visible).all(0)
             )[0]
             points = places(samples, own.space)
             code = spatial_code(points, known.body.key_points, seen.sources)
@@ -118,8 +134,8 @@ class KeypointNerf(FieldNetwork):
         drawn = composite(densities, colours, samples)
         return drawn.colour, drawn.transmittance, drawn.depth
 
-    def _geometry(self, known: Known, points: Tensor, code: Tensor) -> Tensor:
-        """Return (M, 1 + GEOMETRY): raw densities, and what is known of the surface at points (M,
+    def _geometry(self, known: EncodedPerson, points: Tensor, code: Tensor) -> Tensor:
+        """Return (M, 1 + PARAMS.geometry): raw densities, and what is known of the surface at points (M,
         3).
 
         Densities begin with those of limbs of one thickness.
@@ -128,11 +144,13 @@ class KeypointNerf(FieldNetwork):
         bone = from_bones(points, known.body.key_points)[:, None]
         per_image = self.per_image(torch.cat([code, looked.features], -1))
         held = torch.stack([looked.alpha.amin(0), looked.alpha.mean(0)], -1)
-        hints = torch.cat([bone / REACH, (bone / REACH).square(), held], -1)
+        hints = torch.cat([bone / PARAMS.reach, (bone / PARAMS.reach).square(), held], -1)
         found = self.geometry(torch.cat([mean_and_variance(per_image), hints], -1))
-        return torch.cat([found[:, :1] + STEEP * (THICK - bone), found[:, 1:]], -1)
+        return torch.cat([found[:, :1] + PARAMS.steep * (PARAMS.thick - bone), found[:, 1:]], -1)
 
-    def _colours(self, seen: Seen, geometry: Tensor, points: Tensor, directions: Tensor) -> Tensor:
+    def _colours(
+        self, seen: SourceFeatures, geometry: Tensor, points: Tensor, directions: Tensor
+    ) -> Tensor:
         """Return (M, 3) colours: of the images, blended."""
         looked = seen.look(points)
         count = len(seen.sources)
@@ -147,7 +165,7 @@ class KeypointNerf(FieldNetwork):
 
 def density(geometry: Tensor) -> Tensor:
     """Return (M,) densities, per m, of raw ones in the first column."""
-    return DENSEST * softplus(geometry[:, 0])
+    return PARAMS.densest * softplus(geometry[:, 0])
 
 
 @torch.no_grad()
@@ -155,17 +173,17 @@ def spatial_code(points: Tensor, key_points: Tensor, sources: Sources) -> Tensor
     """Return the code (V, M, CODE) of points (M, 3): their depths relative to each key point (J,
     3), in each camera.
 
-    dz, then sine and cosine of pi 2^l dz of each octave l, all times exp(-d^2 / (2 REACH^2)) with
+    dz, then sine and cosine of pi 2^l dz of each octave l, all times exp(-d^2 / (2 PARAMS.reach^2)) with
     the distance d in m.
     """
     apart = points[:, None] - key_points
-    weight = (-apart.square().sum(-1) / (2 * REACH**2)).exp()[None]
+    weight = (-apart.square().sum(-1) / (2 * PARAMS.reach**2)).exp()[None]
     axes = sources.cam_from_world[:, 2, :3]
     dz = (axes @ apart.view(-1, 3).T).view(len(axes), *apart.shape[:2])
     sine = (math.pi * dz).sin()
     cosine = (math.pi * dz).cos()
     parts = [dz]
-    for octave in range(OCTAVES):
+    for octave in range(PARAMS.octaves):
         if octave:
             sine, cosine = 2 * sine * cosine, 1 - 2 * sine.square()
         parts += [sine, cosine]
@@ -173,7 +191,7 @@ def spatial_code(points: Tensor, key_points: Tensor, sources: Sources) -> Tensor
 
 
 @torch.no_grad()
-def hull(seen: Seen, key_points: Tensor) -> Hull:
+def hull(seen: SourceFeatures, key_points: Tensor) -> Hull:
     """Return the cells of a cube that hold a place which all images show as the person.
 
     They are no further than ``AROUND`` from the bones between the key points (J, 3).
@@ -182,13 +200,13 @@ def hull(seen: Seen, key_points: Tensor) -> Hull:
     high = key_points.amax(0)
     half = float((high - low).max()) / 2 + AROUND
     x, y, z = ((low + high) / 2).tolist()
-    space = Space((x, y, z), half, 1, CELLS)
-    axis = (torch.arange(CELLS, device=low.device) + 0.5) * (2 * half / CELLS) - half
+    space = Space((x, y, z), half, 1, PARAMS.cells)
+    axis = (torch.arange(PARAMS.cells, device=low.device) + 0.5) * (2 * half / PARAMS.cells) - half
     z, y, x = torch.meshgrid(*(axis + middle for middle in reversed(space.centre)), indexing="ij")
     middles = torch.stack([x, y, z], -1).view(-1, 3)
     grid, depth = seen.projected(middles)
     sources = seen.sources
-    reach = half / CELLS * math.sqrt(3)
+    reach = half / PARAMS.cells * math.sqrt(3)
     occupied = torch.ones(len(middles), dtype=torch.bool, device=low.device)
     for i in range(len(sources)):
         nearest = max(float(depth[i].min()), NEAR)
@@ -198,7 +216,7 @@ def hull(seen: Seen, key_points: Tensor) -> Hull:
         alpha = max_pool2d(alpha, (1, 2 * pixels + 1), 1, (0, pixels))
         occupied &= (
             grid_sample(alpha, grid[i][None, None], mode="nearest", align_corners=False)[0, 0, 0]
-            > VISIBLE
+            > PARAMS.visible
         )
     where = occupied.nonzero()[:, 0]
     occupied[where] = from_bones(middles[where], key_points) < AROUND

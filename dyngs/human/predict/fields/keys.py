@@ -22,16 +22,6 @@ class FieldPredictorModel(ModelSection):
         le=16,
         description="images that a person is predicted from; each training example has 2 to so many",
     )
-    features: int = Field(
-        default=32, ge=8, le=256, multiple_of=8, description="features of a pixel of the images"
-    )
-    width: int = Field(default=64, ge=8, le=256, description="features of hidden layers")
-    patch: int = Field(
-        default=32,
-        ge=16,
-        le=512,
-        description="side of the part of an image that a step is about, px",
-    )
     lr: Positive = Field(default=2e-3, description="highest learning rate of AdamW (one cycle)")
 
 
@@ -43,9 +33,6 @@ class KeypointNerfModel(FieldPredictorModel):
         description="a network that predicts a field of a person, placed by key points (KeypointNeRF; "
         "docs/people_network.md)",
     )
-    step: float = Field(
-        default=0.015, gt=0, le=1, description="length of a sample of a ray, m of the body"
-    )
 
 
 class EgHumanNerfModel(FieldPredictorModel):
@@ -55,21 +42,6 @@ class EgHumanNerfModel(FieldPredictorModel):
         default="eg_human_nerf",
         description="a network that predicts a field of a person from few samples around a body (EG-HumanNeRF; "
         "docs/people_network.md)",
-    )
-    samples: int = Field(
-        default=16, ge=4, le=256, description="samples of a ray that say where the surface is"
-    )
-    boundaries: bool = Field(
-        default=True,
-        description="look between a dilated and an eroded body alone; false: 50 cm around the person",
-    )
-    visibility: bool = Field(
-        default=True, description="images from which the body hides a sample do not count"
-    )
-    srdf_weight: float = Field(
-        default=0.2,
-        ge=0,
-        description="weight of the error of signed ray distances, by depth maps, over 5 cm",
     )
 
 

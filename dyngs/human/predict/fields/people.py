@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
+import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.config import DataConfig
@@ -21,10 +24,10 @@ from dyngs.data.read import read_capture
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import rest_shape
+from dyngs.human.body.mesh import Fragments, rasterize, vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
-from dyngs.human.predict.gps.pairs import around
-from dyngs.human.predict.gps.rectification import cropped
+from dyngs.human.predict.gps.rectification import around, cropped
 
 KEY_POINTS = 22
 """Joints that are key points: those of the body, which SMPL, SMPL-H and SMPL-X have in common."""
@@ -34,7 +37,7 @@ MISFIT = 0.25  # Of the size of a silhouette, how far its box may be from that o
 
 
 @dataclass(frozen=True)
-class Body:
+class PosedBody:
     """A posed body in a world of metres."""
 
     key_points: Tensor  # (J, 3)
@@ -76,7 +79,7 @@ class Person:
     template: BodyTemplate  # in the person's shape
     motion: CapturedMotion
     images: ImageLoader
-    _bodies: dict[int | None, tuple[Body, float]] = field(default_factory=dict)
+    _bodies: dict[int | None, tuple[PosedBody, float]] = field(default_factory=dict)
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -87,13 +90,13 @@ class Person:
             self.motion.clip, self.motion.rows[-1 if view.frame is None else view.frame]
         )
 
-    def body_in(self, view: View) -> tuple[Body, float]:
+    def body_in(self, view: View) -> tuple[PosedBody, float]:
         """Return the body in the pose of ``view``, and how many world units are a metre; kept."""
         if view.frame not in self._bodies:
             self._bodies[view.frame] = self._posed(view)
         return self._bodies[view.frame]
 
-    def _posed(self, view: View) -> tuple[Body, float]:
+    def _posed(self, view: View) -> tuple[PosedBody, float]:
         pose = self.pose_in(view)
         body = self.template
         vertices = body.vertices
@@ -104,7 +107,7 @@ class Person:
         shift = pose.trans / pose.scale
         joints = apply_transforms(moves, body.joints)[:KEY_POINTS] + shift
         posed = apply_transforms(blend_transforms(body.weights, moves), vertices) + shift
-        return Body(joints, posed, body.faces), float(pose.scale)
+        return PosedBody(joints, posed, body.faces), float(pose.scale)
 
 
 def person_of(data: DataConfig, template: BodyTemplate) -> Person:
@@ -170,7 +173,7 @@ def sources_of(images: Sequence[Image], scale: float) -> Sources:
     return Sources(rgba, poses, intrinsics)
 
 
-def require_shown(name: str, image: Image, body: Body, scale: float) -> None:
+def require_shown(name: str, image: Image, body: PosedBody, scale: float) -> None:
     """Raise DyngsError, for the capture ``name``, unless an image shows a person where the body is
     (world units in m).
 
@@ -241,3 +244,112 @@ def moments(views: Sequence[View]) -> dict[tuple[int | None, float | None], list
 def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
     """Return ``count`` of the views of a ring, evenly around it from the one at ``first`` on."""
     return [ring[(first + round(i * len(ring) / count)) % len(ring)] for i in range(count)]
+
+
+OUTWARDS, INWARDS = 0.06, 0.04  # How far the copies are from the mesh, m
+_NEAREST = 0.05  # Least depth of what is drawn, m
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Where the rays of H x W pixels may meet a person, as depths in m; infinite where they do
+    not."""
+
+    begin: Tensor  # (H, W) where they come in
+    end: Tensor  # (H, W) where they are surely inside, or come out
+    body: Tensor  # (H, W) where they meet the body itself
+
+
+class Boundaries:
+    """The meshes of a body."""
+
+    def __init__(self, body: PosedBody) -> None:
+        self._body = body
+
+    @cached_property
+    def _meshes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Triangles (T, 3), and vertices (M, 3) of the body, of the dilated and of the eroded
+        copy."""
+        vertices, faces = (x.cpu().numpy() for x in (self._body.vertices, self._body.faces))
+        vertices = vertices.astype(np.float64)
+        normals = vertex_normals(vertices, faces)
+        return faces, vertices, vertices + OUTWARDS * normals, vertices - INWARDS * normals
+
+    @cached_property
+    def _tree(self) -> tuple[KDTree, np.ndarray]:
+        """Return the vertices of the body (M, 3) to be searched, and their normals (M, 3)."""
+        faces, vertices, _, _ = self._meshes
+        return KDTree(vertices), vertex_normals(vertices, faces)
+
+    def height(self, points: Tensor) -> Tensor:
+        """Return how far points (N, 3) are from the nearest vertex of the body, m; negative
+        inside."""
+        tree, normals = self._tree
+        places = points.detach().cpu().double().numpy()
+        found, rows = tree.query(places)
+        distance = np.asarray(found)
+        nearest = np.asarray(rows)
+        inside = ((places - tree.data[nearest]) * normals[nearest]).sum(1) < 0
+        return torch.from_numpy(np.where(inside, -distance, distance)).to(points)
+
+    def depth(self, camera: Cameras) -> Tensor:
+        """Return depths (H, W) of the body, m, infinite beside it."""
+        faces, body, _, _ = self._meshes
+        return depths(body, faces, camera)
+
+    def interval(self, camera: Cameras) -> Interval:
+        """Return where the rays of one camera may meet the person."""
+        faces, body, outer, inner = self._meshes
+        begin = depths(outer, faces, camera)
+        out = depths(outer, faces, camera, last=True)
+        # what is thinner than the copy is eroded is turned inside out: its back faces lie before
+        # its front, and where there are cavities (mouth, eyes) and between fingers even front faces
+        # do; nobody is inside before the body
+        surely = depths(inner, faces, camera, front_faces=True)
+        met = depths(body, faces, camera)
+        end = torch.where(
+            met.isfinite(), torch.minimum(torch.maximum(surely, met + INWARDS / 2), out), out
+        )
+        return Interval(begin, torch.maximum(end, begin), met)
+
+
+def depths(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    camera: Cameras,
+    *,
+    last: bool = False,
+    front_faces: bool = False,
+) -> Tensor:
+    """Return depths (H, W) at pixel centres where rays meet a mesh first, m, or ``last``; infinite
+    beside it.
+
+    ``vertices`` (M, 3), ``faces`` (T, 3) anticlockwise from outside. ``front_faces``: of those
+    alone.
+    """
+    pose, k = (x[0].double().cpu().numpy() for x in (camera.cam_from_world, camera.intrinsics))
+    local = vertices @ pose[:3, :3].T + pose[:3, 3]
+    inverse = 1 / np.maximum(local[:, 2], _NEAREST)
+    pixels = (local @ k.T)[:, :2] * inverse[:, None] - 0.5
+    most = 1.01 / _NEAREST
+    corners = np.concatenate([pixels, (most - inverse if last else inverse)[:, None]], axis=1)[
+        faces
+    ]
+    (x0, x1, x2), (y0, y1, y2) = corners[..., 0].T, corners[..., 1].T
+    hidden = (local[faces, 2] <= _NEAREST).any(axis=1)
+    if front_faces:
+        hidden |= (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0) >= 0  # rows go down
+    near_image = (
+        (corners[..., 0].max(1) >= 0)
+        & (corners[..., 0].min(1) <= camera.width - 1)
+        & (corners[..., 1].max(1) >= 0)
+        & (corners[..., 1].min(1) <= camera.height - 1)
+    )
+    corners = corners[near_image & ~hidden]
+    found: Fragments = rasterize(corners, camera.width, camera.height)
+    # linear in the image
+    nearness = 1 / (found.barycentric / corners[found.faces, :, 2]).sum(axis=1)
+    image = np.full(camera.height * camera.width, np.inf)
+    image[found.index] = 1 / (most - nearness if last else nearness)
+    shape = camera.height, camera.width
+    return torch.from_numpy(image.reshape(shape)).to(camera.intrinsics)

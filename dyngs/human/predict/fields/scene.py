@@ -4,7 +4,7 @@ trained."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,14 +19,9 @@ from dyngs.core.tensor_checks import require_indices, require_positive, require_
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
-from dyngs.human.predict.fields.keys import (
-    EgHumanNerfModel,
-    FieldPredictorModel,
-    KeypointNerfModel,
-    PredictedFieldModel,
-)
-from dyngs.human.predict.fields.network import FieldNetwork, Known
-from dyngs.human.predict.fields.people import MULTIPLE, Body, Sources, metric
+from dyngs.human.predict.fields.keys import PredictedFieldModel
+from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
+from dyngs.human.predict.fields.people import MULTIPLE, PosedBody, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
@@ -40,30 +35,22 @@ from dyngs.models.renderable import (
 )
 from dyngs.models.views import evaluation_background
 
-SECTIONS: dict[str, type[FieldPredictorModel]] = {
-    "keypoint_nerf": KeypointNerfModel,
-    "eg_human_nerf": EgHumanNerfModel,
+NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
+    "keypoint_nerf": KeypointNerf,
+    "eg_human_nerf": EgHumanNerf,
 }
+"""Untrained networks, by ``model.kind``."""
 _MOST_VIEWS = 1024
 _MOST_PIXELS = 1 << 26  # Of stored images
-
-
-def network_of(model: FieldPredictorModel, generator: torch.Generator) -> FieldNetwork:
-    """Return the untrained network of a section."""
-    if isinstance(model, EgHumanNerfModel):
-        return EgHumanNerf(model, generator)
-    assert isinstance(model, KeypointNerfModel)
-    return KeypointNerf(model, generator)
 
 
 @dataclass(frozen=True)
 class PredictedField(Renderable):
     """A field of a person in the images ``sources``; it looks the same at every time."""
 
-    model: FieldPredictorModel
     network: FieldNetwork
     sources: Sources
-    body: Body
+    body: PosedBody
     scale: float  # world units per metre
     options: DrawOptions = dataclasses.field(default_factory=lambda: DrawOptions(near=0.0))
     background: Tensor | None = None
@@ -87,7 +74,7 @@ class PredictedField(Renderable):
         return self.sources.rgba.device
 
     @cached_property
-    def known(self) -> Known:
+    def known(self) -> EncodedPerson:
         """What the network knows of the person: the same for all pictures."""
         with torch.no_grad():
             return self.network.look(self.sources, self.body)
@@ -96,11 +83,7 @@ class PredictedField(Renderable):
         tensors = {f"network.{name}": x.detach() for name, x in self.network.state_dict().items()}
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
         tensors |= {f"body.{name}": x for name, x in vars(self.body).items()}
-        numbers = [
-            self.scale,
-            *(float(getattr(self.model, name)) for name in numbers_of(type(self.model))),
-        ]
-        tensors["numbers"] = torch.tensor(numbers, dtype=torch.float64, device="cpu")
+        tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
         return prefixed("field", with_role(tensors, Role.SHARED))
 
     def render(
@@ -138,14 +121,14 @@ class PredictedField(Renderable):
 
 
 @dataclass(frozen=True)
-class Part:
+class ImagePart:
     """A part of a camera's image, with its own camera, and its first row and column."""
 
     camera: Cameras
     corner: tuple[int, int]
 
 
-def around_in(camera: Cameras, box: Tensor) -> Part | None:
+def around_in(camera: Cameras, box: Tensor) -> ImagePart | None:
     """Return the part of an image that shows a box, of corners (2, 3); None: no part does.
 
     Its sides are multiples of ``MULTIPLE`` where the image is as large. All of the image where the
@@ -158,7 +141,7 @@ def around_in(camera: Cameras, box: Tensor) -> Part | None:
     if bool((local[:, 2] <= 0).all()):
         return None
     if bool((local[:, 2] <= 1e-3).any()):
-        return Part(camera, (0, 0))
+        return ImagePart(camera, (0, 0))
     pixels = local[:, :2] / local[:, 2:] * torch.stack([k[0, 0], k[1, 1]]) + k[:2, 2]
     first = pixels.amin(0).floor().tolist()
     last = pixels.amax(0).ceil().tolist()
@@ -171,7 +154,7 @@ def around_in(camera: Cameras, box: Tensor) -> Part | None:
     intrinsics = camera.intrinsics.clone()
     intrinsics[:, 0, 2] -= left
     intrinsics[:, 1, 2] -= top
-    return Part(Cameras(camera.cam_from_world, intrinsics, width, height), (top, left))
+    return ImagePart(Cameras(camera.cam_from_world, intrinsics, width, height), (top, left))
 
 
 def _within(begin: int, end: int, size: int) -> tuple[int, int]:
@@ -182,22 +165,14 @@ def _within(begin: int, end: int, size: int) -> tuple[int, int]:
     return min(begin, size - length), length
 
 
-def numbers_of(section: type[FieldPredictorModel]) -> list[str]:
-    """Return the keys of a network that its scenes need, all numbers."""
-    others = {"kind", "body", "lr", "patch", "source_views"}
-    return [name for name in section.model_fields if name not in others]
-
-
 def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
     """Return what the network ``name`` has predicted. Raises KeyError or ValueError where tensors
     do not fit."""
     stored = checkpoint.part("field")
-    section = SECTIONS[name]
-    keys = numbers_of(section)
-    numbers = require_tensor("numbers", stored["numbers"], (1 + len(keys),), torch.float64)
-    require_positive("scale", numbers[:1])
-    model = section.model_validate(dict(zip(keys, numbers[1:].tolist(), strict=True)))
-    network = network_of(model, torch.Generator())
+    # earlier versions stored sizes of the network behind the scale
+    numbers = require_tensor("numbers", stored["numbers"][:1], (1,), torch.float64)
+    require_positive("scale", numbers)
+    network = NETWORKS[name](torch.Generator())
     own = network.state_dict()
     weights = {
         key: require_tensor(key, stored[f"network.{key}"], tuple(x.shape), x.dtype).clone()
@@ -206,7 +181,7 @@ def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
     network.load_state_dict(weights)
     behind = evaluation_background(checkpoint.info.background, False)[1]
     return PredictedField(
-        model, network, _sources(stored), _body(stored), float(numbers[0]), background=behind
+        network, _sources(stored), _body(stored), float(numbers[0]), background=behind
     )
 
 
@@ -226,11 +201,11 @@ def _sources(stored: Mapping[str, Tensor]) -> Sources:
     )
 
 
-def _body(stored: Mapping[str, Tensor]) -> Body:
+def _body(stored: Mapping[str, Tensor]) -> PosedBody:
     points = require_tensor("key_points", stored["body.key_points"], (None, 3))
     vertices = require_tensor("vertices", stored["body.vertices"], (None, 3))
     faces = require_indices("faces", stored["body.faces"], (None, 3), len(vertices))
-    return Body(points, vertices, faces)
+    return PosedBody(points, vertices, faces)
 
 
 class PredictedModel(Model[PredictedField]):

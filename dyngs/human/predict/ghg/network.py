@@ -6,22 +6,411 @@ Local letters: D input channels, K scaffolds, S texels per side.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
+from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture, View
+from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.observations import Subject
-from dyngs.human.predict.ghg.person import CapturedPerson
-from dyngs.human.predict.ghg.texel_maps import HULL_LIMIT, TexelMaps, from_atlas, to_atlas
-from dyngs.models.convolution import GROUPS, ResidualBlock, begin_weights, upsampled
+from dyngs.human.avatar.observations import FACING_EXPONENT, Subject, project_points
+from dyngs.human.avatar.posing import (
+    BodyPose,
+    Skeleton,
+    frame_pose,
+    pose_blend_shapes,
+    texel_gaussians,
+)
+from dyngs.human.body.atlas import Texels, atlas_texels
+from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.body_reader import rest_shape
+from dyngs.human.body.mesh import interpolate, rasterize, vertex_normals
+from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
+from dyngs.human.keys import HumanPredictorModel
+from dyngs.human.motion.motion import captured_motion
+from dyngs.models.convolution import ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import unit_quats
 
+
+@dataclass(frozen=True)
+class CapturedPerson:
+    """A person with images, as input of a prediction."""
+
+    name: str  # of the capture, for messages
+    body: BodyTemplate  # the template in the person's shape, without a shape space
+    normals: Tensor  # (M, 3) unit normals of its vertices
+    texels: Texels  # P, of that shape
+    mirror: Tensor  # (P,) index of the texel at the mirror image of each
+    heights: tuple[float, ...]  # (K,) of the scaffolds, m, ascending
+    gaussians: Gaussians  # K P grey discs, ordered by scaffold
+    subject: Subject  # skeleton, poses, and the anchors of ``gaussians``
+    views: tuple[View, ...]  # with images, in the order of the split ``train``
+
+    def pose_in(self, view: View) -> BodyPose:
+        """Return the pose of the person in ``view``."""
+        motion = self.subject.motion
+        return frame_pose(motion.clip, motion.rows[-1 if view.frame is None else view.frame])
+
+
+def captured_person(
+    capture: Capture, model: HumanPredictorModel, body: BodyTemplate
+) -> CapturedPerson:
+    """Return the person of a capture, on the template ``body``.
+
+    Raises DyngsError: a capture without body parameters, without silhouettes, or a view without
+    parameters.
+    """
+    if capture.body is None:
+        raise DyngsError(
+            f"{capture.root}: has no body parameters, which a prediction needs; see docs/human.md"
+        )
+    if not capture.has_alpha:
+        raise DyngsError(
+            f"{capture.root}: the images have no silhouettes; give them alpha, see docs/human.md"
+        )
+    given = capture.body["train"]
+    views = capture.splits["train"]
+    vertices, joints = rest_shape(body, given)
+    texels = atlas_texels(body, model.resolution, vertices)
+    heights = tuple(sorted(set(model.scaffold_heights)))
+    gaussians, anchors = texel_gaussians(texels, heights, 0)
+    captured = captured_motion(capture.root, given, views, joints)
+    shape = {
+        "shape_dirs": None,
+        "joint_shape_dirs": None,
+        "expression_dirs": None,
+        "joint_expression_dirs": None,
+    }
+    return CapturedPerson(
+        name=capture.root.name,
+        body=replace(body, vertices=vertices, joints=joints, **shape),
+        normals=torch.from_numpy(
+            vertex_normals(vertices.double().cpu().numpy(), body.faces.cpu().numpy())
+        ).to(vertices),
+        texels=texels,
+        mirror=mirror_texels(texels),
+        heights=heights,
+        gaussians=gaussians,
+        subject=Subject(Skeleton(joints, body.parents), anchors, captured, pose_blend_shapes(body)),
+        views=views,
+    )
+
+
+def spread_views(person: CapturedPerson, count: int, first: int | None = None) -> list[int]:
+    """Return the indices, ascending, of ``count`` views that see as much of the person as possible.
+
+    The views are of one frame, the first with the most views, if it has enough; else of all frames.
+    They maximize the mean over texels of the best view's cosine between normal and view direction,
+    in the rest pose and without occlusion; found greedily, then by exchanging one view after the
+    other. All views if there are fewer than ``count``; the view ``first`` must be among them, and
+    its frame is chosen.
+    """
+    views = person.views
+    frames = [view.frame for view in views]
+    frame = max(dict.fromkeys(frames), key=frames.count) if first is None else frames[first]
+    allowed = [i for i, own in enumerate(frames) if own == frame]
+    if len(allowed) < count:
+        allowed = list(range(len(views)))
+    if len(allowed) <= count:
+        return allowed
+    normals = person.texels.normals[:: max(1, len(person.texels) // 1000)]
+    cosines = normals @ torch.stack([_direction(person, views[i]) for i in allowed], dim=1)
+    start = [] if first is None else [allowed.index(first)]
+    chosen = start + _best(cosines, start, count - len(start))
+    for _ in range(count):
+        before = list(chosen)
+        for place in range(len(start), count):
+            chosen[place] = _best(cosines, chosen[:place] + chosen[place + 1 :], 1)[0]
+        if chosen == before:
+            break
+    return sorted(allowed[i] for i in chosen)
+
+
+def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
+    """Return the columns of ``cosines`` (P, V) that add most to ``others``, chosen greedily."""
+    chosen: list[int] = []
+    for _ in range(count):
+        taken = others + chosen
+        seen = (
+            cosines[:, taken].amax(1, keepdim=True) if taken else cosines.new_zeros(len(cosines), 1)
+        )
+        gain = torch.maximum(cosines, seen).clamp_min(0).mean(0)
+        gain[taken] = -1
+        chosen.append(int(gain.argmax()))
+    return chosen
+
+
+def _direction(person: CapturedPerson, view: View) -> Tensor:
+    """Return the unit vector (3,) from the pelvis to the camera, in the axes of the body at
+    rest."""
+    pose = person.pose_in(view)
+    cam_from_world = torch.from_numpy(view.cam_from_world).to(pose.trans)
+    center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
+    pelvis = pose.scale * person.subject.skeleton.joints[0] + pose.trans
+    return torch.nn.functional.normalize(pose.rotations[0].T @ (center - pelvis), dim=0)
+
+
+_NEAREST = 16  # seen texels that an unseen one takes its colour from
+_TURN = 0.1  # metres that count as much as a turn of the normal by 60 degrees
+_SOFT = 0.01  # distance added, m, so that the very nearest texel does not decide alone
+_UNKNOWN = 0.5
+
+
+def mirror_texels(texels: Texels) -> Tensor:
+    """Return the index (P,) of the texel nearest to the mirror image of each one, at rest."""
+    positions = _positions(texels)
+    found = KDTree(positions).query(positions * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
+    return torch.from_numpy(np.asarray(found, dtype=np.int64)).to(texels.index.device)
+
+
+def colours_nearby(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
+    """Return ``rgb`` (P, 3) where ``seen`` (P,) is positive, elsewhere the mean of seen texels that
+    are near at rest.
+
+    Weights fall with the squared distance, and grow with the cosine at which a texel is seen;
+    normals count, too, so that the sole is not coloured like the instep. 0.5 if nothing is seen.
+    """
+    is_seen = (seen > 0).cpu().numpy()
+    if not is_seen.any():
+        return torch.full_like(rgb, _UNKNOWN)
+    if is_seen.all():
+        return rgb
+    positions = _positions(texels)
+    known = np.flatnonzero(is_seen)
+    count = min(_NEAREST, len(known))
+    found = KDTree(positions[known]).query(positions[~is_seen], k=count)
+    # one neighbour comes without its axis
+    distance, near = (np.asarray(x).reshape(-1, count) for x in found)
+    rows = torch.from_numpy(known[near.astype(np.int64)]).to(rgb.device)
+    weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT).square()
+    filled = rgb.clone()
+    filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(
+        1
+    ) / weight.sum(1)[:, None]
+    return filled
+
+
+def _positions(texels: Texels) -> np.ndarray:
+    """Return the positions and scaled normals (P, 6) of the texels at rest, m."""
+    return torch.cat([texels.points, _TURN * texels.normals], dim=1).double().cpu().numpy()
+
+
+_GRAZING = 0.15  # cosine below which a texel does not count as seen
+HULL_LIMIT = 0.06  # largest distance from the edge of a silhouette that is told apart, m
+# depth tolerance of the visibility test: in m, and in pixels along the surface
+_TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
+
+
+@dataclass(frozen=True)
+class TexelMaps:
+    """Observations in a few images, per texel."""
+
+    # (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel
+    rgb: Tensor
+    # (K, P) largest cosine between normal and view direction, 0 where a texel is hidden
+    seen: Tensor
+    # (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the
+    # frame
+    inside: Tensor
+    # (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m
+    # in the body's size, at most ``HULL_LIMIT`` and at least its negative
+    hull: Tensor
+    # (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the
+    # pelvis
+    offsets: Tensor
+    # (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby
+    nearby: Tensor
+    count: int  # of the views
+
+
+@torch.no_grad()
+def observe_texels(person: CapturedPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
+    """Return the maps of at least one image, each with its body pose. Raises ValueError: no
+    image."""
+    shape = (len(person.heights), len(person.texels))
+    device = person.texels.points.device
+    colour = torch.zeros(*shape, 3, device=device)
+    weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))
+    hull = torch.full(shape, HULL_LIMIT, device=device)
+    offsets: Tensor | None = None
+    count = 0
+    for image, pose in images:
+        distances = _edge_distances(image)
+        count = count + 1
+        scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
+        normals = _at_texels(person, vertex_normals(scaffolds[0], person.body.faces.cpu().numpy()))
+        normals = torch.nn.functional.normalize(normals, dim=1)
+        if offsets is None:
+            offsets = normals @ pose.rotations[0]
+        for level, vertices in enumerate(scaffolds):
+            view = _scaffold_view(person, image, distances, vertices, normals, float(pose.scale))
+            cosine = view.cosine * (view.alpha > 0.5)
+            colour[level] += cosine[:, None] ** FACING_EXPONENT * view.rgb
+            weight[level] += cosine**FACING_EXPONENT * view.alpha
+            seen[level] = torch.maximum(seen[level], cosine)
+            inside[level] += (view.alpha > 0.5).float()
+            in_frames[level] += view.in_frame
+            hull[level] = torch.minimum(
+                hull[level], torch.where(view.in_frame > 0, view.to_edge, HULL_LIMIT)
+            )
+    if offsets is None:
+        raise ValueError("there must be an image")
+    rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
+    fraction = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
+    nearby = colours_nearby(person.texels, rgb[0], seen[0])
+    return TexelMaps(rgb, seen, fraction, hull.clamp_min(-HULL_LIMIT), offsets, nearby, count)
+
+
+def to_atlas(values: Tensor, texels: Texels) -> Tensor:
+    """Return a map (D, S, S) of ``values`` (P, D) at the texels, 0 elsewhere."""
+    atlas = values.new_zeros(values.shape[1], texels.resolution**2)
+    atlas[:, texels.index] = values.T
+    return atlas.unflatten(1, (texels.resolution, texels.resolution))
+
+
+def from_atlas(atlas: Tensor, texels: Texels) -> Tensor:
+    """Return the values (P, D) of a map (D, S, S) at the texels; differentiable."""
+    return atlas.flatten(1).index_select(1, texels.index).T
+
+
+@dataclass(frozen=True)
+class _ScaffoldView:
+    """One scaffold in one view: premultiplied colour (P, 3); alpha, signed distance to the
+    silhouette's edge in m of the body, cosine (0 where hidden), in the frame (P,)."""
+
+    rgb: Tensor
+    alpha: Tensor
+    to_edge: Tensor
+    cosine: Tensor
+    in_frame: Tensor
+
+
+def _scaffold_view(
+    person: CapturedPerson,
+    image: Image,
+    distances: Tensor,
+    vertices: np.ndarray,
+    normals: Tensor,
+    scale: float,
+) -> _ScaffoldView:
+    """Return one image's view of the scaffold with ``vertices`` (M, 3) and ``normals`` (P, 3).
+
+    ``distances`` are those of ``_edge_distances``, ``scale`` is the length of a metre in world
+    units.
+    """
+    camera = image.cameras
+    world = _at_texels(person, vertices)
+    at, depth, in_frame = project_points(world, camera)
+    cosine = (torch.nn.functional.normalize(camera.centers[0] - world, dim=1) * normals).sum(1)
+    alpha = torch.ones_like(image.rgb_premultiplied[..., 0]) if image.alpha is None else image.alpha
+    planes = torch.cat([image.rgb_premultiplied, alpha[..., None], distances[..., None]], dim=-1)
+    found = _sampled(planes, at) * in_frame[:, None]
+    # On a slanted surface the pixels around a texel see nearer points, by their width over the
+    # cosine.
+    slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / camera.intrinsics[
+        0, 0, 0
+    ] / cosine.clamp_min(_GRAZING)
+    is_clear = (
+        depth <= _nearest_depth(vertices, person.body.faces.cpu().numpy(), camera, at) + slack
+    )
+    return _ScaffoldView(
+        rgb=found[:, :3],
+        alpha=found[:, 3],
+        to_edge=found[:, 4] * depth / camera.intrinsics[0, 0, 0] / scale,
+        cosine=torch.where(is_clear & in_frame & (cosine > _GRAZING), cosine, 0.0),
+        in_frame=in_frame.float(),
+    )
+
+
+def _edge_distances(image: Image) -> Tensor:
+    """Return the signed distances (H, W) of pixels to the edge of the silhouette, positive inside,
+    in pixels.
+
+    Next to the edge they are the alpha less a half, which is exact for an upright edge.
+    """
+    if image.alpha is None:
+        return torch.full_like(
+            image.rgb_premultiplied[..., 0], float(max(image.rgb_premultiplied.shape))
+        )
+    alpha = image.alpha.double().cpu().numpy()
+    is_inside = np.pad(alpha > 0.5, 1)
+    within = np.asarray(distance_transform_edt(is_inside))[1:-1, 1:-1] - 0.5
+    beyond = np.asarray(distance_transform_edt(~is_inside))[1:-1, 1:-1] - 0.5
+    signed = np.where(alpha > 0.5, within, -beyond)
+    signed = np.where(np.abs(signed) <= 0.5, alpha - 0.5, signed)
+    return torch.from_numpy(signed).to(image.rgb_premultiplied)
+
+
+def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:
+    """Return the least depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite off
+    the mesh."""
+    projected, distance, _ = project_points(torch.from_numpy(vertices), camera)
+    pixels = projected.double().numpy()
+    depth = distance.double().numpy()
+    corners = np.concatenate([pixels - 0.5, 1.0 / depth[:, None]], axis=1)[faces]
+    # behind the camera: zero area, which covers nothing
+    corners[(depth[faces] <= 0).any(axis=1)] = 0.0
+    fragments = rasterize(corners, camera.width, camera.height)
+    buffer = np.full((camera.height + 2, camera.width + 2), np.inf)
+    buffer[fragments.index // camera.width + 1, fragments.index % camera.width + 1] = interpolate(
+        fragments.barycentric, depth[faces[fragments.faces]][..., None]
+    )[:, 0]
+    least = np.minimum.reduce([buffer[:-1, :-1], buffer[1:, :-1], buffer[:-1, 1:], buffer[1:, 1:]])
+    column, row = (
+        (at[:, i] + 0.5).floor().nan_to_num().clamp(0, size).long()
+        for i, size in enumerate((camera.width, camera.height))
+    )
+    return torch.from_numpy(least)[row.cpu(), column.cpu()].float().to(at.device)
+
+
+def _sampled(image: Tensor, at: Tensor) -> Tensor:
+    """Return values (P, D) of an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear
+    between pixel centres."""
+    size = at.new_tensor([image.shape[1], image.shape[0]])
+    grid = (2 * at / size - 1).nan_to_num().clamp(-2, 2)[None, None]
+    planes = image.permute(2, 0, 1)[None]
+    found = torch.nn.functional.grid_sample(
+        planes, grid, padding_mode="border", align_corners=False
+    )
+    return found[0, :, 0].T
+
+
+def _at_texels(person: CapturedPerson, values: np.ndarray) -> Tensor:
+    """Return values (P, 3) at the texels, interpolated between those (M, 3) at the vertices."""
+    around = (
+        torch.from_numpy(values)
+        .float()
+        .to(person.texels.points.device)[person.body.faces[person.texels.faces]]
+    )
+    return (person.texels.barycentric[..., None] * around).sum(1)
+
+
+def _posed_vertices(person: CapturedPerson, pose: BodyPose, height: float) -> np.ndarray:
+    """Return the vertices (M, 3) of a scaffold in the world."""
+    body = person.body
+    vertices = body.vertices + height * person.normals
+    if body.pose_dirs is not None:
+        features = (pose.rotations[1:] - torch.eye(3, device=vertices.device)).flatten()
+        vertices = vertices + (features @ body.pose_dirs).unflatten(0, (-1, 3))
+    transforms = blend_transforms(
+        body.weights, joint_transforms(body.joints, body.parents, pose.rotations)
+    )
+    return (pose.scale * apply_transforms(transforms, vertices) + pose.trans).cpu().numpy()
+
+
+WIDTHS = (24, 32, 48, 64)
+"""Channels of the U-Net at 1/2, 1/4, ... of the resolution of the atlas."""
+SILHOUETTE_FRACTION = 0.9
+"""Gaussians above the lowest scaffold lie inside at least this fraction of the silhouettes."""
 HEADS = {
     "rotation": 4,
     "scale": 3,
@@ -43,40 +432,31 @@ class AtlasNetwork(nn.Module):
     full resolution the input itself.
     """
 
-    def __init__(
-        self, channels: int, scaffolds: int, widths: Sequence[int], generator: torch.Generator
-    ) -> None:
-        """D ``channels`` come in, K ``scaffolds`` go out; ``widths`` are channels at 1/2, 1/4, ...
-        of the resolution.
+    def __init__(self, channels: int, scaffolds: int, generator: torch.Generator) -> None:
+        """D ``channels`` come in, K ``scaffolds`` go out.
 
-        The network is made on the CPU, with weights of ``generator``. Raises DyngsError: a width is
-        no multiple of 8.
+        The network is made on the CPU, with weights of ``generator``.
         """
         super().__init__()
-        if any(width % GROUPS for width in widths):
-            raise DyngsError(f"model.widths must be multiples of {GROUPS}, not {list(widths)}")
-        self.scaffolds, self.halvings = scaffolds, len(widths)
+        self.scaffolds = scaffolds
         with torch.device("cpu"):
-            self._make_layers(channels, scaffolds, widths)
+            self.down = nn.ModuleList(
+                nn.Sequential(
+                    nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1),
+                    ResidualBlock(width),
+                )
+                for i, (before, width) in enumerate(zip((channels, *WIDTHS), WIDTHS, strict=False))
+            )
+            self.up = nn.ModuleList(
+                nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), ResidualBlock(width))
+                for below, width in zip(WIDTHS[:0:-1], WIDTHS[-2::-1], strict=True)
+            )
+            self.last = nn.Sequential(
+                nn.Conv2d(WIDTHS[0] + channels, WIDTHS[0], 3, padding=1), nn.SiLU()
+            )
+            self.heads = nn.Conv2d(WIDTHS[0], scaffolds * sum(HEADS.values()), 1)
         begin_weights(self, generator)
         nn.init.zeros_(self.heads.weight)
-
-    def _make_layers(self, channels: int, scaffolds: int, widths: Sequence[int]) -> None:
-        self.down = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1),
-                ResidualBlock(width),
-            )
-            for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
-        )
-        self.up = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), ResidualBlock(width))
-            for below, width in zip(widths[:0:-1], widths[-2::-1], strict=True)
-        )
-        self.last = nn.Sequential(
-            nn.Conv2d(widths[0] + channels, widths[0], 3, padding=1), nn.SiLU()
-        )
-        self.heads = nn.Conv2d(widths[0], scaffolds * sum(HEADS.values()), 1)
 
     def forward(self, maps: Tensor) -> Tensor:
         """Return the raw predictions (K, 16, S, S); S must be a multiple of 2 to the number of
@@ -149,23 +529,17 @@ def guessed_colours(
 
 
 def predict_gaussians(
-    person: CapturedPerson,
-    maps: TexelMaps,
-    mean: Tensor,
-    network: AtlasNetwork | None,
-    min_silhouette_fraction: float,
+    person: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork
 ) -> PredictedAvatar:
-    """Return the avatar that ``network`` predicts, differentiable in its weights; None: discs in
-    observed colours.
+    """Return the avatar that ``network`` predicts, differentiable in its weights.
 
     All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they
-    lie inside at least the fraction ``min_silhouette_fraction`` of the silhouettes. Rotations are
-    relative to the tangent frame, scales to the initial Gaussian, means move along the normal.
-    Colours are a weighted mean of those of the images and of the network, which mixes and corrects
-    the ``guessed_colours``; without a network those of the images. ``mean`` is as in
-    ``network_inputs``.
+    lie inside the fraction ``SILHOUETTE_FRACTION`` of the silhouettes. Rotations are relative to
+    the tangent frame, scales to the initial Gaussian, means move along the normal. Colours are a
+    weighted mean of those of the images and of the network, which mixes and corrects the
+    ``guessed_colours``. ``mean`` is as in ``network_inputs``.
     """
-    kept = (maps.inside >= min_silhouette_fraction) & (maps.seen > 0)
+    kept = (maps.inside >= SILHOUETTE_FRACTION) & (maps.seen > 0)
     kept[0] = True
     rows = kept.flatten().nonzero()[:, 0]
     first = person.gaussians.select(rows)
@@ -173,9 +547,6 @@ def predict_gaussians(
     seen = maps.seen.flatten()[rows]
     observed = maps.rgb.flatten(0, 1)[rows]
     guesses = torch.stack(guessed_colours(person, maps, mean))[:, rows % len(person.texels)]
-    if network is None:
-        rgb = torch.where(seen[:, None] > 0, observed, maps.nearby[rows % len(person.texels)])
-        return PredictedAvatar(first.replace(sh=((rgb - 0.5) / SH_C0)[:, None]), subject)
     raw = network(network_inputs(person, maps, mean))
     raw = torch.cat([from_atlas(level, person.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
-from dyngs.core.section import Fraction, Positive, SceneModel
+from dyngs.core.section import Positive, SceneModel
 
 
 class GpsModel(SceneModel):
@@ -22,15 +22,5 @@ class GpsModel(SceneModel):
         ge=32,
         le=4096,
         description="height of the person in the rectified views, px; a Gaussian per pixel",
-    )
-    widths: tuple[
-        Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]
-    ] = Field(
-        default=(24, 40, 64),
-        description="channels of the features of images at 1/4, 1/8 and 1/16 of the resolution",
-    )
-    depth_fraction: Fraction = Field(
-        default=0.4,
-        description="fraction of the steps in which only the depth is learned, from depth maps",
     )
     lr: Positive = Field(default=1e-3, description="highest learning rate of AdamW (one cycle)")

@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from tiny_field_people import NETWORKS, SIZES, field_config
 
-from dyngs.core.errors import DyngsError
-from dyngs.human.predict.fields.boundaries import Boundaries
 from dyngs.human.predict.fields.eg_human_nerf import (
-    LIMIT,
+    PARAMS,
     EgHumanNerf,
     expected_surface,
-    interpolated,
     opacities,
 )
-from dyngs.human.predict.fields.keys import EgHumanNerfModel
-from dyngs.human.predict.fields.network import Known
-from dyngs.human.predict.fields.people import Person, metric, sources_of, window
-from dyngs.training.prediction import network_trainer
+from dyngs.human.predict.fields.network import EncodedPerson
+from dyngs.human.predict.fields.people import Boundaries, Person, metric, sources_of, window
 
 
-def network_with(**keys: object) -> EgHumanNerf:
-    model = EgHumanNerfModel.model_validate(SIZES | NETWORKS["eg_human_nerf"] | keys)
-    return EgHumanNerf(model, torch.Generator().manual_seed(0))
+def network_with() -> EgHumanNerf:
+    return EgHumanNerf(torch.Generator().manual_seed(0))
 
 
-def known(network: EgHumanNerf, person: Person) -> Known:
+def known(network: EgHumanNerf, person: Person) -> EncodedPerson:
     body, scale = person.body_in(person.views[0])
     return network.look(sources_of([person.images[i] for i in (0, 2, 4)], scale), body)
 
@@ -49,13 +41,6 @@ def test_the_surface_is_where_the_distance_first_crosses_zero() -> None:
     torch.testing.assert_close(found, torch.tensor([2.5, 2.25, 2.0, 3.5, 1 + 2 / 3]))
 
 
-def test_values_are_interpolated_along_rays() -> None:
-    at = torch.tensor([[0.0, 1.0, 3.0]])
-    values = torch.tensor([[2.0, 4.0, 0.0]])
-    found = interpolated(at, values, torch.tensor([[-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 9.0]]))
-    torch.testing.assert_close(found, torch.tensor([[2.0, 2.0, 3.0, 4.0, 2.0, 0.0, 0.0]]))
-
-
 def test_a_surface_hides_what_is_behind_it_and_nothing_else_is_opaque() -> None:
     at = torch.linspace(0.9, 1.1, 41)[None]
     hit = opacities(at, 1.0 - at, torch.tensor(400.0))
@@ -65,7 +50,7 @@ def test_a_surface_hides_what_is_behind_it_and_nothing_else_is_opaque() -> None:
     assert float(hit[0, 20]) == pytest.approx(
         1 - 1 / (1 + 2.718281828) / (2.718281828 / (1 + 2.718281828)), abs=1e-2
     )
-    missed = opacities(at, torch.full_like(at, LIMIT), torch.tensor(400.0))
+    missed = opacities(at, torch.full_like(at, PARAMS.limit), torch.tensor(400.0))
     assert float((1 - missed).prod()) > 0.99
 
 
@@ -121,7 +106,7 @@ def test_all_weights_are_learned_alike(person: Person) -> None:
 def test_distances_are_compared_with_depth_maps(person: Person) -> None:
     """None is off where samples say the truth, of rays that meet somebody and of those that
     miss."""
-    network = network_with(srdf_weight=1.0)
+    network = network_with()
     image = window(person.images[1], 12, 4, 16)
     _, scale = person.body_in(person.views[0])
     picture = network.picture(known(network, person), metric(image.cameras, scale))
@@ -141,41 +126,12 @@ def test_distances_are_compared_with_depth_maps(person: Person) -> None:
     for samples in picture.samples:
         surface = (image.depth.flatten() / scale * lengths)[samples.rays][:, None]
         meets = image.alpha.flatten()[samples.rays][:, None] > 0.5
+        limit = PARAMS.limit
         true.append(
             replace(
-                samples, signed=torch.where(meets, surface - samples.at, LIMIT).clamp(-LIMIT, LIMIT)
+                samples,
+                signed=torch.where(meets, surface - samples.at, limit).clamp(-limit, limit),
             )
         )
     told = float(network.penalty(replace(picture, samples=true), image, scale))
     assert told < 1e-4 < off
-    assert float(network_with(srdf_weight=0).penalty(picture, image, scale)) == 0
-
-
-@pytest.mark.parametrize(
-    "keys", [{"boundaries": False}, {"visibility": False}, {"srdf_weight": 0.0}]
-)
-def test_parts_can_be_left_out(folder: Path, tmp_path: Path, keys: dict[str, object]) -> None:
-    config = field_config("eg_human_nerf", folder, tmp_path / "run")
-    model = config.model.model_copy(update=keys)
-    trainer = network_trainer(config.model_copy(update={"model": model}))
-    assert trainer.step().loss > 0
-    assert trainer.bad_gradients == 0
-
-
-def test_depth_maps_are_needed_for_distances(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from dyngs.human.predict.fields import learner
-
-    def without_depth(*given: object) -> Person:
-        found = first(*given)  # pyright: ignore[reportArgumentType]
-        found.images._views = tuple(replace(view, depth_path=None) for view in found.views)
-        return found
-
-    first = learner.person_of
-    monkeypatch.setattr(learner, "person_of", without_depth)
-    with pytest.raises(
-        DyngsError,
-        match=r"has no depth maps, from which eg_human_nerf learns .* model\.srdf_weight=0",
-    ):
-        network_trainer(field_config("eg_human_nerf", folder, tmp_path / "run"))

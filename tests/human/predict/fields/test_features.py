@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
 
-from dyngs.human.predict.fields.features import (
-    ImageEncoder,
-    Perceptron,
-    Seen,
-    begin,
-    between,
+from dyngs.human.predict.fields.network import (
+    SourceFeatures,
     blended,
-    mean_and_variance,
 )
 from dyngs.human.predict.fields.people import Sources
 
 FOCAL, WIDTH, HEIGHT = 20.0, 32, 24
 
 
-def seen() -> Seen:
+def seen() -> SourceFeatures:
     """Two cameras 4 m before and behind the origin; red is the column, green the row, px, times
     alpha 0.5."""
     poses = torch.eye(4).repeat(2, 1, 1)
@@ -31,7 +25,7 @@ def seen() -> Seen:
     )
     half = torch.full_like(rows, 0.5)
     rgba = torch.stack([0.5 * columns, 0.5 * rows, 0 * rows, half]).repeat(2, 1, 1, 1)
-    return Seen(Sources(rgba, poses, k), rgba[:, :3, ::4, ::4], rgba[:, :2, ::2, ::2])
+    return SourceFeatures(Sources(rgba, poses, k), rgba[:, :3, ::4, ::4], rgba[:, :2, ::2, ::2])
 
 
 def test_points_show_what_their_pixels_show() -> None:
@@ -49,18 +43,6 @@ def test_points_show_what_their_pixels_show() -> None:
     assert looked.features.shape == (2, 4, 5)
 
 
-def test_mean_and_variance_are_weighted() -> None:
-    values = torch.rand(3, 5, 2, generator=torch.Generator().manual_seed(0))
-    expected = torch.cat([values.mean(0), values.var(0, unbiased=False)], -1)
-    torch.testing.assert_close(mean_and_variance(values), expected)
-    torch.testing.assert_close(mean_and_variance(values, torch.full((3, 5), 1 / 3)), expected)
-    one = torch.zeros(3, 5)
-    one[1] = 1
-    torch.testing.assert_close(
-        mean_and_variance(values, one), torch.cat([values[1], torch.zeros(5, 2)], -1)
-    )
-
-
 def test_hidden_images_do_not_count_where_another_does() -> None:
     colours = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(0))
     logits = torch.tensor([[0.0] * 4, [1.0] * 4, [5.0] * 4])
@@ -73,35 +55,3 @@ def test_hidden_images_do_not_count_where_another_does() -> None:
     plain = (logits.softmax(0)[..., None] * colours).sum(0)
     torch.testing.assert_close(found[[1, 3]], plain[[1, 3]])
     torch.testing.assert_close(blended(logits, colours), plain)
-
-
-def test_directions_are_compared() -> None:
-    directions = torch.tensor([[0.0, 0.0, 1.0]])
-    found = between(
-        directions,
-        torch.zeros(1, 3),
-        torch.tensor([[0.0, 0.0, -2.0], [0.0, 3.0, 0.0], [0.0, 0.0, 5.0]]),
-    )
-    torch.testing.assert_close(found[:, 0, 3], torch.tensor([1.0, 0.0, -1.0]))
-    torch.testing.assert_close(found[1, 0, :3], torch.tensor([0.0, 1.0, 1.0]) / 2**0.5)
-    assert bool((found[0, 0, :3] == 0).all())
-
-
-def reference(network: Perceptron, x: Tensor) -> Tensor:
-    for i, layer in enumerate(network.layers):
-        x = layer(x) if i == 0 else layer(x.relu())
-    return x
-
-
-def test_networks_begin_the_same_and_are_perceptrons() -> None:
-    one = Perceptron(5, 8, 3)
-    other = Perceptron(5, 8, 3)
-    for network in (one, other):
-        begin(network, torch.Generator().manual_seed(4))
-    x = torch.rand(2, 7, 5, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(one(x), other(x))
-    torch.testing.assert_close(one(x), reference(one, x), atol=1e-5, rtol=1e-5)
-    assert not any(bool(x.any()) for name, x in one.named_parameters() if name.endswith("bias"))
-    encoder: nn.Module = ImageEncoder(16)
-    coarse, fine = encoder(torch.rand(2, 4, 24, 16))
-    assert (coarse.shape, fine.shape) == ((2, 16, 6, 4), (2, 8, 12, 8))

@@ -3,39 +3,33 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
-from dyngs.human.body.joints import JOINT_PARENTS
-from dyngs.human.predict.fields.features import Seen
 from dyngs.human.predict.fields.keypoint_nerf import (
     CODE,
-    REACH,
+    PARAMS,
     KeypointNerf,
-    from_bones,
-    hull,
     spatial_code,
 )
-from dyngs.human.predict.fields.keys import KeypointNerfModel
-from dyngs.human.predict.fields.network import Known
-from dyngs.human.predict.fields.people import Body, Person, Sources, metric, sources_of, window
-
-MODEL = KeypointNerfModel(features=8, width=16, step=0.03)
+from dyngs.human.predict.fields.network import EncodedPerson
+from dyngs.human.predict.fields.people import Person, PosedBody, Sources, metric, sources_of, window
 
 
 @pytest.fixture(scope="module")
 def network() -> KeypointNerf:
-    return KeypointNerf(MODEL, torch.Generator().manual_seed(0))
+    return KeypointNerf(torch.Generator().manual_seed(0))
 
 
-def given(person: Person, views: tuple[int, ...] = (0, 2, 4)) -> tuple[Sources, Body, float]:
+def given(person: Person, views: tuple[int, ...] = (0, 2, 4)) -> tuple[Sources, PosedBody, float]:
     body, scale = person.body_in(person.views[0])
     return sources_of([person.images[i] for i in views], scale), body, scale
 
 
-def known(network: KeypointNerf, person: Person, views: tuple[int, ...] = (0, 2, 4)) -> Known:
+def known(
+    network: KeypointNerf, person: Person, views: tuple[int, ...] = (0, 2, 4)
+) -> EncodedPerson:
     sources, body, _ = given(person, views)
     with torch.no_grad():
         return network.look(sources, body)
@@ -57,23 +51,13 @@ def test_the_code_is_that_of_the_paper(person: Person) -> None:
                 dz = float(depths[0][m] - depths[1][j])
                 near = math.exp(
                     -float((points[m] - body.key_points[j]).double().square().sum())
-                    / (2 * REACH**2)
+                    / (2 * PARAMS.reach**2)
                 )
                 waves = [
                     f(math.pi * 2**octave * dz) for octave in range(3) for f in (math.sin, math.cos)
                 ]
                 expected = torch.tensor([near * x for x in (dz, *waves)])
                 torch.testing.assert_close(found[view, m, j::22], expected, atol=2e-5, rtol=0)
-
-
-def test_bones_are_segments(person: Person) -> None:
-    _, body, _ = given(person)
-    points = body.vertices[::500]
-    steps = torch.linspace(0, 1, 400)[:, None, None]
-    starts = body.key_points[list(JOINT_PARENTS[1:22])]
-    along = (starts + steps * (body.key_points[1:] - starts)).flatten(0, 1)
-    expected = torch.cdist(points, along).amin(1)
-    torch.testing.assert_close(from_bones(points, body.key_points), expected, atol=2e-3, rtol=0)
 
 
 def test_the_cells_hold_the_body_and_nothing_far_away(
@@ -89,15 +73,6 @@ def test_the_cells_hold_the_body_and_nothing_far_away(
         assert float(shown.float().mean()) > 0.5, "at 40 px many vertices lie on the outline"
         assert bool(found.occupied[0, z, y, x][shown].all())
         assert 0.001 < float(found.occupied.float().mean()) < 0.15
-
-
-def test_cells_are_empty_where_an_image_shows_nobody(network: KeypointNerf, person: Person) -> None:
-    sources, body, _ = given(person)
-    rgba = sources.rgba.clone()
-    rgba[1] = 0
-    seen = known(network, person).seen
-    empty = hull(Seen(replace(sources, rgba=rgba), seen.coarse, seen.fine), body.key_points)
-    assert not bool(empty.occupied.any())
 
 
 def test_a_part_of_a_picture_is_the_same_alone(network: KeypointNerf, person: Person) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,20 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.observations import project_points
-from dyngs.human.body.body_reader import default_template
 from dyngs.human.predict.fields.people import (
     KEY_POINTS,
     Person,
     metric,
     moments,
-    person_of,
     require_shown,
     sources_of,
     spread,
-    window,
 )
 
 
@@ -73,28 +68,6 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
         torch.testing.assert_close(sources.centers[i], image.cameras.centers[0] / scale)
 
 
-@pytest.mark.parametrize(
-    ("left", "top", "corner"), [(7, 9, (9, 7)), (-5, 90, (28, 0)), (35, -2, (0, 28))]
-)
-def test_a_window_is_moved_into_the_image(
-    person: Person, left: int, top: int, corner: tuple[int, int]
-) -> None:
-    image = person.images[0]
-    found = window(image, left, top, 12)
-    row, column = corner
-    assert torch.equal(
-        found.rgb_premultiplied, image.rgb_premultiplied[row : row + 12, column : column + 12]
-    )
-    assert found.depth is not None
-    assert image.depth is not None
-    assert torch.equal(found.depth, image.depth[row : row + 12, column : column + 12])
-    point = torch.tensor([[0.1, 0.9, 0.0]])
-    there, whole = (project_points(point, x.cameras)[0] for x in (found, image))
-    torch.testing.assert_close(there + torch.tensor([column, row]), whole)
-    assert window(image, 3, 3, 100).alpha is not None
-    assert window(image, 3, 3, 100).cameras.width == 40
-
-
 def test_views_are_spread_around_a_moment(person: Person) -> None:
     views = person.views
     (ring,) = moments(views).values()
@@ -105,15 +78,6 @@ def test_views_are_spread_around_a_moment(person: Person) -> None:
     assert spread(range(12), 3, 11) == [11, 3, 7]
     later = [replace(view, frame=1, time=0.5) if i % 2 else view for i, view in enumerate(views)]
     assert [len(x) for x in moments(later).values()] == [(len(views) + 1) // 2, len(views) // 2]
-
-
-def test_captures_that_do_not_do_are_refused(folder: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(folder / "s0000" / "p000000", tmp_path / "ann"))
-    (copy / "body_train.npz").unlink()
-    with pytest.raises(
-        DyngsError, match="ann: has no body parameters, which say where the key points are"
-    ):
-        person_of(DataConfig(root=copy), default_template())
 
 
 def test_a_body_that_is_elsewhere_is_told(person: Person) -> None:

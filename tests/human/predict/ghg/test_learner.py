@@ -13,8 +13,8 @@ from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.human.predict.ghg.learner import (
     AtlasLearner,
-    Filmed,
     PersonPredictor,
+    TrainingPerson,
     learner,
     mean_colours,
     new_network,
@@ -45,11 +45,11 @@ def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
 
 def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
     """Every other one of fewer images."""
-    atlas = assembled(config(folder, tmp_path, source_sets=4, source_views=3))
+    atlas = assembled(config(folder, tmp_path, source_views=3))
     assert [[len(choice) for choice in person.choices] for person in atlas.people] == [
-        [3, 1, 3, 2]
+        [3, 1, 3, 2, 3, 1]
     ] * 2
-    assert [person.sitter.name for person in atlas.people] == ["p1", "p2"]
+    assert [person.person.name for person in atlas.people] == ["p1", "p2"]
 
 
 def test_mean_colours_are_those_of_the_people(folder: Path, tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_what_cannot_be_trained_on_is_refused(folder: Path, tmp_path: Path) -> N
     (tmp_path / "junk").mkdir()
     with pytest.raises(DyngsError, match="junk: no capture found"):
         assembled(config(tmp_path, tmp_path / "run"))
-    with pytest.raises(DyngsError, match="multiple of 4"):
+    with pytest.raises(DyngsError, match="multiple of 16"):
         assembled(config(folder, tmp_path / "run", resolution=30))
 
 
@@ -83,7 +83,7 @@ def test_training_on_the_images_of_one_person_shows_them_better(tmp_path: Path) 
     assert trained == again
 
 
-def error_after(shown: Filmed, steps: int) -> float:
+def error_after(shown: TrainingPerson, steps: int) -> float:
     """Sum over three views of the mean absolute error on white, of a network trained on these for
     ``steps``."""
     values = {"data": {"root": "."}, "model": NET, "train": {"alpha_weight": 0.1}}
@@ -92,7 +92,7 @@ def error_after(shown: Filmed, steps: int) -> float:
     views = [0, 3, 6]
     before = {name: x.clone() for name, x in network.state_dict().items()}
     whole = Config.model_validate(values)
-    predictor = PersonPredictor(whole, NET, network, mean, shown, whole.data)
+    predictor = PersonPredictor(whole, network, mean, shown, whole.data)
     predictor.adapt(views, steps)
     unchanged = all(torch.equal(x, before[name]) for name, x in network.state_dict().items())
     assert unchanged == (steps == 0)

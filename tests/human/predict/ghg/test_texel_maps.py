@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -24,17 +22,12 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.mesh import interpolate, rasterize
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.ghg.person import (
+from dyngs.human.predict.ghg.network import (
+    HULL_LIMIT,
     CapturedPerson,
     captured_person,
     colours_nearby,
-    mirror_texels,
-)
-from dyngs.human.predict.ghg.texel_maps import (
-    HULL_LIMIT,
-    from_atlas,
     observe_texels,
-    to_atlas,
 )
 from dyngs.human.synthetic.capture import PosedMesh, render_mesh
 from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
@@ -44,15 +37,6 @@ from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
 def texels() -> Texels:
     body = default_template()
     return atlas_texels(body, 64, body.vertices)
-
-
-def test_mirror_texels_lie_on_the_other_side() -> None:
-    """Within two widths of a texel (3 cm), and mirrored twice most come back to where they were."""
-    points = texels().points
-    mirror = mirror_texels(texels())
-    there = points[mirror] * torch.tensor([-1.0, 1.0, 1.0])
-    assert (there - points).norm(dim=1).quantile(0.95) < 0.06
-    assert (points[mirror[mirror]] - points).norm(dim=1).quantile(0.95) < 0.06
 
 
 def test_unseen_texels_take_colours_from_their_surroundings() -> None:
@@ -69,16 +53,6 @@ def test_unseen_texels_take_colours_from_their_surroundings() -> None:
     away = (seen == 0) & (points[:, 1].abs() > 0.15)
     assert away.sum() > 100
     assert ((found - rgb)[away].abs().amax(1) < 0.01).float().mean() > 0.99
-
-
-def test_few_or_no_seen_texels_are_enough() -> None:
-    rgb = torch.rand(len(texels()), 3)
-    none = torch.zeros(len(texels()))
-    assert (colours_nearby(texels(), rgb, none) == 0.5).all()
-    one = none.clone()
-    one[7] = 1.0
-    torch.testing.assert_close(colours_nearby(texels(), rgb, one), rgb[7].expand_as(rgb))
-    assert torch.equal(colours_nearby(texels(), rgb, none + 1), rgb)
 
 
 SIZE = 96
@@ -210,55 +184,3 @@ def test_a_texel_has_the_colour_of_its_place() -> None:
     hue = [x / x.sum(1, keepdim=True).clamp_min(1e-6) for x in (maps.rgb[0][seen], truth[seen])]
     assert (hue[0] - hue[1]).abs().amax(1).quantile(0.95) < 0.05
     assert seen.float().mean() > 0.4
-
-
-def test_only_what_faces_a_camera_is_seen() -> None:
-    """From before: nothing of the back, and most of the front; more from two sides than from
-    one."""
-    texture = np.full((8, 8, 3), 0.5)
-    aside = sitter(torch.zeros(55, 3))
-    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
-    one = observe_texels(aside, shown[:1])
-    two = observe_texels(aside, shown)
-    normals = aside.texels.normals
-    assert (one.seen[0][normals[:, 2] < -0.2] == 0).all()
-    assert (one.seen[0][normals[:, 2] > 0.8] > 0).float().mean() > 0.85, "not inside the mouth"
-    assert (two.seen >= one.seen).all()
-    assert (two.seen[0] > 0).sum() > 1.2 * (one.seen[0] > 0).sum()
-    assert (one.offsets - normals).norm(dim=1).quantile(0.99) < 0.2, "two ways of averaging normals"
-
-
-def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
-    """At 0 nearly all texels are inside, at 4 cm those that point aside are not; a second view
-    carves more."""
-    texture = np.full((8, 8, 3), 0.5)
-    aside = sitter(torch.zeros(55, 3))
-    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
-    one = observe_texels(aside, shown[:1])
-    two = observe_texels(aside, shown)
-    assert (one.inside[0] == 1).float().mean() > 0.9
-    assert (one.inside[1] == 1).float().mean() < 0.8
-    assert (two.inside[1] == 1).float().mean() < 0.8 * (one.inside[1] == 1).float().mean()
-    body_up = aside.texels.normals[:, 1] > 0.9
-    assert one.inside[1][body_up].mean() < 0.5
-
-
-def test_without_alpha_everything_is_inside() -> None:
-    aside = sitter(torch.zeros(55, 3))
-    rest = torch.zeros(55, 3)
-    opaque = replace(image(rest, np.full((8, 8, 3), 0.5), FRONT), alpha=None)
-    assert (observe_texels(aside, [(opaque, posing(aside))]).inside == 1).all()
-
-
-def test_no_image_is_an_error() -> None:
-    with pytest.raises(ValueError, match="must be an image"):
-        observe_texels(sitter(torch.zeros(55, 3)), [])
-
-
-def test_to_the_atlas_and_back() -> None:
-    texels = sitter(torch.zeros(55, 3)).texels
-    values = torch.rand(len(texels), 3, generator=torch.Generator().manual_seed(0))
-    atlas = to_atlas(values, texels)
-    assert atlas.shape == (3, 64, 64)
-    assert torch.equal(from_atlas(atlas, texels), values)
-    assert (atlas != 0).any(0).sum() == len(texels)

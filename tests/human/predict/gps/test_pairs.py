@@ -10,7 +10,7 @@ import pytest
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
-from dyngs.human.predict.gps.pairs import Pair, around, fault, lessons, neighbours, well_spread
+from dyngs.human.predict.gps.rectification import around, fault, lessons, neighbours, well_spread
 
 
 def view_at(
@@ -32,26 +32,6 @@ def view_at(
 
 
 RING = [view_at(x) for x in (90, 0, 45, 315, 135, 180, 225, 270)]
-
-
-def names(views: list[View], pairs: list[Pair]) -> list[tuple[str, str]]:
-    return [(views[pair.left].name, views[pair.right].name) for pair in pairs]
-
-
-def test_two_views_are_a_pair_in_any_order() -> None:
-    """The one that has the other on its right is left: seen from outside, azimuths grow to the
-    right."""
-    for chosen in ([1, 2], [2, 1]):
-        assert names(RING, neighbours("ann", RING, chosen)) == [("f0_0", "f0_45")]
-
-
-def test_a_ring_is_closed() -> None:
-    pairs = neighbours("ann", RING, range(8))
-    assert len(pairs) == 8
-    assert sorted(i for pair in pairs for i in (pair.left, pair.right)) == sorted([*range(8)] * 2)
-    assert all(RING[pair.left].name != RING[pair.right].name for pair in pairs)
-    open_ring = neighbours("ann", RING, [1, 2, 0])
-    assert names(RING, open_ring) == [("f0_0", "f0_45"), ("f0_45", "f0_90")]
 
 
 def test_order_around_the_vertical_starts_anywhere() -> None:
@@ -76,18 +56,6 @@ def test_what_does_not_suit_is_told(one: View, other: View, message: str) -> Non
     assert message in (fault(one, other) or "")
     with pytest.raises(DyngsError, match=rf"^ann: {one.name} and {other.name} .*{message}"):
         neighbours("ann", [one, other], [0, 1])
-
-
-def test_one_view_is_not_enough() -> None:
-    with pytest.raises(
-        DyngsError, match="ann: depth comes from two neighbouring views at least, not one"
-    ):
-        neighbours("ann", RING, [0])
-
-
-def test_a_view_without_a_neighbour_is_told() -> None:
-    with pytest.raises(DyngsError, match="f0_180"):
-        neighbours("ann", RING, [1, 2, 5])
 
 
 def test_views_are_chosen_around_the_ring() -> None:

@@ -12,13 +12,7 @@ from ray_traced_ball import CENTER, RADIUS, SIZE, ball, exact_depth, pose_at
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.human.predict.gps.rectification import (
-    FACTOR,
-    RectifiedPair,
-    cropped,
-    is_inside,
-    rectified,
-)
+from dyngs.human.predict.gps.rectification import RectifiedPair, cropped, rectified
 
 
 @pytest.fixture(params=[(0, 30, 0.0, 0.0), (-10, 35, 0.15, 4.0), (170, 192, -0.1, -3.0)])
@@ -59,18 +53,6 @@ def test_rows_correspond(pair: RectifiedPair) -> None:
         )
 
 
-def test_windows_are_around_the_person(pair: RectifiedPair) -> None:
-    height, width = pair.alpha.shape[2:]
-    assert height % FACTOR == width % FACTOR == 0
-    assert pair.shift > 0
-    for alpha in pair.alpha[:, 0]:
-        rows, columns = ((alpha > 0.5).any(side).nonzero() for side in (1, 0))
-        assert 58 <= rows.max() - rows.min() <= 66
-        assert (
-            min(rows.min(), height - 1 - rows.max(), columns.min(), width - 1 - columns.max()) >= 3
-        )
-
-
 def test_depth_maps_become_true_offsets(pair: RectifiedPair) -> None:
     assert pair.offsets is not None
     exact = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
@@ -83,13 +65,6 @@ def test_depth_maps_become_true_offsets(pair: RectifiedPair) -> None:
     )
     without = rectified(*(replace(ball(pose_at(x)), depth=None) for x in (0, 30)), 64)
     assert without.offsets is None
-
-
-def test_large_images_are_shrunk_before() -> None:
-    """So that nothing between the pixels of a window is passed over."""
-    small, large = (rectified(ball(pose_at(0)), ball(pose_at(30)), size) for size in (20, 64))
-    assert small.alpha.shape[2] <= 0.6 * large.alpha.shape[2]
-    assert abs(small.focal / large.focal - 20 / 64) < 0.03
 
 
 def test_views_that_cannot_show_the_same_are_refused() -> None:
@@ -110,21 +85,6 @@ def test_views_that_cannot_show_the_same_are_refused() -> None:
     for alpha in (None, torch.zeros(SIZE, SIZE)):
         with pytest.raises(DyngsError, match="b: shows no silhouette"):
             rectified(left, replace(right, alpha=alpha), 64)
-
-
-def test_points_beside_the_person_are_outside() -> None:
-    image = ball(pose_at(40))
-    points = torch.stack(
-        [
-            CENTER,
-            CENTER + torch.tensor([0.0, 0.9 * RADIUS, 0.0]),
-            CENTER + torch.tensor([0, 0.75, 0]),
-        ]
-    )
-    assert is_inside(image, points).tolist() == [True, True, False]
-    assert is_inside(image, torch.tensor([[0.0, 50.0, 0.0], [20.0, 1.0, 20.0]])).all(), (
-        "not in the image: nothing is known"
-    )
 
 
 def aside(camera: Cameras, degrees: float) -> Cameras:

@@ -1,0 +1,391 @@
+"""Masks of a person by the difference from the background, where the camera is fixed: what most
+frames show at a pixel.
+
+Local letters: F frames of one camera, H height, W width."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, shrunk
+from dyngs.core.errors import DyngsError, show
+from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
+from dyngs.data.images.images import (
+    SUFFIXES,
+    area_downscale_uint8,
+    files_in,
+    read_image,
+    target_size,
+)
+from dyngs.data.times import evenly_spaced
+from dyngs.io.write import write_image
+
+NOISE = 1.5  # least standard deviation of the background that is expected, grey levels
+LOW, HIGH = 5.0, 12.0
+"""Differences, in standard deviations, above which a pixel may be, and is, the person: what may be
+is, where it touches what is."""
+GAP = 0.006  # half the width of gaps that are closed, as a fraction of the image's longer side
+OFTEN, MOST_STAYING = 0.4, 0.1
+LEAST_ON_EDGES, LEAST_AREA = 0.8, 1e-3
+"""Limits of what can be trusted. Two people walking by, and on the spot: on edges 0.96 to 1.00, and
+0.56 to 0.79; staying 0.00, and 0.14 to 0.61."""
+LEAST_FRACTION = 0.1  # smaller parts than this fraction of the largest are left out
+SHADE = (0.5, 0.97)  # range of brightness, as a fraction of the background's, that a shadow has
+# largest spread of that fraction, of its mean, in a window where it is a shadow
+SHADE_SPREAD = 0.08
+_WINDOW = 5
+_SMOOTH = 0.7
+UNSURE, SEEN_BARE = 0.02, 3
+"""How far off the outline of a detector may be, in heights of the person, and in how many images a
+pixel must be seen without them."""
+AGREED = 0.8
+"""Overlap (IoU) with a detector's mask below which somebody else before the background is taken for
+the person."""
+EDGE, HALF = 2, 0.45
+"""Width of the rim of a mask, px, and the fraction of the largest difference nearby that a pixel in
+it has: a pixel at the outline is a mixture."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """What a fixed camera sees without the person, in grey levels.
+
+    Attributes:
+        colours: (H, W, 3) float32, the median over time.
+        noise: (H, W) float32, robust standard deviation over time of smoothed images, at least
+            ``NOISE``.
+    """
+
+    colours: np.ndarray
+    noise: np.ndarray
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How well masks separate a person from the background.
+
+    Attributes:
+        on_edges: fraction of the masks' outlines along which the image changes more than the
+            background does: outlines of who is there are edges of the image, outlines of who has
+                left are edges of the background.
+        area: median fraction of the image that the masks cover.
+        staying: fraction of the masks at pixels that they cover in more than ``OFTEN`` of the
+            frames: somebody stands there so long that the background may be a part of them.
+    """
+
+    on_edges: float
+    area: float
+    staying: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the masks can be trusted."""
+        return (
+            self.on_edges > LEAST_ON_EDGES
+            and self.staying < MOST_STAYING
+            and self.area > LEAST_AREA
+        )
+
+
+def background_of(images: np.ndarray) -> Background:
+    """Return the background of a fixed camera from images (F, H, W, 3) uint8, spread over time."""
+    colours = np.median(images, axis=0).astype(np.float32)
+    away = np.stack([_away(colours, image) for image in images])
+    noise = 1.4826 * np.median(away, axis=0)
+    # where somebody passed often the spread is that of the person
+    typical = float(np.median(noise))
+    return Background(colours, np.clip(noise, max(NOISE, typical), 3 * max(NOISE, typical)))
+
+
+def person_mask(
+    background: Background, image: np.ndarray, likely: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the mask (H, W) bool of what stands before the background in an image (H, W, 3) uint8.
+
+    Shadows are left out: there the image is the background times a number that hardly varies. Holes
+    are filled, as clothes may have the colours of the background: all of them, or where a detector
+    sees the person, ``likely`` (H, W).
+    """
+    away = _difference(background, image)
+    sure = ndimage.binary_opening(away > HIGH, iterations=1)
+    seen = ndimage.binary_propagation(sure, mask=away > LOW) & ~_shadow(background, image)
+    radius = max(1, round(GAP * max(away.shape)))
+    # Closing with room around, so that who is cut off by the border is not eaten from there.
+    padded = np.pad(seen, 2 * radius, mode="edge")
+    closed = ndimage.binary_closing(padded, _disc(radius))[
+        2 * radius : -2 * radius, 2 * radius : -2 * radius
+    ]
+    filled = np.asarray(ndimage.binary_fill_holes(closed), bool)
+    opened = ndimage.binary_opening(
+        filled if likely is None else np.where(filled & likely, True, closed), _disc(1)
+    )
+    rim = opened & np.logical_not(ndimage.binary_erosion(opened, iterations=EDGE, border_value=1))
+    opened = opened & np.logical_not(
+        rim & (away < HALF * ndimage.maximum_filter(away, 2 * EDGE + 1))
+    )
+    labels = np.empty(opened.shape, np.int32)
+    if not ndimage.label(opened, output=labels):
+        return opened
+    sizes = np.bincount(labels.ravel())[1:]
+    return np.isin(labels, 1 + np.flatnonzero(sizes >= LEAST_FRACTION * sizes.max()))
+
+
+def outlined(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
+    """Return masks (F, H, W) bool that are near the person as a detector has them, with outlines by
+    the background.
+
+    The background of a pixel is the median of the images in which the detector is sure that nobody
+    is there; where fewer than ``SEEN_BARE`` are, and in images where the background disagrees, as
+    where other people pass, the masks stay as they are. None: the camera moves.
+
+    Args:
+        images: (F, H, W, 3) uint8, of one camera.
+        masks: (F, H, W) bool.
+    """
+    static = np.where(masks[..., None], np.median(images, axis=0).astype(np.uint8), images)
+    if _moves(static):
+        return None
+    heights = [np.ptp(mask.any(1).nonzero()[0]) + 1 for mask in masks if mask.any()]
+    radius = max(2, round(UNSURE * float(np.mean(heights)))) if heights else 2
+    near: np.ndarray = np.stack(
+        [ndimage.binary_dilation(mask, iterations=radius) for mask in masks]
+    ).astype(bool)
+    known = np.logical_not(near).sum(0) >= SEEN_BARE
+    bare = np.ma.masked_array(images, np.broadcast_to(near[..., None], images.shape))
+    colours = np.ma.median(bare, axis=0).filled(0).astype(np.float32)
+    away = np.ma.masked_array(np.stack([_away(colours, image) for image in images]), near | ~known)
+    noise = (1.4826 * np.ma.median(away, axis=0)).filled(NOISE).astype(np.float32)
+    typical = max(NOISE, float(np.median(noise[known]))) if known.any() else NOISE
+    background = Background(colours, np.clip(noise, typical, 3 * typical))
+    core = np.stack([ndimage.binary_erosion(mask, iterations=radius) for mask in masks])
+    reached = np.stack([ndimage.binary_dilation(mask, iterations=2 * radius) for mask in near])
+    different = np.stack(
+        [person_mask(background, x, mask) for x, mask in zip(images, masks, strict=True)]
+    )
+    found = np.where(known, (different & reached) | core, masks)
+    found = np.stack([_touching(mask, own) for mask, own in zip(found, core, strict=True)])
+    common = (found & masks).sum((1, 2))
+    either = (found | masks).sum((1, 2))
+    return np.where((common > AGREED * either)[:, None, None], found, masks)
+
+
+def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
+    """Return the connected parts of a mask (H, W) that hold a pixel of ``core``."""
+    labels, _ = ndimage.label(mask)  # pyright: ignore[reportGeneralTypeIssues]
+    return np.isin(labels, np.unique(labels[core & mask]))
+
+
+def _moves(images: np.ndarray) -> bool:
+    """Whether the camera of images (F, H, W, 3) uint8 moves."""
+    return displaced_by(np.stack([shrunk(image) for image in images])) > STANDS
+
+
+def separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
+    """Return how well masks (F, H, W) bool separate what is in images (F, H, W, 3) uint8 from the
+    background."""
+    on_edges = []
+    slope = _slope(background.colours)
+    for image, mask in zip(images, masks, strict=True):
+        outline = ndimage.binary_dilation(mask) & np.logical_not(
+            ndimage.binary_erosion(mask, border_value=1)
+        )
+        if outline.any():
+            on_edges.append(float((_slope(image.astype(np.float32)) > slope)[outline].mean()))
+    if not on_edges:
+        return Separation(0.0, 0.0, 0.0)
+    often = masks.mean(0) > OFTEN
+    staying = float((masks & often).sum() / masks.sum())
+    area = float(np.median(masks.mean((1, 2))))
+    return Separation(float(np.mean(on_edges)), area, staying)
+
+
+def _difference(background: Background, image: np.ndarray) -> np.ndarray:
+    return _away(background.colours, image) / background.noise
+
+
+def _away(colours: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Return the largest difference (H, W) of any channel, smoothed, grey levels."""
+    return np.abs(ndimage.gaussian_filter(image - colours, (_SMOOTH, _SMOOTH, 0))).max(-1)
+
+
+def _shadow(background: Background, image: np.ndarray) -> np.ndarray:
+    """Return where (H, W) the image is the background, darker."""
+    smooth = ndimage.gaussian_filter(image.astype(np.float32), (_SMOOTH, _SMOOTH, 0))
+    ground = ndimage.gaussian_filter(background.colours, (_SMOOTH, _SMOOTH, 0))
+    ratio = smooth.mean(-1) / np.maximum(ground.mean(-1), 1.0)
+    mean = ndimage.uniform_filter(ratio, _WINDOW)
+    spread = np.sqrt(np.maximum(ndimage.uniform_filter(ratio**2, _WINDOW) - mean**2, 0.0))
+    colour = np.abs(smooth - ratio[..., None] * ground).max(-1) < LOW * background.noise
+    shaded = (mean > SHADE[0]) & (mean < SHADE[1]) & (spread < SHADE_SPREAD * mean) & colour
+    return ndimage.binary_opening(shaded, _disc(1))
+
+
+def _slope(colours: np.ndarray) -> np.ndarray:
+    """Return the largest gradient (H, W) over the channels of colours (H, W, 3), grey levels per
+    pixel."""
+    smooth = ndimage.gaussian_filter(colours, (1.0, 1.0, 0))
+    down, across = np.gradient(smooth, axis=(0, 1))
+    return np.hypot(down, across).max(-1)
+
+
+def _disc(radius: int) -> np.ndarray:
+    rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    return rows**2 + columns**2 <= radius**2 + radius
+
+
+SAMPLES = 41  # images of a camera whose median is the background
+LEAST = 8  # least number of images of a camera
+SIDE = 960  # longest side of the images that are compared, px
+_MOVES = "moves, so there is no background to compare with; give masks of the person (--masks)"
+_ADVICE = "give masks of the person (--masks), or an image of the place without them (--background)"
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """Views of one fixed camera, in order of time, compared at ``size`` (width, height); ``where``:
+    for messages."""
+
+    where: str
+    views: tuple[View, ...]
+    size: tuple[int, int]
+
+    def image(self, view: View) -> np.ndarray:
+        """Return the image (H, W, 3) uint8 of a view at that size."""
+        pixels = read_image(view.image_path, (view.width, view.height))[..., :3]
+        return area_downscale_uint8(pixels, *self.size).numpy()
+
+
+def with_background_masks(
+    capture: Capture, folder: Path, empty: Path | None = None, say: Callable[[str], None] = show
+) -> Capture:
+    """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is
+    made.
+
+    Raises DyngsError: a camera that moves, too few images, or nobody who stands out; says what to
+    add.
+
+    Args:
+        empty: an image without the person, or a folder of one for each camera, whose name ends in
+            the camera's number; None: the median over time.
+    """
+    cameras = _fixed_cameras(capture)
+    plates = {} if empty is None else _plates(empty, cameras)
+    silhouettes: dict[str, Silhouette] = {}
+    worst: Separation | None = None
+    for index, camera in enumerate(cameras):
+        sampled = np.stack(
+            [camera.image(camera.views[i]) for i in evenly_spaced(len(camera.views), SAMPLES)]
+        )
+        background = _background(camera, sampled, plates.get(index))
+        masks = np.stack([person_mask(background, image) for image in sampled])
+        found = separation(background, sampled, masks)
+        _require_clear(camera, found, with_plate=index in plates)
+        worst = found if worst is None or found.on_edges < worst.on_edges else worst
+        for view in camera.views:
+            target = (
+                folder / f"{re.sub(r'[^A-Za-z0-9_-]', '_', view.name)}.{len(silhouettes):06d}.png"
+            )
+            write_image(target, at_size(person_mask(background, camera.image(view)), view))
+            silhouettes[view.name] = Silhouette(target, "white")
+    if worst is not None:
+        say(
+            f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
+            f"images, the person covers {worst.area:.1%} of them"
+        )
+    splits = each_view(
+        capture.splits, lambda view: replace(view, silhouette=silhouettes[view.name])
+    )
+    return capture.replace(splits=splits, has_alpha=True)
+
+
+def _fixed_cameras(capture: Capture) -> list[_Camera]:
+    """Return the cameras of a capture, all of which stand."""
+    cameras = []
+    for number, views in by_camera(capture.splits).items():
+        where = f"{capture.root}, camera {number}"
+        first = views[0]
+        poses = np.stack([view.cam_from_world for view in views])
+        if (
+            not np.allclose(poses, poses[0], atol=1e-6)
+            or len({(view.width, view.height) for view in views}) > 1
+        ):
+            raise DyngsError(f"{where} {_MOVES}")
+        if len(views) < LEAST:
+            raise DyngsError(
+                f"{where}: has {len(views)} images, too few for a background; {_ADVICE}"
+            )
+        cameras.append(
+            _Camera(where, tuple(views), target_size(first.width, first.height, 1.0, SIDE))
+        )
+    return cameras
+
+
+def _plates(empty: Path, cameras: Sequence[_Camera]) -> Mapping[int, Path]:
+    if empty.is_file():
+        if len(cameras) > 1:
+            raise DyngsError(
+                f"{empty}: is one image for {len(cameras)} cameras; give a folder with one each"
+            )
+        return {0: empty}
+    numbers = {
+        int(found[1]): path
+        for path in files_in(empty, SUFFIXES)
+        if (found := re.search(r"(\d{1,9})\D*$", path.stem))
+    }
+    if not numbers:
+        raise DyngsError(f"{empty}: no image of the background there")
+    plates = {}
+    for index, camera in enumerate(cameras):
+        number = camera.views[0].camera_id
+        if number not in numbers:
+            raise DyngsError(f"{empty}: no background for {camera.where}; call it {number}.png")
+        plates[index] = numbers[number]
+    return plates
+
+
+def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Background:
+    if plate is not None:
+        first = camera.views[0]
+        pixels = read_image(plate, (first.width, first.height))[..., :3]
+        height, width = pixels.shape[:2]
+        if abs(width * first.height - height * first.width) > max(first.width, first.height):
+            raise DyngsError(
+                f"{plate}: is {width}x{height}, images of its camera {first.width}x{first.height}; take it with the "
+                "same camera"
+            )
+        if width < camera.size[0]:
+            raise DyngsError(f"{plate}: is smaller than the images; take it with the same camera")
+        colours = area_downscale_uint8(pixels, *camera.size).numpy().astype(np.float32)
+        spread = background_of(sampled).noise
+        return Background(colours, np.full_like(spread, float(np.median(spread))))
+    if _moves(sampled):
+        raise DyngsError(f"{camera.where}: the camera {_MOVES}")
+    return background_of(sampled)
+
+
+def _require_clear(camera: _Camera, found: Separation, *, with_plate: bool) -> None:
+    if found.is_clear if not with_plate else found.area > 0 and found.on_edges > 0.5:
+        return
+    if found.area < 1e-3:
+        raise DyngsError(f"{camera.where}: nobody stands out from the background; {_ADVICE}")
+    raise DyngsError(
+        f"{camera.where}: the person never leaves their place, so that the background there is not seen "
+        f"({found.staying:.0%} of the masks are where somebody is most of the time, {found.on_edges:.0%} of their "
+        f"outlines on edges); {_ADVICE}"
+    )
+
+
+def at_size(mask: np.ndarray, view: View) -> np.ndarray:
+    """Return the mask as grey levels (H, W, 1) uint8 at the size of the view's image, bilinear."""
+    values = torch.from_numpy(mask.astype(np.float32))[None, None]
+    sized = torch.nn.functional.interpolate(
+        values, (view.height, view.width), mode="bilinear", align_corners=False
+    )
+    return (sized[0, 0, :, :, None] * 255).round().to(torch.uint8).numpy()

@@ -1,0 +1,1 @@
+"""Structure from motion by COLMAP: photos, a video of a moving camera, or videos of fixed cameras."""

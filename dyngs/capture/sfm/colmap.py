@@ -1,0 +1,172 @@
+"""Structure from motion: options, the images laid out for COLMAP, its calls, and the folder to work
+in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from dyngs.capture.sfm.photos import Photo
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError
+from dyngs.io.containment import MAX_MEGAPIXELS
+from dyngs.io.write import write_text
+
+if TYPE_CHECKING:
+    import pycolmap
+
+LENS = "SIMPLE_RADIAL"
+"""COLMAP's name of the lens model that is fitted."""
+LONGEST_SIDE, MAX_FEATURES = 1600, 8192
+"""Images are shrunk to so many px for finding so many SIFT features at most; poses refer to the
+full size."""
+SEED = 0
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """Options of pose estimation.
+
+    Attributes:
+        matching: pairs that are compared; auto = all of up to 60 photos or 24 frames, beyond that
+            neighbours by name (some far ones, too) and those that look alike; sequential = the same
+            without what looks alike.
+        num_frames: images to take at most from a video, None = 100; of several videos time steps,
+            None = ``times.MOST_STEPS``, fewer for many cameras.
+        masks: folder of masks of the photos, named as in captures; white = keep. None without.
+        starts: of several videos: camera to the second at which its video begins; None: as in
+            ``videos.json``, else found.
+        num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is
+            always the same.
+        follow_links: photos and videos may be links that lead out of their folder.
+        max_megapixels: larger images and videos are refused.
+    """
+
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    num_frames: int | None = None
+    masks: Path | None = None
+    starts: Mapping[str, float] | None = None
+    num_threads: int = 0
+    follow_links: bool = False
+    max_megapixels: float = MAX_MEGAPIXELS
+
+
+@dataclass(frozen=True)
+class SfmTask:
+    """Images laid out for COLMAP.
+
+    Attributes:
+        database: COLMAP's; made where it is missing.
+        images: folder of upright images, ``names`` in order; ``photos``: the same ones, with their
+            tags.
+        is_video: they are frames of a video.
+        masks: folder of masks ``NAME.png``, white = keep; None without.
+    """
+
+    database: Path
+    images: Path
+    names: Sequence[str]
+    photos: Sequence[Photo]
+    options: SfmOptions
+    report: ReportProgress = report_nothing
+    is_video: bool = False
+    masks: Path | None = None
+
+    @property
+    def side(self) -> int:
+        """Longest side of an image, in pixels."""
+        return max((max(photo.header.size) for photo in self.photos), default=0)
+
+    @property
+    def has_one_lens(self) -> bool:
+        """Whether all images share a lens: of a video, or of the same size, camera model and focal
+        length (EXIF)."""
+        kinds = {
+            (p.header.upright_size, p.header.tags.model, p.header.tags.focal_px)
+            for p in self.photos
+        }
+        return self.is_video or len(kinds) == 1
+
+
+def feature_options(num_threads: int, side: int, count: int) -> pycolmap.FeatureExtractionOptions:
+    """Return COLMAP's options for up to ``count`` SIFT features in images of up to ``side`` px, on
+    the CPU."""
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = num_threads or -1
+    extraction.max_image_size = side
+    extraction.sift.max_num_features = count
+    return extraction
+
+
+def matching_options(
+    num_threads: int,
+) -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
+    """Return COLMAP's options for matching on the CPU, and for verification."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    verification = pycolmap.TwoViewGeometryOptions()
+    matching.use_gpu = False
+    matching.num_threads = num_threads or -1
+    verification.ransac.random_seed = SEED
+    return matching, verification
+
+
+def match_listed(
+    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], num_threads: int
+) -> None:
+    """Match pairs of images, given by their places among the names, and verify them; those of
+    before are left."""
+    import pycolmap
+
+    matching, verification = matching_options(num_threads)
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = database.with_name("pairs.txt")
+    write_text(Path(pairing.match_list_path), "".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
+    pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
+
+
+def incremental_options(num_threads: int, seed: int = SEED) -> pycolmap.IncrementalPipelineOptions:
+    """Return COLMAP's options for incremental mapping on the CPU."""
+    import pycolmap
+
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.num_threads = num_threads or -1
+    mapping.random_seed = mapping.mapper.random_seed = mapping.triangulation.random_seed = seed
+    mapping.ba_use_gpu = False
+    return mapping
+
+
+class ColmapError(DyngsError):
+    """COLMAP failed."""
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Keep COLMAP's log out of the terminal, and make it start from a seed; its errors in the block
+    are ours."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    pycolmap.set_random_seed(SEED)
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        lines = str(error).strip().splitlines()
+        if "database factory" in str(error):
+            # all that COLMAP says where it cannot open or fill one
+            raise ColmapError(
+                "COLMAP can make no database there: free some space, or check the disk"
+            ) from error
+        raise ColmapError(
+            f"structure from motion failed: {lines[-1] if lines else error}"
+        ) from error
+    finally:
+        pycolmap.logging.minloglevel = level

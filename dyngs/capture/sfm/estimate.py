@@ -1,0 +1,648 @@
+"""Camera poses for a folder of photos or a video, by COLMAP's structure from motion on the CPU."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from dyngs.capture.sfm.colmap import (
+    LENS,
+    LONGEST_SIDE,
+    MAX_FEATURES,
+    SEED,
+    SfmOptions,
+    SfmTask,
+    feature_options,
+    incremental_options,
+    match_listed,
+    quiet_colmap,
+)
+from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
+from dyngs.capture.sfm.matches import (
+    agreement,
+    angles_deg,
+    matched_pairs,
+    parallax_of,
+    without_movers,
+)
+from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, counted
+from dyngs.data.images.images import read_header
+from dyngs.data.images.video import (
+    colour_notes,
+    frame_seconds,
+    probe_video,
+    read_frames,
+    read_numbered_frames,
+)
+from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.times import write_seconds
+from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.fields import first_few
+from dyngs.io.outputs import new_folder
+from dyngs.io.write import write_image, write_text
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_NUM_FRAMES = 100
+_SMALL_ANGLE_DEG = 1.0
+_MOVING_FRACTION = 0.02
+# parallax, as a fraction of the longest side and in pixels, below which the camera did not move,
+# and below which it hardly moved
+_NO_PARALLAX = (0.0015, 1.0)
+_LITTLE_PARALLAX = (0.008, 2.0)
+_COVERED = 0.5  # fraction of the image that matches must cover to tell that
+
+
+@dataclass(frozen=True)
+class SfmResult:
+    """Result of pose estimation: a capture in COLMAP's layout in the folder ``root``.
+
+    Attributes:
+        unregistered: names of the images without a pose.
+        mean_error_px: mean reprojection error.
+        notes: lines about choices, and about what to film or photograph better.
+    """
+
+    root: Path
+    num_images: int
+    num_registered: int
+    unregistered: tuple[str, ...]
+    num_points: int
+    mean_error_px: float
+    notes: tuple[str, ...]
+
+    def summary(self) -> str:
+        """The result as lines of text."""
+        lines = [
+            f"{self.num_registered} of {self.num_images} images registered, {self.num_points} points, "
+            f"mean error {self.mean_error_px:.2f} px: {self.root}"
+        ]
+        if self.unregistered:
+            lines.append("no pose for " + first_few(self.unregistered))
+        return "\n".join((*lines, *self.notes))
+
+    def write(self, folder: Path) -> None:
+        """Write the result, without its folder, to ``sfm_report.json``."""
+        fields = asdict(self)
+        del fields["root"]
+        write_text(folder / "sfm_report.json", json.dumps(fields, indent=1) + "\n")
+
+
+@dataclass(frozen=True)
+class _Images:
+    """The images in ``capture/images``, names of those that are blurred, and lines on what was
+    taken."""
+
+    photos: list[Photo]
+    blurred: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def estimate_poses(
+    source: Path,
+    out: Path,
+    options: SfmOptions = SfmOptions(),
+    report: ReportProgress = report_nothing,
+) -> SfmResult:
+    """Estimate poses of the images in ``source`` and write a COLMAP capture (``out/images``,
+    ``out/sparse/0``).
+
+    Work is done in a hidden folder next to ``out``; it is renamed at the end, so ``out`` is
+    complete or absent. Of several models the one with most images is kept. Raises DyngsError: too
+    few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
+    registered, with advice.
+
+    Args:
+        source: a folder of photos (subfolders included) or a video file.
+        out: a folder that does not exist, or is empty.
+    """
+    if not source.exists():
+        raise DyngsError(f"no such folder of photos or video: {source}")
+    if options.masks is not None and not options.masks.is_dir():
+        raise DyngsError(f"no such folder of masks: {options.masks}")
+    with (
+        new_folder(out) as capture,
+        staying_within(source, options.follow_links or source.is_file()),
+        images_up_to(options.max_megapixels),
+    ):
+        return _posed_in(capture, source, out, options, report)
+
+
+def _posed_in(
+    capture: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress
+) -> SfmResult:
+    if source.is_file():
+        images = _frames_of(source, capture, options, report)
+    else:
+        gathered, left_out = gather_photos(source, capture / "images", out)
+        images = _Images(gathered, notes=left_out)
+    photos = images.photos
+    if len(photos) < 3:
+        found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *images.notes))
+        raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
+    notes = [*images.notes]
+    with quiet_colmap():
+        masks = options.masks
+        with nullcontext() if masks is None else staying_within(masks, options.follow_links):
+            task = _laid_out(capture, photos, source.is_file(), options, report)
+        find_features(task)
+        match_pairs(task, pairs_to_match(task))
+        notes += _parallax_seen(task)
+        model, more = _mapped(task)
+    _require_depth(model, task)
+    own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
+    missing = _write_model(model, capture, own)
+    notes += [*more, *_advice(missing, images.blurred, task.is_video)]
+    count = len(photos)
+    points = model.reconstruction.num_points3D()
+    result = SfmResult(
+        out, count, count - len(missing), missing, points, model.error_px, tuple(notes)
+    )
+    result.write(capture)
+    shutil.rmtree(task.images.parent)
+    return result
+
+
+def _laid_out(
+    capture: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ReportProgress
+) -> SfmTask:
+    folder = capture / "images"
+    work = capture / "colmap"
+    work.mkdir()
+    found = {} if options.masks is None else find_masks(options.masks)
+    masks = {
+        photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None
+    }
+    if options.masks is not None and not masks:
+        raise DyngsError(
+            f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)"
+        )
+    names = lay_out(photos, folder, work / "images", masks)
+    for name, mask in masks.items():
+        copied(inside(mask).resolve(), folder.with_name("masks") / (name + mask.suffix))
+    used = work / "masks" if masks else None
+    return SfmTask(
+        work / "database.db", work / "images", names, photos, options, report, is_video, used
+    )
+
+
+def _mapped(task: SfmTask) -> tuple[SfmModel, list[str]]:
+    """Return the model, and lines about what was done for it.
+
+    Where it is not good, features that disagree with most of their images are left out, and the
+    better one is kept.
+    """
+    model = mapped(task)
+    notes = []
+    if model is None or needs_more(model, task):
+        still = task.database.with_name("still.db")
+        shutil.copyfile(task.database, still)
+        fraction = without_movers(still, task.side)
+        if fraction >= _MOVING_FRACTION:
+            second = mapped(replace(task, database=still))
+            best = better(model, second)
+            if best is second and second is not None:
+                notes.append(
+                    f"{fraction:.0%} of the features move with something else than the scene and were left out: "
+                    f"{counted(second.registered, 'image')}, {second.error_px:.2f} px"
+                )
+            model = best
+    if model is None:
+        raise DyngsError(
+            f"no poses could be found for {len(task.names)} images: take sharper ones that overlap by two thirds, move "
+            "the camera sideways, do not only rotate it, avoid bare or moving surfaces, or try matching=exhaustive"
+        )
+    return model, notes
+
+
+def _parallax_seen(task: SfmTask) -> list[str]:
+    """Return a line where the camera hardly moved, or where matches may be of something that moves;
+    else none."""
+    fraction, covered = parallax_of(matched_pairs(task.database))
+    if covered < _COVERED:
+        return [
+            f"matches cover only {covered:.0%} of where the images have features: they may be of something "
+            "that moves, which the poses then follow; give masks of it (--masks), or film more of what stands"
+        ]
+    if fraction < max(_NO_PARALLAX[0], _NO_PARALLAX[1] / task.side):
+        raise DyngsError(
+            "the images differ only as if the camera rotated on the spot (or all show one flat surface), which gives "
+            "no depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
+        )
+    if fraction >= max(_LITTLE_PARALLAX[0], _LITTLE_PARALLAX[1] / task.side):
+        return []
+    return [
+        f"the camera hardly moved: near and far things shift by {fraction:.1%} of the image against each other, "
+        f"so depth and focal length are uncertain; {_film(task)} while walking sideways by about a quarter of the "
+        "distance to the scene"
+    ]
+
+
+def _film(task: SfmTask) -> str:
+    return "film" if task.is_video else "take photos"
+
+
+def _require_depth(model: SfmModel, task: SfmTask) -> None:
+    """Check that points are seen from directions that differ, by a lens that there can be."""
+    if not model.has_real_lens:
+        raise DyngsError(
+            "no lens that there can be fits the matches: most of them are probably on something that moves, as a "
+            "person who fills much of the images; give masks of it (--masks), or film what stands"
+        )
+    angles = angles_deg(model.reconstruction)
+    angle = float(np.median(angles)) if len(angles) else 0.0
+    if angle >= _SMALL_ANGLE_DEG:
+        return
+    raise DyngsError(
+        f"the camera hardly moved: half of the points are seen from directions less than {max(angle, 0.1):.1f} degrees "
+        f"apart, which gives no depth; {_film(task)} while walking sideways by about a quarter of the distance to the "
+        "scene"
+    )
+
+
+def _write_model(model: SfmModel, capture: Path, names: dict[str, str]) -> tuple[str, ...]:
+    """Write the model with the images' own names; return the names of images without a pose."""
+    registered = set()
+    for image in model.reconstruction.images.values():
+        image.name = names[image.name]
+        if image.has_pose:
+            registered.add(image.name)
+    sparse = capture / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    model.reconstruction.write(sparse)
+    return tuple(name for name in names.values() if name not in registered)
+
+
+def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool) -> Iterator[str]:
+    """Yield lines about what to film better: images without a pose, or less sharp than others."""
+    if unregistered:
+        more = "move slower there" if is_video else "take more photos around them"
+        yield (
+            f"{len(unregistered)} images without a pose: {more}, unless things that move fill them, or the camera only "
+            "rotated there"
+        )
+    if blurred:
+        more = "more light or a slower hand" if is_video else "take them again"
+        yield f"{len(blurred)} images are much less sharp than the others ({first_few(blurred)}): {more}"
+
+
+def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportProgress) -> _Images:
+    """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
+
+    Two passes, so that only one image is held in memory: the first one measures.
+    """
+    measures = measured(read_frames(video))
+    choice = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
+    if choice.num_frames >= 3 and choice.reach < STILL:
+        raise DyngsError(
+            f"{video}: the camera stands still (the image moves by {choice.reach:.2%} of its width), which "
+            "gives no depth; film while walking sideways around the scene"
+        )
+    names = {index: f"frame_{index:05d}.png" for index in choice.numbers}
+    photos = []
+    for index, rgb in read_numbered_frames(video, choice.numbers):
+        path = capture / "images" / names[index]
+        write_image(path, rgb)
+        photos.append(Photo(path.name, read_header(path), path.name))
+        report("frames of the video", len(photos), len(names))
+    seconds = frame_seconds(video, len(measures))
+    write_seconds(capture, {name: seconds[index] for index, name in names.items()})
+    notes = (*colour_notes([probe_video(video)]), choice.summary())
+    return _Images(photos, tuple(names[index] for index in choice.blurred), notes)
+
+
+# Features, and which images are compared
+
+_AT_ONCE, _MATCHING_CALLS = 8, 16
+# images up to this long are doubled in size for finding features: they have few otherwise
+_SMALL_PX = 1000
+_PEAK = 0.02 / 3
+
+
+def find_features(task: SfmTask) -> None:
+    """Find SIFT features of all images.
+
+    COLMAP is called for some images at a time: it has no callbacks, and its database must not be
+    opened by another copy of SQLite in the same process, whose end would take away COLMAP's locks.
+
+    Images and cameras are entered first, in order: with several threads COLMAP would number them as
+    they are done, and what follows depends on the numbers. Focal lengths of the EXIF tags are taken
+    as first values.
+    """
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions(camera_model=LENS)
+    mode = pycolmap.CameraMode.PER_IMAGE
+    if task.masks is not None:
+        reader.mask_path = task.masks
+    if task.has_one_lens:
+        mode = pycolmap.CameraMode.SINGLE
+    side = min(task.side, LONGEST_SIDE)
+
+    extraction = feature_options(task.options.num_threads, LONGEST_SIDE, MAX_FEATURES)
+    extraction.sift.peak_threshold = _PEAK
+    extraction.sift.first_octave = -1 if side <= _SMALL_PX else 0
+    pycolmap.Database.open(task.database).close()
+    pycolmap.import_images(task.database, task.images, mode, task.names, reader)
+    _enter_focal_lengths(task)
+    count = len(task.names)
+    for first in range(0, count, _AT_ONCE):
+        names = task.names[first : first + _AT_ONCE]
+        pycolmap.extract_features(
+            task.database, task.images, names, camera_mode=mode, reader_options=reader,
+            extraction_options=extraction, device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        task.report("features, images", first + len(names), count)
+
+
+def match_pairs(task: SfmTask, pairs: Sequence[tuple[int, int]]) -> None:
+    """Match pairs of images, given by their places in the order, and verify them; those of before
+    are left."""
+    # of few images at a time: COLMAP prepares each one anew in every call
+    ordered = sorted(set(pairs))
+    step = max(len(ordered) // _MATCHING_CALLS, _AT_ONCE)
+    for first in range(0, len(ordered), step):
+        part = ordered[first : first + step]
+        match_listed(task.database, task.names, part, task.options.num_threads)
+        task.report("matching, pairs", first + len(part), len(ordered))
+
+
+def _enter_focal_lengths(task: SfmTask) -> None:
+    import pycolmap
+
+    tags = dict(zip(task.names, (photo.header.tags for photo in task.photos), strict=True))
+    with pycolmap.Database.open(task.database) as opened:
+        first: dict[int, str] = {}
+        for image in sorted(opened.read_all_images(), key=lambda image: image.name):
+            first.setdefault(image.camera_id, image.name)
+        for camera in opened.read_all_cameras():
+            focal = tags[first[camera.camera_id]].focal_px
+            camera.has_prior_focal_length = focal is not None
+            if focal is not None:
+                params = camera.params.copy()
+                params[list(camera.focal_length_idxs())] = focal
+                camera.params = params
+            opened.update_camera(camera)
+
+
+_EXHAUSTIVE_PHOTOS, _EXHAUSTIVE_FRAMES = 60, 24
+_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+"""Distances in the order of names at which images are compared: dense near, sparse far (loops of a
+few seconds)."""
+# images that look most alike, compared with each one next to its neighbours
+_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24
+_WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
+
+
+def pairs_to_match(task: SfmTask) -> list[tuple[int, int]]:
+    """Return the pairs to match, by places in the order of names, the smaller one first."""
+    matching = task.options.matching
+    count = len(task.names)
+    limit = _EXHAUSTIVE_FRAMES if task.is_video else _EXHAUSTIVE_PHOTOS
+    if matching == "exhaustive" or (matching == "auto" and count <= limit):
+        return list(combinations(range(count), 2))
+    near = [(i, i + step) for step in _STEPS for i in range(count - step)]
+    return near if matching == "sequential" else near + _alike_pairs(task)
+
+
+def _alike_pairs(task: SfmTask) -> list[tuple[int, int]]:
+    """Return pairs of each image with the others that look most alike by their features.
+
+    An image is described by its SIFT descriptors, counted by which of 64 typical ones is nearest
+    (found by k-means among these images), as sums of differences from it (VLAD: Jegou et al. 2010,
+    "Aggregating local descriptors into a compact image representation"). Nothing random is left to
+    chance: the same features give the same pairs.
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(task.database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        found = [
+            np.asarray(opened.read_descriptors(ids[name]).data).astype(np.float32)
+            for name in task.names
+        ]
+    described = _described(found)
+    alike = described @ described.T
+    np.fill_diagonal(alike, -np.inf)
+    pairs = set()
+    for i, row in enumerate(alike):
+        for j in np.argsort(-row, kind="stable")[
+            : _ALIKE_FRAMES if task.is_video else _ALIKE_PHOTOS
+        ].tolist():
+            if np.isfinite(row[j]):
+                pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
+
+
+def _described(descriptors: list[np.ndarray]) -> np.ndarray:
+    """Return (N, D) unit vectors, zero for images without features."""
+    from scipy.cluster.vq import kmeans2, vq
+
+    full = np.concatenate([*descriptors, np.zeros((0, 128), np.float32)])
+    if len(full) == 0:
+        return np.zeros((len(descriptors), 1), np.float32)
+    sample = full[:: max(len(full) // _SAMPLE, 1)]
+    first = sample[np.linspace(0, len(sample) - 1, min(_WORDS, len(sample))).astype(int)]
+    words, _ = kmeans2(sample, first, _ROUNDS, minit="matrix", missing="warn")
+    vectors = np.zeros((len(descriptors), *words.shape), np.float32)
+    for place, own in enumerate(descriptors):
+        if len(own):
+            nearest, _ = vq(own, words)
+            np.add.at(vectors[place], nearest, own - words[nearest])
+    vectors /= np.linalg.norm(vectors, axis=2, keepdims=True) + 1e-6
+    flat = vectors.reshape(len(vectors), -1)
+    return flat / (np.linalg.norm(flat, axis=1, keepdims=True) + 1e-6)
+
+
+# Poses and points from matches
+
+Mapper = Literal["global", "incremental"]
+GOOD_ERROR_PX = 1.5
+"""Mean reprojection error, in pixels of images up to 1,000 px long, above which the other mapping
+is tried, too."""
+# fraction of matched pairs that fit the poses, below which the other mapping is tried, too
+GOOD_AGREEMENT = 0.9
+_TRACKS_PER_IMAGE = 400
+"""Points of an image that global mapping places at first, those seen in most images; the others are
+added to the poses found. All of them take two to three times as long, for the same points in the
+end."""
+_THREADS = 1  # with more, sums are added in another order on each run, and the model differs
+_SAME_ERROR, _SAME_AGREEMENT = 0.05, 0.02
+_FOCALS = (0.2, 10.0)
+
+
+@dataclass(frozen=True)
+class SfmModel:
+    """A model, and the fraction of the matched pairs whose matches fit its poses."""
+
+    reconstruction: pycolmap.Reconstruction
+    agreeing: float
+
+    @property
+    def registered(self) -> int:
+        """Images that have a pose."""
+        return self.reconstruction.num_reg_images()
+
+    @property
+    def has_real_lens(self) -> bool:
+        """Whether focal lengths, as fractions of the longest side, are those of cameras: 0.2 to 10,
+        or said by EXIF."""
+        return all(
+            camera.has_prior_focal_length
+            or _FOCALS[0]
+            <= camera.mean_focal_length() / max(camera.width, camera.height)
+            <= _FOCALS[1]
+            for camera in self.reconstruction.cameras.values()
+        )
+
+    @property
+    def error_px(self) -> float:
+        """Mean reprojection error."""
+        return float(self.reconstruction.compute_mean_reprojection_error())
+
+
+def mapped(task: SfmTask) -> SfmModel | None:
+    """Return the model with most images; None where none could be found.
+
+    Global mapping for a video and incremental mapping for photos, where it is as fast and
+    its poses are nearer to given ones (it breaks videos into pieces). The other one is tried only
+    where the first leaves images out, its poses do not fit the matches of all pairs, or its mean
+    reprojection error is large: see ``better``.
+    """
+    order: tuple[Mapper, Mapper] = (
+        ("global", "incremental") if task.is_video else ("incremental", "global")
+    )
+    first = _found(task, order[0])
+    return (
+        first
+        if first is not None and not needs_more(first, task)
+        else better(first, _found(task, order[1]))
+    )
+
+
+def needs_more(model: SfmModel, task: SfmTask) -> bool:
+    """Whether images are left out, poses do not fit the matches, a lens is none, or the error is
+    large."""
+    bad = (
+        model.registered < len(task.names)
+        or model.agreeing < GOOD_AGREEMENT
+        or not model.has_real_lens
+    )
+    return bad or model.error_px > GOOD_ERROR_PX * max(task.side, 1000) / 1000
+
+
+def better(first: SfmModel | None, second: SfmModel | None) -> SfmModel | None:
+    """Return the model with more images whose pairs agree, then the clearly smaller error, else the
+    first.
+
+    Global mapping may give every image a pose and put a part of them elsewhere: such images must
+    not count.
+    """
+    if first is None or second is None:
+        return first or second
+    if first.has_real_lens != second.has_real_lens:
+        return first if first.has_real_lens else second
+    good = first.registered * first.agreeing
+    other = second.registered * second.agreeing
+    if abs(good - other) > _SAME_AGREEMENT * max(first.registered, second.registered):
+        return first if good > other else second
+    if first.registered != second.registered:
+        return max(first, second, key=lambda model: model.registered)
+    return second if second.error_px < first.error_px * (1 - _SAME_ERROR) else first
+
+
+def _found(task: SfmTask, mapper: Mapper) -> SfmModel | None:
+    """Return the model of one mapper with most images; a failure of its solver counts as no
+    model."""
+    import pycolmap
+
+    folder = task.database.with_name("models") / mapper
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    pycolmap.set_random_seed(SEED)
+    try:
+        best = (_global if mapper == "global" else _incremental)(task, folder)
+    except (RuntimeError, ValueError):
+        best = None
+    if best is None or best.num_reg_images() < 2:
+        return None
+    task.report("poses, images", best.num_reg_images(), len(task.names))
+    return SfmModel(best, agreement(best, task.database, task.side))
+
+
+def _most_images(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    return max(models, key=lambda model: model.num_reg_images(), default=None)
+
+
+def _global(task: SfmTask, folder: Path) -> pycolmap.Reconstruction | None:
+    """Map all images at once, then let incremental mapping refine: it filters points by pixels, not
+    by angles."""
+    import pycolmap
+
+    task.report("poses, images", 0, len(task.names))
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = _THREADS
+    mapper = options.mapper
+    for part in (
+        options,
+        mapper,
+        mapper.rotation_averaging,
+        mapper.global_positioning,
+        mapper.retriangulation,
+    ):
+        part.random_seed = SEED
+    mapper.track_required_tracks_per_view = _TRACKS_PER_IMAGE
+    mapper.bundle_adjustment.ceres.use_gpu = mapper.global_positioning.use_gpu = False
+    best = _most_images(
+        pycolmap.global_mapping(task.database, task.images, folder, options).values()
+    )
+    if best is None or best.num_reg_images() < len(task.names):
+        return best
+    start = folder / "start"
+    start.mkdir()
+    best.write(start)
+    refined = pycolmap.incremental_mapping(
+        task.database, task.images, folder, _options(), input_path=start
+    )
+    kept = _most_images(refined.values())
+    return best if kept is None or kept.num_reg_images() < best.num_reg_images() else kept
+
+
+def _incremental(task: SfmTask, folder: Path) -> pycolmap.Reconstruction | None:
+    import pycolmap
+
+    done = 0
+
+    def told() -> None:
+        nonlocal done
+        done = min(done + 1, len(task.names))
+        task.report("poses, images", done, len(task.names))
+
+    told()  # the second one of the first pair is told by COLMAP
+    found = pycolmap.incremental_mapping(
+        task.database,
+        task.images,
+        folder,
+        _options(),
+        initial_image_pair_callback=told,
+        next_image_callback=told,
+    )
+    return _most_images(found.values())
+
+
+def _options() -> pycolmap.IncrementalPipelineOptions:
+    mapping = incremental_options(_THREADS)
+    mapping.min_model_size = 3
+    mapping.mapper.init_min_num_inliers = 50
+    return mapping

@@ -1,0 +1,130 @@
+"""Photos and videos without poses, given as a capture: their poses are estimated first, and
+cached."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import estimate_poses
+from dyngs.capture.sfm.photos import digest_of, photos_below
+from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
+from dyngs.config import DataConfig
+from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.errors import DyngsError, as_word, counted, reading, show
+from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
+from dyngs.data.read import is_capture
+from dyngs.io.lock import make_once
+from dyngs.io.outputs import note_sources
+from dyngs.io.write import cache_folder
+from dyngs.io.wrong_place import command_for
+
+FEWEST_PHOTOS = 3
+
+
+def with_poses(
+    data: DataConfig,
+    *,
+    needs_times: bool = False,
+    say: Callable[[str], None] = show,
+    report: ReportProgress = report_nothing,
+) -> DataConfig:
+    """Return the options with a capture that has poses as their folder: the same one, unless it has
+    none.
+
+    Photos and videos without poses go through structure from motion once; the same ones are found
+    in the user's cache from then on. Of a folder that holds ``images``, those are the photos: masks
+    and maps next to them are not. Raises DyngsError: photos without times where they are needed,
+    several videos where nothing is to move, or poses that cannot be found.
+
+    Args:
+        data: its ``root`` is a capture of any format, a folder of photos, or a video.
+        needs_times: something is to move, so photos must have an order.
+    """
+    if not is_unposed(data):
+        return data
+    source = data.root / "images" if (data.root / "images").is_dir() else data.root
+    videos = videos_in(source) if is_several_videos(source) else []
+    if videos and not needs_times:
+        raise DyngsError(
+            f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
+            f"data.root={as_word(source)}`, or one video of a camera that moves"
+        )
+    if source.is_dir() and not videos and needs_times and data.times == "files":
+        raise DyngsError(
+            f"{source}: photos have no times, so nothing can move; give data.times=order if their names are in the "
+            "order of time, a video, or train configs/static.yaml"
+        )
+    files = (
+        [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
+    )
+    beside = data.root / "masks"
+    masks = beside if source != data.root and beside.is_dir() else None
+    digest = digest_of(source, files) + ("" if masks is None else digest_of(masks))
+    folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
+
+    def estimate() -> None:
+        say(
+            f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
+        )
+        options = SfmOptions(
+            masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels
+        )
+        if videos:
+            say(poses_of_videos(source, folder, options, report))
+        else:
+            say(estimate_poses(source, folder, options, report).summary())
+
+    make_once(folder, estimate, say, f"{source} has no poses; those of before are in {folder}")
+    note_sources(folder, data.root)
+    return data.model_copy(update={"root": folder})
+
+
+def is_unposed(data: DataConfig) -> bool:
+    """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of
+    captures knows.
+
+    Raises DyngsError: a folder of a single video, which it names; one or two photos.
+    """
+    root = data.root
+    if root.is_file():
+        return root.suffix.lower() in VIDEO_SUFFIXES
+    if data.format != "auto" or not root.is_dir() or is_capture(root):
+        return False
+    if _holds_photos(root):
+        return True
+    videos = videos_in(root)
+    if len(videos) == 1:
+        raise DyngsError(f"{root}: holds one video; give that: data.root={as_word(videos[0])}")
+    photos = [] if videos or command_for(root, captures=False) is not None else photos_below(root)
+    if photos:
+        raise DyngsError(
+            f"{root}: holds {counted(len(photos), 'photo')} and no cameras; a scene needs at least {FEWEST_PHOTOS} "
+            "photos of it from different places, better 50, or a video"
+        )
+    return bool(videos)
+
+
+def is_several_videos(source: Path) -> bool:
+    """Whether ``source`` is a folder of two videos or more, and not of photos."""
+    return source.is_dir() and not _holds_photos(source) and len(videos_in(source)) > 1
+
+
+def is_videos(source: Path) -> bool:
+    """Whether ``source`` is a video file, or a folder of videos that is no capture and holds no
+    photos."""
+    if source.is_file():
+        return source.suffix.lower() in VIDEO_SUFFIXES
+    return (
+        source.is_dir()
+        and not is_capture(source)
+        and not _holds_photos(source)
+        and bool(videos_in(source))
+    )
+
+
+def _holds_photos(folder: Path) -> bool:
+    with reading(folder, "choose another folder or change its permissions"):
+        return len(photos_below(folder)) >= FEWEST_PHOTOS

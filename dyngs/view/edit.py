@@ -1,0 +1,304 @@
+"""The folder Edit of the page: pick points, measure, delete by a box, undo, save. Each browser edits
+for itself; files and runs on disk never change."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import combinations, product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.api.edit import write_part
+from dyngs.core.errors import DyngsError, counted
+from dyngs.data.aim import look_at, perpendicular, with_poses
+from dyngs.export.edit.crop import Box, held_by
+from dyngs.gaussians.scene import GaussianScene
+from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.runs.opened import Opened
+from dyngs.view.layers import Shot, depth_of
+from dyngs.view.views import camera_at, viewpoint_of
+
+if TYPE_CHECKING:
+    from dyngs.view.server import Browsing
+
+_SIZE = 9  # px, width and height of the image whose middle is picked
+_SOLID = 0.5  # opacity below which a ray meets nothing
+_COLOURS = (255, 200, 0), (80, 200, 255)
+_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
+# (12, 2, 3) of a cube
+_EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2) if np.abs(a - b).sum() == 1])
+
+
+def world_of(opened: Opened) -> Similarity:
+    """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of
+    the file itself."""
+    return UNMOVED if opened.captured is None else opened.world
+
+
+def picked(
+    opened: Opened, origin: np.ndarray, direction: np.ndarray, pixel: float, shot: Shot
+) -> np.ndarray | None:
+    """Return the point (3,) of the scene that a ray meets, at the depth that is drawn there; None:
+    it meets nothing.
+
+    Depths are those of centres: the point is exact to about the size of the Gaussians there.
+
+    ``origin``, ``direction``: (3,) of the ray. ``pixel``: rad that a pixel of the image sees.
+    ``shot``: time and part that are shown.
+    """
+    length = float(np.linalg.norm(direction))
+    if not (np.isfinite([*origin, length]).all() and length > 0 and pixel > 0):
+        return None  # browsers may send anything
+    forward = direction / length
+    camera = camera_at((1, 0, 0, 0), origin, 2 * math.atan(0.5 * _SIZE * pixel), (_SIZE, _SIZE))
+    camera = with_poses(camera, look_at(origin, origin + forward, perpendicular(forward))[None])
+    found = depth_of(opened, Shot(camera, shot.time, part=shot.part))
+    depth, alpha = (float(x[_SIZE // 2, _SIZE // 2]) for x in found)
+    return origin + depth * forward if alpha >= _SOLID else None
+
+
+@dataclass
+class Editing:
+    """Picked points, a box, and what is left of the scene ``whole`` after what was deleted.
+
+    Attributes:
+        points: at most two, (3,) each, in the coordinates of the scene.
+        centre, size: (3,) each, of the box, in the coordinates that people mean (``world_of``).
+        steps: (K,) indices into ``whole`` of the Gaussians that were left after each deletion.
+    """
+
+    whole: Opened
+    centre: np.ndarray
+    size: np.ndarray
+    points: list[np.ndarray] = field(default_factory=list)
+    steps: list[Tensor] = field(default_factory=list)
+
+    @property
+    def box(self) -> Box:
+        return Box(self.centre - self.size / 2, self.centre + self.size / 2)
+
+    @property
+    def rows(self) -> Tensor:
+        """(K,) indices of the Gaussians that are left."""
+        return self.steps[-1] if self.steps else torch.arange(len(self.whole.scene), device="cpu")
+
+    @property
+    def left(self) -> Opened:
+        """The scene that is left."""
+        if not self.steps:
+            return self.whole
+        scene: GaussianScene = self.whole.scene
+        return self.whole.showing(scene.select(self.rows.to(scene.device)))
+
+    def pick(self, point: np.ndarray) -> None:
+        """Add a picked point (3,); a third one is the first of a new pair."""
+        self.points = [point] if len(self.points) == 2 else [*self.points, point]
+
+    def delete(self, *, inside: bool) -> int:
+        """Delete what the box holds, or all else; return how many Gaussians go. Raises DyngsError:
+        all would."""
+        kept = held_by(self.box, self.left.scene, world_of(self.whole)) ^ inside
+        if not bool(kept.any()):
+            held = "all of the scene" if inside else "nothing"
+            raise DyngsError(f"nothing would be left: the box holds {held}")
+        gone = len(kept) - int(kept.sum())
+        if gone:
+            self.steps.append(self.rows[kept])
+        return gone
+
+    def file(self, time: float | None) -> bytes:
+        """Return what is left as a .ply, at ``time`` if it moves."""
+        moment = None if self.whole.scene.is_static else time
+        with tempfile.TemporaryDirectory(prefix="dyngs_view_") as folder:
+            path = Path(folder) / "edited.ply"
+            return write_part(self.whole, self.rows, path, moment).path.read_bytes()
+
+    @property
+    def description(self) -> str:
+        """Lines of markdown about the picks, the box and what is left; options of `dyngs edit` that
+        say the same."""
+        world = world_of(self.whole)
+        places = [world.points(point) for point in self.points]
+        # four digits, and as many more as the scene is far away from the origin
+        low, high, *texts = (
+            self._digits(place) for place in (self.box.low, self.box.high, *places)
+        )
+        lines = [f"{name}: `{text}`" for name, text in zip("AB", texts, strict=False)]
+        if len(places) == 2:
+            length = float(np.linalg.norm(places[1] - places[0]))
+            lines.append(f"distance: **{length:.4g} {'m' if self.whole.scaled else 'units'}**")
+            lines.append(f'`--scale "{texts[0]} {texts[1]} LENGTHm"`')
+        lines.append(f"box: `--crop {low} {high}`")
+        total = counted(len(self.whole.scene), "Gaussian")
+        lines.append(f"{len(self.rows):,} of {total} left" if self.steps else total)
+        return "\n\n".join(lines)
+
+    def _digits(self, point: np.ndarray) -> str:
+        distance = float(np.abs(point).max() / self.size.max())
+        digits = 4 + math.ceil(math.log10(max(distance, 1)))
+        return ",".join(f"{x:.{digits}g}" for x in point)
+
+
+def can_be_edited(opened: Opened) -> bool:
+    """Return whether a scene has Gaussians of which a part can be saved: not those of people, or in
+    training."""
+    is_file = opened.path is not None and opened.path.exists()
+    has_gaussians = isinstance(opened.renderable, GaussianScene) and opened.person is None
+    return is_file and has_gaussians and not opened.in_training
+
+
+class EditControls:
+    """Controls and marks of one browser for one scene; ``remove`` takes the marks away."""
+
+    def __init__(self, browsing: Browsing, opened: Opened) -> None:
+        begin = viewpoint_of(opened)
+        world = world_of(opened)
+        extent = begin.extent * world.scale
+        size = np.full(3, float(f"{0.5 * extent:.2g}"))
+        self.editing = Editing(opened, world.points(begin.center), size)
+        self._browsing, self._extent = browsing, begin.extent
+        self._back = world.inverse()
+        self._marks = dict[str, Any]()
+        gui = browsing.client.gui
+        hint = "click on the scene: two points and their distance"
+        pick = gui.add_checkbox("Pick points", False, hint=hint)
+        box = gui.add_checkbox("Box", False, hint="drag its arrows; along the axes of the scene")
+        step = 10.0 ** (math.floor(math.log10(2 * extent)) - 2)
+        longest = step * math.ceil(2 * extent / step)
+        self._sizes = [
+            gui.add_slider(f"Size {axis}", step, longest, step, size[0]) for axis in "xyz"
+        ]
+        self._text = gui.add_markdown(self.editing.description)
+        pick.on_update(lambda _: self._listen(bool(pick.value)))
+        box.on_update(lambda _: self._show_box() if box.value else self._drop("box", "gizmo"))
+        for slider in self._sizes:
+            slider.on_update(lambda _: self._resize())
+        jobs: dict[str, Callable[[], None]] = {
+            "Delete inside": lambda: self._delete(inside=True),
+            "Delete outside": lambda: self._delete(inside=False),
+            "Undo": self._undo,
+            "Save as .ply": self._save,
+        }
+        for name, job in jobs.items():
+            gui.add_button(name).on_click(lambda _, job=job: self._ask(job))
+
+    def remove(self) -> None:
+        self._listen(False)
+        self._drop(*list(self._marks))
+
+    def _ask(self, job: Callable[[], None]) -> None:
+        """Have a job done by the thread that draws; what cannot be done is told."""
+
+        def work() -> None:
+            try:
+                job()
+            except DyngsError as error:
+                self._browsing.notify("Not done", str(error))
+            self._text.content = self.editing.description
+
+        self._browsing.session.ask(work)
+
+    def _listen(self, listens: bool) -> None:
+        scene = self._browsing.client.scene
+        scene.remove_click_callback()
+        if listens:
+            scene.on_click()(lambda event: self._ask(lambda: self._pick(event)))
+        else:
+            self.editing.points = []
+            self._drop("A", "B", "line")
+            self._text.content = self.editing.description
+
+    def _pick(self, event: Any) -> None:
+        session = self._browsing.session
+        if session.eye is None:
+            return
+        pixel = session.eye.fov / session.eye.size[1]
+        origin = np.array(event.ray_origin, np.float64)
+        direction = np.array(event.ray_direction, np.float64)
+        point = picked(session.opened, origin, direction, pixel, session.shot())
+        if point is None:
+            self._browsing.notify("Nothing there", "The scene is not solid at this place.")
+            return
+        self.editing.pick(point)
+        self._drop("A", "B", "line")
+        scene = self._browsing.client.scene
+        points = self.editing.points
+        for name, place, colour in zip("AB", points, _COLOURS, strict=False):
+            radius = 0.008 * float(np.linalg.norm(place - origin))
+            self._marks[name] = scene.add_icosphere(
+                f"/edit/{name}", radius=radius, color=colour, position=place
+            )
+        if len(points) == 2:
+            self._add_lines("line", np.stack(points)[None])
+
+    def _add_lines(self, name: str, ends: np.ndarray, **place: Any) -> None:
+        self._marks[name] = self._browsing.client.scene.add_line_segments(
+            f"/edit/{name}",
+            ends.astype(np.float32),
+            _COLOURS[0],
+            thickness=2,
+            thickness_units="screen",
+            **place,
+        )
+
+    def _show_box(self) -> None:
+        """Show the box and its gizmo, along the axes of the frame."""
+        self._drop("gizmo")
+        self._marks["gizmo"] = gizmo = self._browsing.client.scene.add_transform_controls(
+            "/edit/gizmo",
+            scale=0.3 * self._extent,
+            disable_rotations=True,
+            wxyz=self._back.turn,
+            position=self._back.points(self.editing.centre),
+        )
+        gizmo.on_update(lambda _: self._move(np.array(gizmo.position)))
+        self._show_edges()
+
+    def _show_edges(self) -> None:
+        self._drop("box")
+        edges = _EDGES * self._back.scale * self.editing.size
+        place = self._back.points(self.editing.centre)
+        self._add_lines("box", edges, wxyz=self._back.turn, position=place)
+
+    def _move(self, place: np.ndarray) -> None:
+        if np.isfinite(place).all():
+            self.editing.centre = world_of(self.editing.whole).points(place)
+            self._marks["box"].position = place
+            self._text.content = self.editing.description
+
+    def _resize(self) -> None:
+        self.editing.size = np.array([float(slider.value) for slider in self._sizes])
+        if "box" in self._marks:
+            self._show_edges()
+        self._text.content = self.editing.description
+
+    def _delete(self, *, inside: bool) -> None:
+        gone = self.editing.delete(inside=inside)
+        self._show()
+        self._browsing.notify("Deleted", f"{counted(gone, 'Gaussian')}; Undo brings them back")
+
+    def _undo(self) -> None:
+        if self.editing.steps:
+            self.editing.steps.pop()
+            self._show()
+
+    def _show(self) -> None:
+        self._browsing.loaded = self.editing.left
+        self._browsing.session.show(self.editing.left)
+
+    def _save(self) -> None:
+        data = self.editing.file(self._browsing.session.time)
+        name = f"{self.editing.whole.name.removesuffix('.ply')}_edited.ply"
+        self._browsing.client.send_file_download(name, data, save_immediately=True)
+
+    def _drop(self, *names: str) -> None:
+        for name in names:
+            if name in self._marks:
+                self._marks.pop(name).remove()

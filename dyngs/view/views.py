@@ -1,0 +1,207 @@
+"""Cameras of the viewer: the views of a scene's capture, from where a scene is looked at first, and
+poses of a browser's camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from dyngs.config import DataConfig
+from dyngs.core.camera import Cameras
+from dyngs.data.aim import look_at_point, world_from_cam
+from dyngs.data.capture import View
+from dyngs.data.loader import ImageLoader
+from dyngs.export.choose_path import orbit_around, points_at
+from dyngs.human.avatar.scene import avatar_of
+from dyngs.models.views import training_cameras
+from dyngs.runs.opened import Opened, scene_of_split
+
+MAX_FOV = math.radians(160)
+
+
+@dataclass(frozen=True)
+class CapturedViews:
+    """V views of a capture, each with a camera of the size of training, and their images, also
+    small ones.
+
+    There are no images where those of the capture do not show what the scene plays.
+    """
+
+    views: tuple[View, ...] = ()
+    cameras: tuple[Cameras, ...] = ()
+    images: ImageLoader | None = None
+    thumbnails: ImageLoader | None = None
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(view.name for view in self.views)
+
+    @property
+    def times(self) -> tuple[float | None, ...]:
+        return tuple(view.time for view in self.views)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(V, 4, 4) world to camera."""
+        return np.stack([view.cam_from_world for view in self.views])
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """The camera from which a scene is looked at first, the point (3,) to orbit around, its rough
+    size, and up (3,)."""
+
+    start: Cameras
+    center: np.ndarray
+    extent: float
+    up: np.ndarray
+
+
+def views_of(opened: Opened) -> CapturedViews:
+    """Return the views of a scene's capture, if there is one; without images where a person is in
+    other poses."""
+    if opened.captured is None:
+        return CapturedViews()
+    found = opened.captured.once("views", lambda: _views_of_capture(opened))
+    return found if opened.as_captured else replace(found, images=None)
+
+
+def _views_of_capture(opened: Opened) -> CapturedViews:
+    """Return the views of all splits that show what the scene plays: a person may be filmed in
+    other clips, too."""
+    if opened.missing is not None:
+        return CapturedViews()
+    capture = opened.capture
+    by_name = {}
+    for split in ("train", "val", "test"):
+        views = capture.splits.get(split, ())
+        if views and scene_of_split(opened, capture, split) is opened.renderable:
+            by_name |= {view.name: view for view in views}
+    return captured_views(tuple(by_name.values()), opened.config.data)
+
+
+def captured_views(
+    views: Sequence[View], data: DataConfig, images: ImageLoader | None = None
+) -> CapturedViews:
+    """Return views with their cameras, and what loads their images."""
+    small = data.model_copy(update={"downscale": 1.0, "longest_side": 96, "cache_mb": 256.0})
+    return CapturedViews(
+        tuple(views),
+        tuple(training_cameras(views, data)),
+        images or ImageLoader(views, data),
+        ImageLoader(views, small),
+    )
+
+
+def viewpoint_of(opened: Opened) -> Viewpoint:
+    """Return where to begin: at the first camera of the capture, else where all of the scene is in
+    view."""
+    return (opened.captured or opened).once("viewpoint", lambda: _viewpoint(opened))
+
+
+def _viewpoint(opened: Opened) -> Viewpoint:
+    shown = views_of(opened)
+    if len(shown):
+        poses = torch.from_numpy(shown.poses).float()
+        start = shown.cameras[0]
+        intrinsics = start.intrinsics.expand(len(poses), 3, 3)
+        together = Cameras(poses, intrinsics, start.width, start.height)
+        center = look_at_point(together)
+        eyes = together.centers.double().cpu().numpy()
+        person = avatar_of(opened.renderable)
+        if person is not None:
+            center = person.at(None).means.double().cpu().numpy().mean(0)
+    else:
+        means = points_at(opened.renderable).double().cpu().numpy()
+        start = orbit_around(opened, 1)
+        center = np.median(means[np.isfinite(means).all(1)], axis=0)
+        eyes = start.centers.double().cpu().numpy()
+    extent = float(np.median(np.linalg.norm(eyes - center, axis=1)))
+    up = np.array([0.0, 0.0, 1.0]) if opened.up is None else opened.up[0]
+    return Viewpoint(start, center, extent, up)
+
+
+def has_timeline(opened: Opened) -> bool:
+    """Return whether there are times to choose from, now or later."""
+    may_move = opened.in_training and len(opened.renderable.times) > 1
+    return may_move or not opened.renderable.is_static or opened.person is not None
+
+
+def nearest_view(opened: Opened, camera: Cameras, time: float) -> int:
+    """Return which view of the capture is nearest to one camera in position, viewing direction and,
+    where the scene moves, time.
+
+    As much as a radian between viewing directions weigh half the size of the scene, and half of the
+    times.
+    """
+    shown = views_of(opened)
+    poses = shown.poses
+    own = camera.cam_from_world[0].double().cpu().numpy()
+    centers = centers_of(np.concatenate([own[None], poses]))
+    apart = np.linalg.norm(centers[1:] - centers[0], axis=1)
+    cost = apart / max(viewpoint_of(opened).extent, 1e-9)
+    cost += 0.5 * np.arccos(np.clip(poses[:, 2, :3] @ own[2, :3], -1, 1))
+    if not opened.renderable.is_static:
+        cost += 2.0 * np.array([0.0 if t is None else abs(t - time) for t in shown.times])
+    return int(cost.argmin())
+
+
+def centers_of(poses: np.ndarray) -> np.ndarray:
+    """Return the centres (V, 3) of world-to-camera poses (V, 4, 4)."""
+    return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def camera_at(
+    wxyz: Sequence[float] | np.ndarray,
+    position: Sequence[float] | np.ndarray,
+    fov: float,
+    size: tuple[int, int],
+) -> Cameras:
+    """Return one camera of ``size``, px, at ``position``; ``wxyz``: world from camera; ``fov``:
+    vertical, rad."""
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z = (float(value) for value in wxyz)
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ np.asarray(position, np.float64)
+    width, height = size
+    focal = 0.5 * height / math.tan(0.5 * min(max(fov, 1e-3), MAX_FOV))
+    matrix = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+    poses, matrices = (torch.from_numpy(x).float()[None] for x in (pose, matrix))
+    return Cameras(poses, matrices, width, height)
+
+
+def pose_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotation (4,) wxyz, world from camera, and the centre (3,) of one camera,
+    float64."""
+    from scipy.spatial.transform import Rotation
+
+    (pose,) = world_from_cam(camera)
+    quat = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return quat[[3, 0, 1, 2]], pose[:3, 3]
+
+
+def fitting_fov(camera: Cameras, aspect: float) -> float:
+    """Return the vertical field of view, rad, at which a window of an ``aspect`` shows the full
+    image of one camera."""
+    focal_x, focal_y, _ = camera.intrinsics[0].diagonal().tolist()
+    half = max(0.5 * camera.height / focal_y, 0.5 * camera.width / focal_x / aspect)
+    return min(2 * math.atan(half), MAX_FOV)
+
+
+def look_point(camera: Cameras, begin: Viewpoint) -> np.ndarray:
+    """Return the point (3,) on the axis of one camera to orbit around: as far away as the centre of
+    the scene is deep."""
+    (pose,) = world_from_cam(camera)
+    eye = pose[:3, 3]
+    forward = pose[:3, 2]
+    return eye + max(float((begin.center - eye) @ forward), 0.1 * begin.extent) * forward

@@ -1,0 +1,107 @@
+"""Photos and videos that are given as captures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_captures import write_colmap
+
+from dyngs.capture.sfm import unposed
+from dyngs.capture.sfm.colmap import SfmOptions
+from dyngs.capture.sfm.estimate import SfmResult
+from dyngs.capture.sfm.unposed import with_poses
+from dyngs.cli import main
+from dyngs.config import Config, DataConfig
+from dyngs.config.io import save_config
+from dyngs.core.errors import DyngsError
+from dyngs.export.video import VideoWriter
+from dyngs.io.outputs import SOURCES_NAME
+from dyngs.io.write import cache_folder, write_image
+
+
+@pytest.fixture(autouse=True)
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Structure from motion is not done; what it was asked for is listed."""
+    sources: list[Path] = []
+
+    def estimate(source: Path, out: Path, options: SfmOptions, report: object) -> SfmResult:
+        sources.append(source)
+        write_colmap(out)
+        return SfmResult(out, 3, 3, (), 8, 0.5, ())
+
+    def several(source: Path, out: Path, options: SfmOptions, report: object) -> str:
+        sources.append(source)
+        write_colmap(out)
+        return "4 of 4 cameras have a pose"
+
+    monkeypatch.setattr(unposed, "estimate_poses", estimate)
+    monkeypatch.setattr(unposed, "poses_of_videos", several)
+    return sources
+
+
+def _photos(folder: Path, count: int = 3) -> Path:
+    for i in range(count):
+        write_image(folder / f"photo_{i}.png", np.full((4, 6, 3), i, np.uint8))
+    return folder
+
+
+def _videos(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    for i in range(count):
+        (folder / f"cam{i}.mp4").write_bytes(b"")
+    return folder
+
+
+def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
+    said: list[str] = []
+    data = DataConfig(root=_photos(tmp_path / "photos"))
+    first = with_poses(data, say=said.append)
+    assert cache_folder("poses") in first.root.parents
+    assert "estimated first" in said[0]
+    assert "3 of 3 images" in said[1]
+    assert with_poses(data, say=said.append) == first
+    assert asked == [tmp_path / "photos"]
+    assert "of before" in said[-1]
+    write_image(tmp_path / "photos" / "photo_1.png", np.zeros((4, 8, 3), np.uint8))
+    assert with_poses(data, say=said.append).root != first.root, "a photo has changed"
+    assert len(asked) == 2
+
+
+def test_no_output_replaces_the_video_that_a_run_is_made_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run knows only the folder in the cache, which names the video."""
+    video = tmp_path / "clip.mp4"
+    with VideoWriter(video, fps=10) as writer:
+        writer.add(np.zeros((16, 16, 3), np.uint8))
+    before = video.read_bytes()
+    for _ in ("estimated", "of before"):
+        data = with_poses(DataConfig(root=video), say=lambda _: None)
+        save_config(Config(data=data), tmp_path / "run" / "config.yaml")
+        assert (
+            main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
+        )
+        assert "clip.mp4: is the file that is read" in capsys.readouterr().err
+        (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
+    assert video.read_bytes() == before
+
+
+def test_what_cannot_work_is_said_before_poses_are_estimated(
+    tmp_path: Path, asked: list[Path]
+) -> None:
+    photos = DataConfig(root=_photos(tmp_path / "photos"))
+    with pytest.raises(DyngsError, match=r"no times.*data\.times=order"):
+        with_poses(photos, needs_times=True)
+    with pytest.raises(DyngsError, match=r"2 videos.*dyngs train dynamic"):
+        with_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
+    with pytest.raises(DyngsError, match=r"one video; give that: data\.root=.*cam0\.mp4"):
+        with_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
+    with pytest.raises(
+        DyngsError, match=r"two: holds 2 photos and no cameras; a scene needs at least 3 photos"
+    ):
+        with_poses(DataConfig(root=_photos(tmp_path / "two", 2)))
+    assert asked == []
+    ordered = photos.model_copy(update={"times": "order"})
+    assert with_poses(ordered, needs_times=True, say=lambda _: None).root != photos.root

@@ -1,0 +1,176 @@
+"""Masks by the difference from the background."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from dyngs.capture.fixed_camera import read_fixed_camera
+from dyngs.capture.masks import (
+    background_of,
+    outlined,
+    person_mask,
+    separation,
+    with_background_masks,
+)
+from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError
+from dyngs.data.capture import Capture
+from dyngs.data.images.images import read_image
+from dyngs.io.write import write_image
+
+HEIGHT, WIDTH, FRAMES, RADIUS = 120, 240, 12, 22
+
+
+def clip(speed: float, noise: float = 2.0, shade: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Images (F, H, W, 3) uint8 of a checkered disc that moves ``speed`` px per frame, and its
+    masks."""
+    rng = np.random.default_rng(1)
+    ground = rng.uniform(90, 170, (HEIGHT // 8, WIDTH // 8, 3)).repeat(8, 0).repeat(8, 1)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    images = []
+    masks = []
+    for frame in range(FRAMES):
+        middle = 30 + speed * frame
+        mask = (rows - 56) ** 2 + (columns - middle) ** 2 < RADIUS**2
+        inside = (abs(rows - 94) < 12) & (abs(columns - middle) < 28)
+        shadow = ndimage.gaussian_filter(inside.astype(float), 4.0)
+        colours = ground * (1 - (1 - shade) * shadow[..., None])
+        own = np.where((rows // 3 + (columns - round(middle)) // 3) % 2 == 0, 30.0, 230.0)[
+            ..., None
+        ] * [1, 0.8, 0.5]
+        colours = np.where(mask[..., None], own, colours) + rng.normal(0, noise, (HEIGHT, WIDTH, 3))
+        images.append(np.clip(colours.round(), 0, 255).astype(np.uint8))
+        masks.append(mask)
+    return np.array(images), np.array(masks)
+
+
+def worst_iou(found: np.ndarray, true: np.ndarray) -> float:
+    return float(((found & true).sum((1, 2)) / (found | true).sum((1, 2))).min())
+
+
+@pytest.mark.parametrize(
+    ("noise", "shade", "least"), [(2.0, 1.0, 0.9), (5.0, 1.0, 0.85), (2.0, 0.7, 0.85)]
+)
+def test_who_walks_by_is_cut_out(noise: float, shade: float, least: float) -> None:
+    images, true = clip(16.0, noise, shade)
+    background = background_of(images)
+    found = np.stack([person_mask(background, image) for image in images])
+    assert worst_iou(found, true) > least
+    assert separation(background, images, found).is_clear
+
+
+def rough(masks: np.ndarray) -> np.ndarray:
+    """Masks as a detector has them: too wide in odd images, too narrow in even ones."""
+    return np.stack(
+        [
+            (ndimage.binary_dilation if i % 2 else ndimage.binary_erosion)(x)
+            for i, x in enumerate(masks)
+        ]
+    )
+
+
+@pytest.mark.parametrize("speed", [16.0, 6.0])
+def test_a_detector_and_the_background_outline_better_than_each(speed: float) -> None:
+    """Also of somebody whose median over time is not the background."""
+    images, true = clip(speed)
+    found = outlined(images, rough(true))
+    assert found is not None
+    assert worst_iou(found, true) > 0.96 > worst_iou(rough(true), true)
+    background = background_of(images)
+    alone = np.stack([person_mask(background, image) for image in images])
+    assert worst_iou(found, true) > worst_iou(alone, true)
+
+
+def test_a_moving_camera_has_no_outlines_and_nobody_no_mask() -> None:
+    images, true = clip(6.0)
+    moved = np.stack([np.roll(image, 6 * t, axis=1) for t, image in enumerate(images)])
+    assert outlined(moved, np.zeros_like(true)) is None
+    nobody = outlined(images, np.zeros_like(true))
+    assert nobody is not None
+    assert not nobody.any()
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_who_stays_is_not(speed: float) -> None:
+    images, _ = clip(speed)
+    background = background_of(images)
+    found = np.stack([person_mask(background, image) for image in images])
+    assert not separation(background, images, found).is_clear
+
+
+SIZE = (60, 90)
+COUNT = 9
+
+
+def ground() -> np.ndarray:
+    return (
+        np.random.default_rng(0)
+        .uniform(80, 180, (6, 9, 3))
+        .repeat(10, 0)
+        .repeat(10, 1)
+        .astype(np.uint8)
+    )
+
+
+def moving_block(folder: Path, step: int, turn: int = 0) -> Capture:
+    """A bright block that moves by ``step`` px per image, before a background that moves by
+    ``turn``."""
+    for i in range(COUNT):
+        image = np.roll(ground(), turn * i, axis=1)
+        image[20:50, 5 + step * i : 17 + step * i] = [250, 240, 20]
+        write_image(folder / f"f{i}.png", image)
+    return read_fixed_camera(DataConfig(root=folder))
+
+
+def mask_of(capture: Capture, index: int) -> np.ndarray:
+    silhouette = capture.splits["train"][index].silhouette
+    assert silhouette is not None
+    return read_image(silhouette.path)[..., 0].numpy() > 127
+
+
+def iou_of(mask: np.ndarray, step: int, index: int) -> float:
+    true = np.zeros(SIZE, bool)
+    true[20:50, 5 + step * index : 17 + step * index] = True
+    return (mask & true).sum() / (mask | true).sum()
+
+
+def test_who_walks_by_gets_masks(tmp_path: Path) -> None:
+    said: list[str] = []
+    capture = with_background_masks(
+        moving_block(tmp_path / "c", 8), tmp_path / "m", say=said.append
+    )
+    assert capture.has_alpha
+    assert all(iou_of(mask_of(capture, i), 8, i) > 0.9 for i in range(COUNT))
+    assert len(said) == 1
+    assert "of the outlines lie on edges" in said[0]
+
+
+def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
+    capture = moving_block(tmp_path / "c", 0)
+    with pytest.raises(DyngsError, match="--background"):
+        with_background_masks(capture, tmp_path / "m")
+    write_image(tmp_path / "empty.png", ground())
+    found = with_background_masks(
+        capture, tmp_path / "m", tmp_path / "empty.png", say=lambda _: None
+    )
+    assert iou_of(mask_of(found, 4), 0, 4) > 0.9
+    write_image(tmp_path / "plates" / "0.png", ground())
+    again = with_background_masks(capture, tmp_path / "n", tmp_path / "plates", say=lambda _: None)
+    assert np.array_equal(mask_of(again, 4), mask_of(found, 4))
+
+
+def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="moves, so there is no background"):
+        with_background_masks(moving_block(tmp_path / "c", 8, turn=2), tmp_path / "m")
+    capture = moving_block(tmp_path / "d", 8)
+    views = list(capture.splits["train"])
+    pose = views[3].cam_from_world.copy()
+    pose[0, 3] = 0.1
+    views[3] = replace(views[3], cam_from_world=pose)
+    with pytest.raises(DyngsError, match="moves, so there is no background"):
+        with_background_masks(capture.replace(splits={"train": tuple(views)}), tmp_path / "m")
