@@ -317,7 +317,7 @@ def read_option_values(root: Path) -> object:
 def read_a_log(root: Path) -> object:
     """Read log and timing of an interrupted run, as resuming does."""
     from dyngs.runs.checkpoint import seconds_at
-    from dyngs.runs.log import RunLog
+    from dyngs.training.run_log import RunLog
 
     seconds = seconds_at(root, 7)
     with RunLog(root, 2):

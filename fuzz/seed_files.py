@@ -22,6 +22,7 @@ from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.export.camera_paths import CameraPath, write_path
+from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass
@@ -32,7 +33,6 @@ from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.runs.stored_file import encoded
 from dyngs.static.keys import StaticModel
-from dyngs.training.new_trainer import restored_scene
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
 from moving_scene import camera
 
+from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import StepDone, StepReport
 from dyngs.training.loop import Loop
+from dyngs.training.trainer import Edit
 
 IMAGE = Image("view", camera(2, 2), torch.zeros(2, 2, 3), None, None, None)
+
+
+CONFIG = Config(data=DataConfig(root=Path("x")), train=TrainConfig(log_every=1))
 
 
 @dataclass
@@ -28,6 +34,7 @@ class Counting:
     has_test_views: bool = False
     findings: dict[int, str] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
+    config: Config = field(default_factory=lambda: CONFIG)
 
     def step(self) -> StepReport:
         step = self.done + 1
@@ -35,6 +42,9 @@ class Counting:
             raise DyngsError(self.failures[step])
         self.done = step
         return report_of(step, finding=self.findings.get(step))
+
+    def apply(self, edit: Edit) -> None:
+        """Do nothing."""
 
     def checkpoint(self) -> Checkpoint:
         return Checkpoint(CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), "black", "classic"), {})

@@ -7,8 +7,6 @@ to 0.15 dB.
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +15,6 @@ import pytest
 
 import dyngs
 from dyngs.cli import main
-from dyngs.config.io import load_resolved
 from dyngs.data.images.images import read_image
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.human.fit import fitted_capture
@@ -147,51 +144,3 @@ def test_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     floors = {"test": 23.0, "pose": 21.8}  # 23.32, 22.18; after 40 steps 21.58, 21.02
     found = {split: evaluate_run(run, split).psnr_person or 0.0 for split in floors}
     assert {split: psnr for split, psnr in found.items() if psnr <= floors[split]} == {}
-
-
-def test_what_stays_before_fixed_cameras_is_trained_as_static(
-    still_life: Captured, tmp_path: Path
-) -> None:
-    """The same bytes as by the static preset, though the dynamic one was asked for."""
-    source = still_life.root / "capture"
-    target = tmp_path / "capture"
-    shutil.copytree(source, target)
-    described = json.loads((source / "transforms_train.json").read_text())
-    frames = []
-    for frame in described["frames"][:3]:
-        for k in range(6):
-            name = f"{frame['file_path']}_{k}"
-            shutil.copy(source / f"{frame['file_path']}.png", target / f"{name}.png")
-            frames.append(frame | {"file_path": name, "time": k / 5})
-    (target / "transforms_train.json").write_text(json.dumps(described | {"frames": frames}))
-    (target / "transforms_test.json").unlink()
-    captured = Captured(tmp_path)
-    runs = [captured.trained(preset, "train.steps=20") for preset in ("dynamic", "static")]
-    assert load_resolved(runs[0]).model.kind == "static"
-    assert checkpoint_bytes(runs[0]) == checkpoint_bytes(runs[1])
-
-
-def test_what_moves_is_trained_as_static_where_the_run_is_too_short_to_follow_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    room = Captured.of(tmp_path, "room", "--size", "32", "--views", "6", "--cameras", "3")
-    run = room.trained("dynamic", "train.steps=20")
-    assert load_resolved(run).model.kind == "static"
-    printed = capsys.readouterr().out
-    assert "something moves" in printed
-    assert "too short a run" in printed
-
-
-def test_the_command_trains_the_same_bytes_as_python(still_life: Captured) -> None:
-    keys = still_life.keys("by_command", "train.steps=20")
-    assert main(["train", "static", *keys]) == 0
-    by_python = dyngs.train(
-        dyngs.load_config("static", still_life.keys("by_python", "train.steps=20"))
-    )
-    assert checkpoint_bytes(still_life.root / "by_command") == checkpoint_bytes(by_python)
-
-
-def checkpoint_bytes(run: Path) -> bytes:
-    """The only checkpoint of a run."""
-    (path,) = (run / "checkpoints").iterdir()
-    return path.read_bytes()

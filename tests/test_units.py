@@ -12,14 +12,13 @@ import pytest
 import torch
 import trimesh
 from scaled_captures import scaled_capture
-from tiny_field_people import NETWORKS, SIZES, field_people
-from tiny_fields import busy_config, write_tiny_capture
-from tiny_people import NET, people
-from tiny_stereo import STEREO, stereo_people
+from tiny_field_people import NETWORKS, SIZES
+from tiny_fields import write_tiny_capture
+from tiny_people import NET
+from tiny_stereo import STEREO
 
 import dyngs
 from dyngs.cli import main
-from dyngs.config import Config
 from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
@@ -91,34 +90,6 @@ def test_unit_of_a_power_of_two_trains_to_the_same_bytes(
         scaled = scaled_capture(capture, tmp_path / name, 2.0**exponent)
         other = trained(preset, scaled, tmp_path / f"run_{name}")
         assert_same_up_to_scale(one, other, 2.0**exponent)
-
-
-@pytest.mark.parametrize("field", ["hexplane", "mlp", "free"])
-def test_deformation_field_in_another_unit(field: str, captures: Path, tmp_path: Path) -> None:
-    scaled = scaled_capture(captures / "moving", tmp_path / "scaled", 2.0**-13)
-    one = dyngs.train(busy_config(captures / "moving", tmp_path / "one", field))
-    assert_same_up_to_scale(
-        one, dyngs.train(busy_config(scaled, tmp_path / "other", field)), 2.0**-13
-    )
-
-
-@pytest.mark.parametrize("kind", NETWORK_KEYS)
-def test_network_of_people_in_another_unit(kind: str, tmp_path: Path) -> None:
-    write = {"human_predictor": lambda x: people(x, (1,)), "gps": stereo_people}.get(
-        kind, field_people
-    )
-    folder = write(tmp_path / "people")
-    scaled = scaled_capture(folder, tmp_path / "scaled", 2.0**-13)
-    results = []
-    for name, root in (("one", folder), ("other", scaled)):
-        train = {"steps": 3, "alpha_weight": 0.1}
-        run = {"dir": tmp_path / name, "threads": 1}
-        config = Config.model_validate(
-            {"data": {"root": root}, "model": NETWORK_KEYS[kind], "train": train, "run": run}
-        )
-        results.append(latest_checkpoint(dyngs.train(config)).tensors)
-    for name, x in results[0].items():
-        assert torch.equal(x, results[1][name]), name
 
 
 @pytest.mark.parametrize(
@@ -237,11 +208,3 @@ def test_run_of_an_earlier_version_is_evaluated_in_its_own_unit(
     info = replace(checkpoint.info, world_scale=1.0, extent=unit * checkpoint.info.extent)
     save_checkpoint(run, replace(checkpoint, info=info, tensors=tensors), 1.0)
     assert evaluate_run(run).psnr == pytest.approx(psnr, abs=1e-3)
-
-
-def test_number_for_the_near_plane_is_in_the_unit_of_the_capture(
-    captures: Path, tmp_path: Path
-) -> None:
-    scaled = scaled_capture(captures / "still", tmp_path / "scaled", 0.01)
-    scene = dyngs.load(trained("static", scaled, tmp_path / "run", "model.near=0.005"))
-    assert scene.options.near == pytest.approx(0.005)

@@ -15,12 +15,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.api.first_scene import first_of
-from dyngs.config import BudgetConfig, Config, PruneConfig
+from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import psnr
@@ -33,11 +34,12 @@ from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.io.write import write_text
-from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
+from dyngs.models.kind import HasGaussians, capability, kind_of
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
+from dyngs.static.keys import StaticModel
 from dyngs.training.corrections.camera_refinement import fitted_to_image
 from dyngs.training.loop import Interrupts
 from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
@@ -156,7 +158,8 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
         )
         return _with_settings(as_static(config), capture)
     show(f"  {choice}")
-    best, choices, capture = _with_settings(moving if choice.taken else as_static(config), capture)
+    found = moving if choice.taken else as_static(config)
+    best, choices, capture = _with_settings(found, capture, moving=choice.taken)
     return best, [choice, *choices], capture
 
 
@@ -246,10 +249,23 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
     return choice
 
 
-def _with_settings(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
+@dataclass(frozen=True)
+class _OpenSetting:
+    """A setting that pilot runs decide about: ``change`` returns its section of the config with
+    it."""
+
+    text: str
+    section: str
+    change: Callable[[Any], Section]
+    score: PairScore
+
+
+def _with_settings(
+    config: Config, capture: Capture, *, moving: bool = False
+) -> tuple[Config, list[Choice], Capture]:
     """Return ``config`` with the settings that win pilot runs, each tried on top of those before it,
     all results, and the prepared capture."""
-    open_settings = _open_settings(config)
+    open_settings = _open_settings(config, moving=moving)
     config = _resolved(config)
     capture = with_points(capture, config)
     views = capture.splits["train"]
@@ -259,14 +275,15 @@ def _with_settings(config: Config, capture: Capture) -> tuple[Config, list[Choic
     if not open_settings:
         return config, choices, capture
     if not folds or steps < SETTINGS.fewest_steps:
-        keys = ", ".join(f"{section}.{key}" for section, key, _ in open_settings)
-        show(f"{keys}=auto: not taken, too short a run, or too few views, to compare")
+        keys = ", ".join(x.text for x in open_settings)
+        show(f"{keys} not taken: too short a run, or too few views, to compare")
         return config, choices, capture
     show(f"pilot runs of {counted(steps, 'step')}, compared on held-out training views:")
-    for section, key, score in open_settings:
-        changed = _with(config, section, **{key: "always"})
+    for setting in open_settings:
+        name = setting.section
+        changed = config.model_copy(update={name: setting.change(getattr(config, name))})
         both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
-        choice = _compared(f"{section}.{key}=always", both, capture, folds, score)
+        choice = _compared(setting.text, both, capture, folds, setting.score)
         if choice is None:
             continue
         show(f"  {choice}")
@@ -275,18 +292,31 @@ def _with_settings(config: Config, capture: Capture) -> tuple[Config, list[Choic
     return config, choices, capture
 
 
-def _open_settings(config: Config) -> list[tuple[str, str, PairScore]]:
-    """Return section, key and score of the settings that are ``auto``, by what they were worth in
-    the past, the most first."""
-    found: list[tuple[str, str, PairScore]] = [
-        ("camera", "refine", after_pose_fit),
-        ("train", "exposure", after_colour_fit),
+def _open_settings(config: Config, *, moving: bool) -> list[_OpenSetting]:
+    """Return the settings that are ``auto``, by what they were worth in the past, the most first;
+    where motion was found to pay, colours are open, too."""
+    scores: dict[tuple[str, str], PairScore] = {
+        ("camera", "refine"): after_pose_fit,
+        ("train", "exposure"): after_colour_fit,
+    }
+    if isinstance(config.model, StaticModel):
+        scores["train", "robust"] = explained
+    elif not isinstance(config.model, DynamicModel):
+        return []
+
+    def always(key: str) -> Callable[[Any], Section]:
+        return lambda section: section.model_copy(update={key: "always"})
+
+    found = [
+        _OpenSetting(f"{section}.{key}=always", section, always(key), score)
+        for (section, key), score in scores.items()
+        if getattr(getattr(config, section), key) == "auto"
     ]
-    kind = kind_of(config.model)
-    if not isinstance(kind, Moves):
-        found.append(("train", "robust", explained))
-    found = [x for x in found if f"{x[0]}.{x[1]}" in kind.uses]
-    return [x for x in found if getattr(getattr(config, x[0]), x[1]) == "auto"]
+    if moving and config.colour == ShColour() and not config.colour.model_fields_set:
+        found.append(
+            _OpenSetting("colour.kind=network", "colour", lambda _: NetworkColour(), plain)
+        )
+    return found
 
 
 def _resolved(config: Config) -> Config:

@@ -57,10 +57,9 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import require_empty
+from dyngs.runs.folder import LOG_NAME, require_empty
 from dyngs.runs.frame import RunFrame, write_frame
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.log import LOG_NAME
 from dyngs.runs.opened import Opened, open_scene, opened_scene
 
 Tell = Callable[[str], None]

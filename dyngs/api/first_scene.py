@@ -23,7 +23,7 @@ def first_of(config: Config, capture: Capture) -> FirstGaussians | None:
     init = config.init
     if not isinstance(init, SceneInit):
         return None
-    opened = open_scene(init.scene, nonfinite="skip")
+    opened = open_scene(init.scene, nonfinite="skip", with_capture=False)
     scene = opened.scene.to("cpu")
     if not scene.is_static:
         raise DyngsError(

@@ -46,7 +46,7 @@ def load(path: Path | str) -> GaussianScene:
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    opened = open_scene(Path(path))
+    opened = open_scene(Path(path), with_capture=False)
     scene = opened.scene
     scale = opened.info.world_scale
     if scale == 1:

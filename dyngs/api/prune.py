@@ -30,9 +30,8 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER, require_empty
+from dyngs.runs.folder import EXPORT_FOLDER, LOG_NAME, require_empty
 from dyngs.runs.frame import FRAME_NAME
-from dyngs.runs.log import LOG_NAME
 from dyngs.runs.stored_file import write_scene
 from dyngs.training.new_trainer import assemble
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from dyngs.compress.measure import GREY_LEVELS, Precision, mean_square_change, storage_plan
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
+from dyngs.gaussians.restored import restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
@@ -19,7 +20,6 @@ from dyngs.runs.folder import folder_of_export
 from dyngs.runs.frame import read_frame, write_frame
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.stored_file import FIELD, decoded, drawable, encoded, write_scene
-from dyngs.training.new_trainer import restored_model
 
 MISSED = 1.05
 """A file whose images change by so many times what is allowed is not written; less is rounding of

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
-from itertools import count as counted_from
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, as_word, counted, show, warn
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
-from dyngs.io.lock import Held, writing
+from dyngs.io.lock import writing
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
@@ -51,6 +50,7 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import (
+    LOG_NAME,
     asked_for,
     begin,
     default_folder,
@@ -62,7 +62,6 @@ from dyngs.runs.folder import (
     was_only_begun,
 )
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.log import RunLog
 from dyngs.training.clock import SaveTimer, Stopwatch
 from dyngs.training.events import (
     Evaluated,
@@ -79,6 +78,7 @@ from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.new_trainer import build
 from dyngs.training.plan import RunPlan
 from dyngs.training.processes import Processes
+from dyngs.training.run_log import RunLog
 from dyngs.training.trainer import Trainer
 
 _COUNT = "budget.count"  # Name of the limit's state in a checkpoint
@@ -175,7 +175,7 @@ def train(
             plan = planned(plan, [read_same_capture(folder, resumed), set_limits])
             watch.pause(-seconds_at(folder, resumed.info.step))
         trainer = _built(plan, resumed, images)
-        run = _Run(plan, trainer, folder, resumed, held=held, processes=processes, watch=watch)
+        run = _Run(plan, trainer, folder, resumed, processes=processes, watch=watch)
         run.run(listeners)
     return run.folder
 
@@ -227,7 +227,6 @@ class _Run:
     """The loop of a run with its folder: checkpoints, log, evaluations and limits.
 
     Args:
-        held: the lock of the folder, which finds that if it is renamed.
         watch: seconds since the capture was read, those of pilot runs included.
     """
 
@@ -238,15 +237,13 @@ class _Run:
         folder: Path,
         resumed: Checkpoint | None,
         *,
-        held: Held,
         processes: Processes,
         watch: Stopwatch,
     ) -> None:
         config = plan.resolved
         self._plan = plan
-        self._held = held
         self._processes = processes
-        self.folder = held.folder() or folder
+        self.folder = folder
         self._count = None
         self._time = None
         editors: list[Editor] = []
@@ -294,7 +291,10 @@ class _Run:
         done = loop.trainer.done
         with (
             RunLog(
-                self.folder, done, every=options.log_every, tensorboard=options.tensorboard
+                self.folder / LOG_NAME,
+                done,
+                every=options.log_every,
+                tensorboard=options.tensorboard,
             ) as log,
             Interrupts() as interrupts,
         ):
@@ -305,7 +305,6 @@ class _Run:
                 if isinstance(loop.trainer, Trainer):
                     loop.trainer.images.rest()
             if loop.trainer.done < loop.total:
-                self.folder = self._held.folder() or self.folder
                 if loop.trainer.done > self._saved:
                     self._save()
                 raise KeyboardInterrupt(
@@ -339,17 +338,14 @@ class _Run:
         if self._count is not None:
             kept = {f"{_COUNT}.{name}": x for name, x in self._count.state().items()}
             checkpoint = replace(checkpoint, tensors=checkpoint.tensors | kept)
-        found = self._held.folder()
-        self.folder = found or _free(self.folder)
-        if found is None:
+        if not self.folder.is_dir():  # removed, or renamed
+            try:
+                self.folder.mkdir(parents=True)
+            except OSError as error:
+                raise DyngsError(f"{self.folder}: cannot be made again: {error}") from error
             write_config(self.config, self.folder)
         path = save_checkpoint(self.folder, checkpoint, self.loop.watch.seconds)
         self._saved = self.loop.trainer.done
-        if found is None:
-            raise DyngsError(
-                f"the folder of the run was removed, or moved to another disk; the checkpoint after step {self._saved} "
-                f"is in {self.folder}; go on with `dyngs train --resume {as_word(self.folder)}`"
-            )
         self._save_timer.saved(begin, self.loop.watch.seconds)
         self.loop.emit(Saved(self._saved, path))
 
@@ -384,16 +380,6 @@ def _show_memory(trainer: Trainer[Any], processes: int) -> None:
         warning = forecast.warning()
         if warning is not None:
             warn(warning)
-
-
-def _free(folder: Path) -> Path:
-    """Return ``folder`` if nothing is there, else one of a similar name."""
-    names = (folder.with_name(f"{folder.name}_{number}") for number in counted_from(2))
-    return (
-        folder
-        if not os.path.lexists(folder)
-        else next(path for path in names if not os.path.lexists(path))
-    )
 
 
 def _is_done_and_read_only(config: Config, folder: Path) -> bool:

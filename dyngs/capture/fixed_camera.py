@@ -4,7 +4,6 @@ guessed camera."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from dyngs.config import DataConfig
@@ -95,19 +94,6 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     return Capture(
         source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note, *notes)
     )
-
-
-def zoomed(view: View, factor: float, distance: float) -> View:
-    """Return the view of a camera with ``factor`` times the focal length that stands back by as
-    much.
-
-    What is at ``distance`` before the camera is as large as before.
-    """
-    intrinsics = view.intrinsics.copy()
-    pose = view.cam_from_world.copy()
-    intrinsics[:2, :2] *= factor
-    pose[2, 3] += (factor - 1) * distance
-    return replace(view, intrinsics=intrinsics, cam_from_world=pose)
 
 
 def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:

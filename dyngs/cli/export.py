@@ -454,16 +454,15 @@ def _export_network(arguments: argparse.Namespace) -> int:
 
 def _export_bodies(arguments: argparse.Namespace) -> int:
     """Write a moving scene with its bodies as animated nodes."""
-    from dyngs.export.body_nodes import SUFFIX, write_bodies
     from dyngs.export.redrawn import compare_run
-    from dyngs.export.splat_files import writing_of
+    from dyngs.export.splat_files import write_bodies, writing_of
     from dyngs.io.formats.formats import format_named, read_splats
 
     if arguments.format not in (None, "glb"):
         raise DyngsError(f"--bodies goes with --format glb, not with {arguments.format}")
-    out: Path = arguments.out or arguments.run_dir / f"bodies{SUFFIX}"
-    if out.is_dir() or out.suffix.lower() != SUFFIX:
-        name = out / f"bodies{SUFFIX}" if out.is_dir() else f"{out.stem}{SUFFIX}"
+    out: Path = arguments.out or arguments.run_dir / "bodies.glb"
+    if out.is_dir() or out.suffix.lower() != ".glb":
+        name = out / "bodies.glb" if out.is_dir() else f"{out.stem}.glb"
         raise DyngsError(f"{out}: --bodies writes one file; give --out {name}")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
@@ -478,8 +477,7 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
 
 def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
-    from dyngs.export.rigged.mesh_file import Played, write_mesh
-    from dyngs.export.rigged.splat_files import write_rigged_splats
+    from dyngs.export.rigged.people import Played, write_mesh, write_rigged_splats
     from dyngs.runs.opened import FRAME_RATE
 
     option, stem = ("--joints", "rigged") if arguments.joints else ("--format mesh", "mesh")
@@ -503,9 +501,8 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         if arguments.motion is not None
         else None
     )
-    written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
-    print_notes(written.notes)
-    print_written(written.path)
+    print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
+    print_written(out)
     return 0
 
 
@@ -590,8 +587,8 @@ def _export_page(arguments: argparse.Namespace) -> int:
 def _export_cameras(arguments: argparse.Namespace) -> int:
     """Write the cameras of a run as a transforms.json, refined where training refined them."""
     from dyngs.data.capture import all_views
+    from dyngs.evaluate.refined_cameras import found_corrections
     from dyngs.export.cameras import NAME, write_cameras
-    from dyngs.runs.checkpoint import found_corrections
     from dyngs.runs.opened import open_run
 
     source: Path = arguments.run_dir

@@ -10,9 +10,9 @@ from typing import IO, Any
 
 from dyngs.core.errors import escaped
 from dyngs.models.schedule import image_divisor
-from dyngs.runs.log import record_of
 from dyngs.training.clock import Forecast
 from dyngs.training.events import Evaluated, Event, Message, Started, StepDone, TotalChanged
+from dyngs.training.run_log import record_of
 
 PLAIN_LINES = 10
 """Number of lines that a run prints without a terminal."""

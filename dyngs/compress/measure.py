@@ -18,6 +18,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import contributions
+from dyngs.gaussians.restored import restored_model, restored_scene
 from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.renderable import Renderable
@@ -37,7 +38,6 @@ from dyngs.runs.stored_file import (
     restored,
     step_below,
 )
-from dyngs.training.new_trainer import restored_model, restored_scene
 
 GREY_LEVELS = 255.0
 TRIALS = 4  # number of steps tried per group

@@ -132,9 +132,9 @@ class DynamicModel(SceneModel):
     ] = HexplaneField()
     choose: bool = Field(
         default=False,
-        description="find out first, by short trainings compared on training views held out, whether motion pays (else "
-        "the scene is trained as preset static does), and what colours are made of and whether opacities change where "
-        "that was not requested (docs/dynamic.md)",
+        description="find out first, by pilot runs compared on held-out training views, whether motion pays (else the "
+        "scene is trained as preset static does), and what colours are made of where that was not requested "
+        "(docs/dynamic.md)",
     )
     motion_from: Fraction = Field(
         default=0.13,

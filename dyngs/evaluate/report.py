@@ -17,6 +17,7 @@ from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.tracks import read_true_tracks
+from dyngs.evaluate.refined_cameras import found_corrections
 from dyngs.evaluate.regions import REGION_METRICS, Regions
 from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
@@ -33,7 +34,6 @@ from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     LoadedRun,
-    found_corrections,
     has_only_scene_file,
     load_run,
 )

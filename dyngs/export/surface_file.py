@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dyngs.baselines.fields.keys import NgpModel
 from dyngs.baselines.fields.scene import FieldScene, space_of
@@ -28,7 +27,6 @@ from dyngs.io.write import atomic_file
 from dyngs.models.surface import Surface
 from dyngs.models.views import training_cameras
 from dyngs.ops.patches import MOST_SEGMENTS
-from dyngs.ops.rays import Space
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 
@@ -54,22 +52,23 @@ class Cut:
 
     def require_fitting(self, scene: object) -> None:
         """Check that all that is given goes with the kind of scene. Raises DyngsError."""
-        if self.level is not None and not isinstance(scene, FieldScene):
-            raise DyngsError(
-                "--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)"
-            )
-        if self.segments is not None and not isinstance(scene, TriangleScene):
-            raise DyngsError(
-                "--segments goes with --format mesh of curved triangles (model.kind=bg_triangle)"
-            )
-        if self.segments is not None and not 1 <= self.segments <= MOST_SEGMENTS:
-            raise DyngsError(f"--segments {self.segments}: give 1 to {MOST_SEGMENTS}")
-        if self.cells is not None and isinstance(scene, TriangleScene):
-            raise DyngsError(
-                "--cells goes with --format mesh of radiance fields and Gaussians, not of triangles"
-            )
-        if self.cells is not None and not 8 <= self.cells <= MOST_CELLS:
-            raise DyngsError(f"--cells {self.cells}: give 8 to {MOST_CELLS}")
+        is_field = isinstance(scene, FieldScene)
+        is_triangles = isinstance(scene, TriangleScene)
+        given = {
+            "level": (is_field, "a radiance field (model.kind=ngp or nerf)", None),
+            "segments": (
+                is_triangles,
+                "curved triangles (model.kind=bg_triangle)",
+                (1, MOST_SEGMENTS),
+            ),
+            "cells": (not is_triangles, "radiance fields and Gaussians", (8, MOST_CELLS)),
+        }
+        for name, (fits, kinds, limits) in given.items():
+            value = getattr(self, name)
+            if value is not None and not fits:
+                raise DyngsError(f"--{name} goes with --format mesh of {kinds}")
+            if value is not None and limits and not limits[0] <= value <= limits[1]:
+                raise DyngsError(f"--{name} {value}: give {limits[0]} to {limits[1]}")
 
 
 def upright_surface(
@@ -99,8 +98,9 @@ def write_surface(
     needed, or no surface is there.
     """
     cut = cut or Cut()
+    suffix = out.suffix.lower()
     cut.require_fitting(opened.renderable)
-    if out.suffix.lower() not in SUFFIXES:
+    if suffix not in SUFFIXES:
         raise DyngsError(
             f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}"
         )
@@ -108,9 +108,8 @@ def write_surface(
     surface = _surface(opened, time, cut)
     vertices = Similarity(how.turn).points(opened.world.points(surface.vertices))
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
-    data = _mesh_bytes(out.suffix.lower(), vertices, surface.faces, colours)
     with atomic_file(out) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(_mesh_bytes(suffix, vertices, surface.faces, colours))
     return surface
 
 
@@ -153,20 +152,14 @@ def _surface_of_gaussians(opened: Opened, scene: GaussianScene, time: float, cut
     """Return what training cameras see of Gaussians; what they frame, where there is a
     background."""
     views = opened.capture.splits["train"]
-    cameras = training_cameras(
-        [views[i] for i in evenly_spaced(len(views), VIEWS)], opened.config.data
-    )
+    seen = [views[i] for i in evenly_spaced(len(views), VIEWS)]
+    cameras = training_cameras(seen, opened.config.data)
     box = gaussians.opaque_box(scene.at(time))
     if not opened.capture.has_alpha:
-        box = _common(box, space_of(NgpModel(), None, opened.capture))
+        space = space_of(NgpModel(), None, opened.capture)
+        middle = torch.tensor(space.centre, device="cpu")
+        cube = middle - space.half, middle + space.half
+        common = torch.maximum(box[0], cube[0]), torch.minimum(box[1], cube[1])
+        shares_much = bool((common[1] - common[0] > 0.1 * space.half).all())
+        box = common if shares_much else cube
     return gaussians.surface_of(scene, cameras, box, time, cells=cut.cells)
-
-
-def _common(box: tuple[Tensor, Tensor], space: Space) -> tuple[Tensor, Tensor]:
-    """Return the corners of what ``box`` and the innermost cube share; of the cube where that is
-    little."""
-    middle = torch.tensor(space.centre, device="cpu")
-    low = torch.maximum(box[0], middle - space.half)
-    high = torch.minimum(box[1], middle + space.half)
-    shares_much = bool((high - low > 0.1 * space.half).all())
-    return (low, high) if shares_much else (middle - space.half, middle + space.half)

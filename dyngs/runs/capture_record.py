@@ -89,7 +89,7 @@ def _is_close(one: np.ndarray, other: np.ndarray, extent: float) -> bool:
         return False
     tolerance = np.full(len(one), TOLERANCE)
     tolerance[_CENTRE] *= extent
-    return bool((np.abs(one - other) <= tolerance + 1e-9 * np.abs(one)).all())
+    return np.allclose(one, other, rtol=1e-9, atol=tolerance)
 
 
 def _record(data: DataConfig, capture: Capture | None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,17 +22,15 @@ from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, as_word, reading
-from dyngs.data.capture import View
+from dyngs.gaussians.restored import restored_model
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.io.fields import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.runs.stored_file import read_scene
-from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
-from dyngs.training.new_trainer import restored_model
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
@@ -163,20 +161,6 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
     scene = restored_model(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
-
-
-def found_corrections(
-    run_dir: Path, run: LoadedRun, trained_on: Sequence[View]
-) -> CameraCorrections | None:
-    """Return the corrections of a run's cameras; None where it refined none, or has no
-    checkpoint."""
-    if run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
-        return None
-    checkpoint = latest_checkpoint(run_dir)
-    refinement = CameraRefinement(trained_on, run.info.extent, run.config.train.steps)
-    with reading(checkpoint.name, OTHER_CONFIG):
-        refinement.load_state(checkpoint.part("cameras"))
-    return refinement.corrections
 
 
 def has_only_scene_file(run_dir: Path) -> bool:

@@ -4,7 +4,7 @@ killed processes."""
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,8 +19,8 @@ from dyngs.models.kind import Predicts, capability
 from dyngs.runs.capture_record import RECORD_NAME, changed_files
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
-from dyngs.runs.log import LOG_NAME
 
+LOG_NAME = "log.jsonl"
 EXPORT_FOLDER = "export"
 """In a run folder: the run as one .dyngs file of at most ``budget.max_mb``."""
 CHOICES_NAME = "choices.json"
@@ -185,36 +185,11 @@ def _about_other(folder: Path, config: Config) -> str:
             f"{folder} already holds a run, this very one, stopped after step {done:,} of {stored.total_steps:,}; go "
             f"on with `dyngs train --resume {as_word(folder)}`"
         )
-    different = list(_differences(asked, config))
-    shown = ", ".join(f"{key} is {was} there and {now} here" for key, was, now in different[:2])
-    more = f" and {len(different) - 2} more" if len(different) > 2 else ""
-    longer = [key for key, _, _ in different] == ["train.steps"] and config.train.steps > done
-    go_on = f", or go on to so many with `dyngs train --resume {as_word(folder)} train.steps={config.train.steps}`"
-    return (
-        f"{folder} already holds a run, another one ({shown}{more}); give another run.dir to keep both"
-        f"{go_on if longer else ''}"
-    )
-
-
-def _differences(one: Config, other: Config) -> Iterator[tuple[str, object, object]]:
-    """Yield dotted key and both values, as they are printed, of what makes two runs different."""
-    both = one, with_body_of(other, one)
-    first, second = (
-        _flat(c.model_dump(mode="json", exclude={"run"}) | {"run.seed": c.run.seed}) for c in both
-    )
-    for key in dict.fromkeys((*first, *second)):
-        if first.get(key) != second.get(key):
-            yield key, first.get(key, "not"), second.get(key, "not")
-
-
-def _flat(values: Mapping[str, object], above: str = "") -> dict[str, object]:
-    """Return nested values by their dotted keys."""
-    found: dict[str, object] = {}
-    for key, value in values.items():
-        found |= (
-            _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
-        )
-    return found
+    train = config.train.model_copy(update={"steps": asked.train.steps})
+    is_longer = config.train.steps > done
+    longer = is_longer and _is_same_run(asked, config.model_copy(update={"train": train}))
+    go_on = f", or go on to that with `dyngs train --resume {as_word(folder)} train.steps={config.train.steps}`"
+    return f"{folder} already holds another run; give another run.dir to keep both{go_on if longer else ''}"
 
 
 def was_only_begun(folder: Path) -> bool:

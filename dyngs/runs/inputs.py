@@ -24,8 +24,7 @@ from dyngs.runs.checkpoint import (
     has_only_scene_file,
 )
 from dyngs.runs.config_file import BODY_FOLDER
-from dyngs.runs.folder import ASKED_NAME
-from dyngs.runs.log import LOG_NAME
+from dyngs.runs.folder import ASKED_NAME, LOG_NAME
 
 Read = Path | BaseModel | LoadedRun | Capture | None
 _FILES_OF_VIEWS = ("image_path", "mask_path", "depth_path", "motion_mask_path", "flow_path")

@@ -44,42 +44,20 @@ T = TypeVar("T")
 
 
 class Captured:
-    """The capture that a scene was trained on; read when it is first needed, and only once, if not
-    ``capture``.
+    """The capture that a scene was trained on, in its coordinates.
 
-    It is in the scene coordinates of ``info``.
+    Attributes:
+        found: the capture, or why it cannot be read.
+        cameras: the V training cameras, all with size and intrinsics of the first; None where the
+            capture cannot be read.
     """
 
-    def __init__(
-        self, data: DataConfig, info: CheckpointInfo, capture: Capture | None = None
-    ) -> None:
-        self.data, self._info = data, info
-        self._found: Capture | DyngsError | None = capture
+    def __init__(self, data: DataConfig, found: Capture | DyngsError) -> None:
+        self.found = found
+        self.cameras: Cameras | None = None
+        if isinstance(found, Capture):
+            self.cameras = cameras_for_paths(found.splits["train"], data)
         self._kept: dict[str, Any] = {}
-
-    @property
-    def capture(self) -> Capture:
-        """The capture. Raises DyngsError where it cannot be read."""
-        if self._found is None:
-            try:
-                self._found = read_capture_of(self.data, self._info)
-            except DyngsError as error:
-                self._found = error
-        if isinstance(self._found, DyngsError):
-            raise self._found
-        return self._found
-
-    @property
-    def cameras(self) -> Cameras | None:
-        """The V training cameras, all with size and intrinsics of the first; None where the capture
-        cannot be read."""
-        return self.once("cameras", self._cameras)
-
-    def _cameras(self) -> Cameras | None:
-        try:
-            return cameras_for_paths(self.capture.splits["train"], self.data)
-        except DyngsError:
-            return None
 
     def once(self, name: str, compute: Callable[[], T]) -> T:
         """Return what ``compute`` returned when first asked for ``name``."""
@@ -121,21 +99,19 @@ class Opened(LoadedRun):
 
     @property
     def capture(self) -> Capture:
-        """As of ``Captured``. Raises DyngsError where there is none, or it cannot be read."""
-        if self.captured is None:
-            raise DyngsError(
+        """What it was trained on. Raises DyngsError where there is none, or it cannot be read."""
+        if self.captured is None or self.missing is not None:
+            raise self.missing or DyngsError(
                 f"{self.config.data.root}: a file, without the capture that it was trained on"
             )
-        return self.captured.capture
+        assert isinstance(self.captured.found, Capture)
+        return self.captured.found
 
     @property
     def missing(self) -> DyngsError | None:
-        """Why there is no capture; None: there is one."""
-        try:
-            _ = self.capture
-        except DyngsError as error:
-            return error
-        return None
+        """Why the capture cannot be read; None: it was, or there is none."""
+        found = None if self.captured is None else self.captured.found
+        return found if isinstance(found, DyngsError) else None
 
     @property
     def cameras(self) -> Cameras | None:
@@ -207,7 +183,8 @@ class Opened(LoadedRun):
         frames = max(len(self.renderable.times), 1)
         if self.fps is not None:
             return max(frames / self.fps, SHORTEST)
-        known = None if self.in_training or self.missing else self.capture.seconds
+        found = None if self.captured is None or self.in_training else self.captured.found
+        known = found.seconds if isinstance(found, Capture) else None
         return max(known or frames / FRAME_RATE, SHORTEST)
 
     def once(self, name: str, compute: Callable[[], T]) -> T:
@@ -286,7 +263,11 @@ def _once(kept: dict[str, Any], name: str, compute: Callable[[], T]) -> T:
 
 
 def open_scene(
-    path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | None = None
+    path: Path,
+    *,
+    nonfinite: Nonfinite = "error",
+    data_root: Path | None = None,
+    with_capture: bool = True,
 ) -> Opened:
     """Open a run folder, a ``scene.dyngs`` with the ``config.yaml`` of its run, an avatar, or a
     file of Gaussians.
@@ -294,6 +275,7 @@ def open_scene(
     Args:
         nonfinite: of a file of Gaussians, as ``dyngs.io.formats.formats.read_splats``.
         data_root: where the capture of a run lies by now, if it was moved.
+        with_capture: read the capture of a run, too.
 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
@@ -301,7 +283,8 @@ def open_scene(
     if (path.is_dir() and format_to_read(path) is None) or (
         path.name == SCENE_FILE and path.exists()
     ):
-        return open_run(path if path.is_dir() else path.parent, data_root=data_root)
+        folder = path if path.is_dir() else path.parent
+        return open_run(folder, data_root=data_root, with_capture=with_capture)
     if not path.exists():
         raise DyngsError(
             f"{path}: no such file or folder; give what `dyngs train` or `dyngs export` wrote"
@@ -326,12 +309,16 @@ def open_scene(
     return replace(opened, info=info, turned=splat.turned)
 
 
-def open_run(folder: Path, capture: Capture | None = None, data_root: Path | None = None) -> Opened:
-    """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it
-    is read already."""
+def open_run(folder: Path, data_root: Path | None = None, *, with_capture: bool = True) -> Opened:
+    """Open a run folder at its newest checkpoint, see ``load_run``."""
     run = load_run(folder, data_root)
     edited = read_frame(folder)
-    captured = Captured(run.config.data, run.info, capture)
+    captured = None
+    if with_capture:
+        try:
+            captured = Captured(run.config.data, read_capture_of(run.config.data, run.info))
+        except DyngsError as error:
+            captured = Captured(run.config.data, error)
     opened = Opened(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
     if edited is None:
         return opened

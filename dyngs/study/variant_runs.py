@@ -18,6 +18,7 @@ from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.keys import DynamicModel, FieldSection
+from dyngs.gaussians.restored import restored_model
 from dyngs.models.checkpoint import read_capture_of, settings_of
 from dyngs.models.kind import Moves, capability
 from dyngs.ops.native import kernel_threads
@@ -36,7 +37,7 @@ from dyngs.runs.stored_file import write_scene
 from dyngs.study.measure import Subject
 from dyngs.study.runs import finished
 from dyngs.study.variants import Settings, Value, Variant
-from dyngs.training.new_trainer import assemble, restored_model
+from dyngs.training.new_trainer import assemble
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width"}
 """The key that sets the size of a field, by its kind; free primitives have none."""

@@ -23,7 +23,7 @@ from dyngs.core.errors import DyngsError
 
 # The others wait while the first one reads, evaluates, or tries settings in small runs
 TIMEOUT = timedelta(days=30)
-CHUNK = 2**22  # Most values that are summed at once: the memory that a sum takes for a while, twice
+CHUNK = 2**22  # Most values that are summed at once: each process holds those of all for a while
 FAILED = "dyngs/failed"  # Key of the store that counts the processes that have said why they end
 STOP = "dyngs/stop"  # Key of the store that counts the processes that were told to stop
 EXIT_INTERRUPTED = 130  # Exit code of a process that was told to stop, as after Ctrl-C
@@ -121,17 +121,12 @@ class Processes:
         processes."""
         if self.size == 1:
             return
-        for bucket in _buckets(tensors):
-            flat = (
-                bucket[0].reshape(-1)
-                if len(bucket) == 1
-                else torch.cat([x.reshape(-1) for x in bucket])
-            )
+        for x in (x for x in tensors if x.numel()):
+            flat = x.reshape(-1)
             for chunk in flat.split(CHUNK):
                 chunk.copy_(self._summed(chunk))
-            for x, values in zip(bucket, flat.split([x.numel() for x in bucket]), strict=True):
-                if len(bucket) > 1 or not x.is_contiguous():  # else they are the same memory
-                    x.copy_(values.view_as(x))
+            if not x.is_contiguous():  # else they are the same memory
+                x.copy_(flat.view_as(x))
 
     def sum_gradients_(self, leaves: Sequence[Tensor], report: Tensor) -> None:
         """Replace the gradients of ``leaves`` and the values of ``report`` (R,), in place, by their
@@ -186,18 +181,14 @@ class Processes:
             )
 
     def _summed(self, x: Tensor) -> Tensor:
-        """Return the sum (n,) over the processes: each sums a part of the values, in the order of
-        the processes."""
-        length = -(-len(x) // self.size)
-        own = torch.nn.functional.pad(x, (0, self.size * length - len(x)))
-        parts = torch.empty_like(own)
+        """Return the sum (n,) over the processes, in their order."""
+        parts = [torch.empty_like(x) for _ in range(self.size)]
         with self._connected():
-            distributed.all_to_all_single(parts, own)
-            total, *others = parts.view(self.size, length)
-            for part in others:
-                total += part
-            distributed.all_gather(list(own.view(self.size, length)), total.contiguous())
-        return own[: len(x)]
+            distributed.all_gather(parts, x.contiguous())
+        total, *others = parts
+        for part in others:
+            total += part
+        return total
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
@@ -242,15 +233,3 @@ def _checksum(tensors: Mapping[str, Tensor]) -> int:
             found += (start + 1) * int((chunk.long() * (2 * places + 1)).sum())
         total = (total * 1_000_003 + found) % 2**63
     return total
-
-
-def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
-    """Yield the tensors in order, small ones together, up to ``CHUNK`` values."""
-    bucket: list[Tensor] = []
-    for x in (x for x in tensors if x.numel()):
-        if bucket and sum(y.numel() for y in bucket) + x.numel() > CHUNK:
-            yield bucket
-            bucket = []
-        bucket.append(x)
-    if bucket:
-        yield bucket

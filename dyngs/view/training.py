@@ -18,7 +18,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.runs.opened import Captured, Opened, cameras_for_paths
+from dyngs.runs.opened import Captured, Opened
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.gate import free_port
@@ -128,10 +128,8 @@ def opened_training(trainer: Trainer[Any]) -> Opened:
     config = trainer.config
     views = trainer.images.views
     shown = captured_views(views, config.data, trainer.images)
-    cameras = cameras_for_paths(views, config.data)
-    captured = Captured(config.data, trainer.info, trainer.capture)
+    captured = Captured(config.data, trainer.capture)
     captured.once("views", lambda: shown)
-    captured.once("cameras", lambda: cameras)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))
     name = config.run.name

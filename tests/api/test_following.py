@@ -90,15 +90,6 @@ def test_two_processes_end_with_the_bytes_of_one(
     assert len(counts) > 3, "the set of Gaussians changes"
 
 
-def test_two_processes_with_a_gpu_each_do_so_too(still: Path, tmp_path: Path) -> None:
-    """On pretended GPUs: whatever is exchanged or compared lies where it has to."""
-    one, two = (_still(still, tmp_path / name, batch_size=2, steps=6) for name in ("one", "two"))
-    codes, said = run_in(2, do.trained_on_gpu, tmp_path, [two])
-    assert codes == [0, 0], said
-    train(one)
-    _require_same_bytes(tmp_path / "one", tmp_path / "two")
-
-
 def test_four_do_so_too_and_write_one_run(still: Path, tmp_path: Path) -> None:
     codes, said = run_in(4, do.trained, tmp_path, [_still(still, tmp_path / "four")])
     assert codes == [0] * 4, said
@@ -109,18 +100,6 @@ def test_four_do_so_too_and_write_one_run(still: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "four").iterdir()) == sorted(
         path.name for path in (tmp_path / "one").iterdir()
     )
-
-
-def test_two_views_for_each_process_differ_by_rounding(still: Path, tmp_path: Path) -> None:
-    """Rotations aside: of Gaussians that are round, their gradient is rounding, of which Adam makes
-    full steps."""
-    few = {"batch_size": 4, "steps": 3}
-    codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "two", **few)])
-    assert codes == [0, 0], said
-    train(_still(still, tmp_path / "one", **few))
-    one, two = (latest_checkpoint(tmp_path / name).part("gaussians") for name in ("one", "two"))
-    for name in one.keys() - {"quats"}:
-        torch.testing.assert_close(one[name], two[name], rtol=1e-4, atol=1e-5)
 
 
 def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Path) -> None:

@@ -4,25 +4,19 @@ nothing had happened."""
 from __future__ import annotations
 
 import json
-import os
 import re
-import select
 import shutil
 import signal
-import subprocess
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from moving_scene import write_timed_capture
 from tiny_fields import ALL_KINDS, busy_config, write_tiny_capture
-from tiny_people import NET, people
 from torch import Tensor
 
 from dyngs.api import train as train_module
-from dyngs.api.train import train, with_capture
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import (
     Config,
@@ -36,24 +30,17 @@ from dyngs.config import (
 )
 from dyngs.config.io import (
     RESOLVED_NAME,
-    load_config,
     load_resolved,
-    packaged_preset,
-    packaged_presets,
-    save_config,
 )
 from dyngs.core.errors import DyngsError
-from dyngs.data import read
-from dyngs.data.capture import Capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.static.keys import StaticModel
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
 from dyngs.training.events import Event, StepDone
-from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import StepReport, Trainer
 
 # Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.
@@ -148,15 +135,6 @@ def test_a_run_learns_and_leaves_its_folder(capture: Path, tmp_path: Path) -> No
     assert losses[-8:].mean() < 0.6 * losses[:8].mean()
 
 
-def test_the_default_folder_has_the_name_of_the_run(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    config = _config(capture, tmp_path, steps=1, run=RunConfig(name="pond", threads=1))
-    assert train(config) == Path("runs/pond")
-    assert checkpoint_paths(tmp_path / "runs" / "pond")
-
-
 @pytest.mark.parametrize("strategy", [BUSY, BUSY_MCMC], ids=["default", "mcmc"])
 def test_the_seed_decides_every_byte_and_threads_none(
     capture: Path, tmp_path: Path, strategy: DefaultStrategy | McmcStrategy
@@ -174,24 +152,6 @@ def test_the_seed_decides_every_byte_and_threads_none(
     assert results["a"] != results["other seed"]
     counts = {record["num_gaussians"] for record in _log(tmp_path / "a")}
     assert len(counts) > 2, "the set of Gaussians must change, or this test shows little"
-
-
-def test_threads_decide_nothing_above_the_grain_of_torch(capture: Path, tmp_path: Path) -> None:
-    """torch shares work among threads from 32,768 elements on; some of its functions then round
-    otherwise."""
-    results = []
-    for threads in (1, 2):
-        config = _config(
-            capture,
-            tmp_path,
-            steps=7,
-            strategy=BUSY.model_copy(update={"max_gaussians": 150_000}),
-            model=StaticModel(sh_degree=1, filter_3d=True),
-            init=RandomInit(num_random=100_003),
-            run=RunConfig(dir=tmp_path / str(threads), threads=threads),
-        )
-        results.append(_final_bytes(train(config)))
-    assert results[0] == results[1]
 
 
 @pytest.mark.parametrize("stop_at", [2, 8])
@@ -216,50 +176,11 @@ def test_resumed_equals_uninterrupted(
     ]
 
 
-@pytest.mark.parametrize("stop_at", [2, 8])
-def test_a_scene_that_dynamic_finds_still_has_the_bytes_of_static_also_if_resumed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
-) -> None:
-    root = write_tiny_capture(tmp_path / "capture")
-    words = [f"data.root={root}", "train.steps=14", "init.num_random=40", "run.threads=1"]
-    still = train(load_config("static", [*words, f"run.dir={tmp_path / 'static'}"]))
-    whole = train(load_config("dynamic", [*words, f"run.dir={tmp_path / 'dynamic'}"]))
-    config = load_config("dynamic", [*words, f"run.dir={tmp_path / 'parts'}"])
-    resumed = _stopped_and_resumed(config, stop_at, monkeypatch)
-    assert _final_bytes(resumed) == _final_bytes(whole) == _final_bytes(still)
-
-
 def test_sigterm_saves_too(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _interrupt_after(3, monkeypatch, signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt, match="stopped after step 3"):
         train(_config(capture, tmp_path / "run"))
     assert load_run(tmp_path / "run").step == 3
-
-
-@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals")
-def test_a_closed_terminal_saves_too(capture: Path, tmp_path: Path) -> None:
-    """A real process whose terminal goes away while it prints there."""
-    config = _config(capture, tmp_path / "run", steps=100_000)
-    save_config(config, tmp_path / "config.yaml")
-    controlling, terminal = os.openpty()
-    files = {"stdin": terminal, "stdout": terminal, "stderr": terminal}
-    environment = os.environ | {"TERM": "xterm"}
-    with subprocess.Popen(
-        [sys.executable, "-c", IN_TERMINAL, str(tmp_path / "config.yaml"), str(tmp_path / "run")],
-        start_new_session=True,
-        env=environment,
-        **files,
-    ) as process:
-        os.close(terminal)
-        log = tmp_path / "run" / "log.jsonl"
-        printed = b""
-        while process.poll() is None and not (log.is_file() and log.stat().st_size):
-            if select.select([controlling], [], [], 0.05)[0]:
-                printed += os.read(controlling, 65536)
-        os.close(controlling)
-        assert process.wait(60) == 130, printed
-    done = load_run(tmp_path / "run").step
-    assert done == _log(tmp_path / "run")[-1]["step"] > 0
 
 
 @pytest.fixture
@@ -271,16 +192,6 @@ def interrupted(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         with pytest.raises(KeyboardInterrupt):
             train(_config(tmp_path / "capture", tmp_path / "run", steps=6))
     return tmp_path / "run"
-
-
-def test_a_resumed_run_names_images_that_were_replaced(
-    interrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    images = tmp_path / "capture" / "train"
-    shutil.copyfile(images / "r_002.png", images / "r_001.png")
-    assert main(["train", "--resume", str(interrupted)]) == 0
-    warning = "files of 1 training view have changed since the run began: train/r_001"
-    assert f"dyngs: warning: {warning}\n" in capsys.readouterr().err
 
 
 def test_a_resumed_run_refuses_another_capture(
@@ -339,60 +250,7 @@ def test_an_edited_configuration_that_contradicts_the_checkpoint_is_refused(
         assert said in capsys.readouterr().err
 
 
-def test_time_adds_up_over_resumes(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run_dir = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        _interrupt_after(3, patch)
-        with pytest.raises(KeyboardInterrupt):
-            train(_config(capture, run_dir))
-    before = load_run(run_dir).seconds_train
-    (run_dir / "timing.json").write_text(json.dumps({"seconds_train": {"3": before + 1000}}))
-    train(load_resolved(run_dir), resume_from=run_dir)
-    assert 1000 + before < load_run(run_dir).seconds_train < 1060 + before
-
-
-def test_a_run_is_never_overwritten(
-    capture: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    config = _config(capture, tmp_path / "run", steps=4)
-    with monkeypatch.context() as patch:
-        _interrupt_after(2, patch)
-        with pytest.raises(KeyboardInterrupt):
-            train(config)
-    with pytest.raises(
-        DyngsError, match=r"already holds a run, this very one, stopped after step 2 of 4.*--resume"
-    ):
-        train(config)
-    train(config, resume_from=tmp_path / "run")
-    before = _final_bytes(tmp_path / "run")
-    capsys.readouterr()
-    assert train(config) == tmp_path / "run"
-    line = capsys.readouterr().out
-    assert re.search(r"holds just this run, finished.*dyngs eval.*--resume.*run.dir", line)
-    assert line.count("\n") == 1
-    with pytest.raises(
-        DyngsError,
-        match=r"another one \(train.steps is 4 there and 9 here\).*--resume .*train.steps=9",
-    ):
-        train(_config(capture, tmp_path / "run", steps=9))
-    with pytest.raises(
-        DyngsError, match=r"another one \(run.seed is 42 there and 7 here\); give another run.dir"
-    ):
-        train(config.model_copy(update={"run": config.run.model_copy(update={"seed": 7})}))
-    # finished: nothing to do
-    assert train(config, resume_from=tmp_path / "run") == tmp_path / "run"
-    assert _final_bytes(tmp_path / "run") == before
-
-
-@pytest.mark.parametrize("is_replaced", [False, True])
-def test_a_folder_that_is_removed_loses_nothing_but_its_log(
-    capture: Path, tmp_path: Path, is_replaced: bool
-) -> None:
+def test_a_folder_that_is_removed_loses_nothing_but_its_log(capture: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     still = tmp_path / "still"
     train(_config(capture, still, steps=12))
@@ -400,32 +258,10 @@ def test_a_folder_that_is_removed_loses_nothing_but_its_log(
     def remove(event: Event) -> None:
         if isinstance(event, StepDone) and event.step == 5:
             shutil.rmtree(run)
-            if is_replaced:
-                run.write_text("mine")
 
-    with pytest.raises(
-        DyngsError, match=r"step 12 is in .*; go on with `dyngs train --resume"
-    ) as caught:
-        train(_config(capture, run, steps=12), listeners=[remove])
-    found = tmp_path / ("run_2" if is_replaced else "run")
-    assert f"--resume {found}`" in str(caught.value)
-    assert _final_bytes(found) == _final_bytes(still)
-    assert train(load_resolved(found), resume_from=found) == found
-    assert not is_replaced or run.read_text() == "mine"
-
-
-def test_a_run_is_known_by_what_was_asked_for(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Also where training has chosen something itself."""
-    config = _config(capture, tmp_path / "run", train=TrainConfig(steps=3, robust="auto"))
-    before = _final_bytes(train(config))
-    assert load_resolved(tmp_path / "run").train.robust == "never"
-    assert load_resolved(tmp_path / "run" / "asked.yaml") == config
-    train(config)
-    assert "holds just this run" in capsys.readouterr().out
-    assert _final_bytes(tmp_path / "run") == before
-    assert not (train(_config(capture, tmp_path / "plain", steps=3)) / "asked.yaml").exists()
+    assert train(_config(capture, run, steps=12), listeners=[remove]) == run
+    assert _final_bytes(run) == _final_bytes(still)
+    assert train(load_resolved(run), resume_from=run) == run
 
 
 def test_bad_input_leaves_no_folder(tmp_path: Path) -> None:
@@ -486,11 +322,6 @@ def _saved_often(config: Config, minutes: float = 5.0) -> Config:
     )
 
 
-def test_checkpoints_come_by_time_in_every_preset() -> None:
-    for name in packaged_presets():
-        assert load_config(packaged_preset(name), ["data.root=nowhere"]).train.save_minutes == 5
-
-
 @pytest.mark.parametrize("strategy", [BUSY, BUSY_MCMC], ids=["default", "mcmc"])
 def test_saving_changes_no_byte(
     capture: Path,
@@ -504,42 +335,6 @@ def test_saving_changes_no_byte(
     assert saves_each_step[1:] == list(range(1, 15))
     assert [path.stem for path in checkpoint_paths(often)] == ["step_0000013", "step_0000014"]
     assert _final_bytes(plain) == _final_bytes(often)
-
-
-def test_saving_changes_no_byte_of_a_network(tmp_path: Path, saves_each_step: list[int]) -> None:
-    root = people(tmp_path / "people", (1, 2))
-    ends = []
-    for minutes in (0.0, 5.0):
-        run = RunConfig(dir=tmp_path / f"run{minutes:g}", threads=1)
-        config = Config(data=DataConfig(root=root), model=NET, train=TrainConfig(steps=3), run=run)
-        ends.append(_final_bytes(train(_saved_often(config, minutes))))
-    assert saves_each_step == [3, 1, 2, 3]
-    assert ends[0] == ends[1]
-
-
-def test_the_capture_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Deciding, training and evaluating hand it on."""
-    root = write_tiny_capture(tmp_path / "capture")
-    reads = list[Path]()
-    real = read._finished
-
-    def counted(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
-        reads.append(capture.root)
-        return real(capture, options, decode_videos)
-
-    monkeypatch.setattr(read, "_finished", counted)
-    words = [
-        "train.steps=4",
-        "train.eval_every=2",
-        "init.num_random=40",
-        "model.num_random_moving=20",
-        "run.threads=1",
-    ]
-    config = load_config(
-        packaged_preset("dynamic"), [f"data.root={root}", f"run.dir={tmp_path / 'run'}", *words]
-    )
-    assert (tmp_path / "run" / "metrics.json") in train(config).iterdir()
-    assert len(reads) == 1
 
 
 # --- scenes that move
@@ -565,24 +360,6 @@ def _kind_of(run_dir: Path) -> str:
     return run_dir.parent.name.rstrip("0123456789")
 
 
-def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
-    log = _log(whole_run)
-    moving = [record["num_moving"] / record["num_gaussians"] for record in log]
-    assert moving[:7] == [0.0] * 7
-    assert all(0 < fraction < 1 for fraction in moving[7:]), (
-        "a part of them must move, or the tests below show little"
-    )
-    assert log[7]["num_moving"] > 12, "not only the random Gaussians"
-    assert log[-1]["num_moving"] != log[13]["num_moving"], "some must have been frozen since"
-    assert len({record["num_gaussians"] for record in log}) > 3
-    losses = torch.tensor([record["loss"] for record in log])
-    assert losses[-4:].mean() < losses[:4].mean()
-    assert log[-1]["bad_gradients"] == 0
-    scene = load_run(whole_run).scene
-    assert scene.moving_fraction == moving[-1]
-    assert len(scene.times) == 16
-
-
 @pytest.mark.parametrize(
     ("whole_run", "stop_at"),
     [
@@ -606,35 +383,6 @@ def test_a_resumed_moving_run_equals_an_uninterrupted_one(
     assert [[r[k] for k in same] for r in _log(resumed)] == [
         [r[k] for k in same] for r in _log(whole_run)
     ]
-
-
-def test_saving_changes_no_byte_of_a_moving_run(
-    whole_run: Path, moving_capture: Path, tmp_path: Path, saves_each_step: list[int]
-) -> None:
-    often = train(busy_config(moving_capture, tmp_path / "often", _kind_of(whole_run)))
-    assert saves_each_step == list(range(1, 25))
-    assert _final_bytes(often) == _final_bytes(whole_run)
-
-
-@pytest.mark.parametrize("kind", ALL_KINDS)
-@pytest.mark.parametrize("steps", [2, 8, 11, 20], ids=["coarse", "begin", "fine", "split"])
-def test_what_is_loaded_is_what_the_trainer_draws(
-    moving_capture: Path, tmp_path: Path, kind: str, steps: int
-) -> None:
-    """At any time, with the 3D filter."""
-    config = busy_config(moving_capture, tmp_path, kind, filter_3d=True, freeze_below_px=0.1)
-    trainer = assemble(config)
-    for _ in range(steps):
-        trainer.step()
-    save_config(config, tmp_path / RESOLVED_NAME)
-    save_checkpoint(tmp_path, trainer.checkpoint(), 1.0)
-    scene = load_run(tmp_path).scene
-    assert scene.is_static == (steps == 2)
-    for time in (0.0, 0.37, 1.0):
-        image = replace(trainer.images[0], time=time)
-        drawn = trainer.model.training.time_step(trainer.model.scene, image, steps + 1).gaussians
-        for name, x in scene.at(time).tensors().items():
-            torch.testing.assert_close(x, drawn.tensors()[name].detach(), rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
@@ -696,20 +444,6 @@ def test_a_field_that_is_no_number_stops_the_run(
         assert load_run(run_dir).scene.at(0.5).means.isfinite().all()
 
 
-def test_a_field_that_is_huge_stops_the_run(
-    whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By what overflows first, a term of the loss or what the field makes of the Gaussians."""
-    _spoil_in_step(11, monkeypatch, 1e30)
-    config = busy_config(moving_capture, tmp_path / "run", _kind_of(whole_run))
-    with pytest.raises(
-        DyngsError,
-        match=r"^step 11, view 'train/r_0\d\d': the (field makes|loss term) .*step_0000008",
-    ):
-        train(config.model_copy(update={"train": TrainConfig(steps=24, save_every=4)}))
-    assert load_run(tmp_path / "run").step == 8
-
-
 def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> None:
     """Fill all that the field has learned with ``value`` before ``step``."""
     real = Trainer.step
@@ -722,10 +456,3 @@ def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> 
         return real(trainer)
 
     monkeypatch.setattr(Trainer, "step", stepping)
-
-
-def test_the_captures_of_a_network_are_left_as_they_are(tmp_path: Path) -> None:
-    """The folder of captures is itself no capture, and holds many images below."""
-    root = people(tmp_path, (1,))
-    config = Config.model_validate({"data": {"root": root}, "model": NET})
-    assert with_capture(config) == config

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dyngs.capture.fixed_camera import FOCAL, read_fixed_camera, zoomed
+from dyngs.capture.fixed_camera import FOCAL, read_fixed_camera
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.io.write import write_image
@@ -53,12 +53,3 @@ def test_masks_are_named_as_images(tmp_path: Path) -> None:
     assert shown.path.name == "f1.png"
     with pytest.raises(DyngsError, match="no such folder of masks"):
         read_fixed_camera(DataConfig(root=root), tmp_path / "none")
-
-
-def test_a_zoomed_camera_stands_back(tmp_path: Path) -> None:
-    view = read_fixed_camera(DataConfig(root=frames(tmp_path / "c", 1))).splits["train"][0]
-    far = zoomed(view, 2.0, 3.0)
-    point = view.cam_from_world @ np.array([0.4, 0.2, -3.0, 1.0])
-    before = view.intrinsics @ point[:3]
-    after = far.intrinsics @ (far.cam_from_world @ [0.4, 0.2, -3.0, 1.0])[:3]
-    assert (after / after[2]).tolist() == pytest.approx((before / before[2]).tolist())

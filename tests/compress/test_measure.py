@@ -16,10 +16,10 @@ from dyngs.compress.measure import (
 )
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
+from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.runs.stored_file import decoded
-from dyngs.training.new_trainer import restored_scene
 
 
 def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:

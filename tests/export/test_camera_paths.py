@@ -137,27 +137,6 @@ def test_cameras_are_those_that_were_meant(document: Any, tmp_path: Path) -> Non
         assert (path.fps, path.times, path.notes) == (30.0, None, ())
 
 
-def test_what_a_file_leaves_open(tmp_path: Path) -> None:
-    views = [{"camera_to_world": pose.ravel().tolist()} for pose in OPENGL]
-    path = read_path(written(tmp_path, nerfstudio(camera_path=views, default_fov=90)))
-    assert path.times is None
-    assert float(path.cameras.intrinsics[0, 0, 0]) == pytest.approx(HEIGHT / 2)
-    blender = written(tmp_path, {"camera_angle_x": math.pi / 2, "frames": transforms()["frames"]})
-    with pytest.raises(DyngsError, match="'width' is missing"):
-        read_path(blender)
-    found = read_path(blender, size=(40, 30)).cameras
-    assert float(found.intrinsics[0, 0, 0]) == pytest.approx(20)
-
-
-def test_sizes_and_lenses_of_frames(tmp_path: Path) -> None:
-    document = transforms(k1=0.1, p1=0.0)
-    assert "lens distortion (k1) is left out" in read_path(written(tmp_path, document)).notes[0]
-    del document["w"], document["h"]
-    for frame in document["frames"]:
-        frame |= {"w": WIDTH, "h": HEIGHT}
-    assert read_path(written(tmp_path, document)).cameras.width == WIDTH
-
-
 # Keyframes in files.
 
 
@@ -189,21 +168,6 @@ def test_keyframes_of_files(tmp_path: Path, document: Any, wanted: Any) -> None:
     found = path.cameras.centers[:, 0].numpy()
     np.testing.assert_allclose(found, wanted, atol=1e-6)
     assert (path.times, path.warnings, path.fps) == (None, (), 10.0)
-    far = {**document, "keyframes": [dict(x) for x in document["keyframes"]]}
-    for entry in far["keyframes"]:
-        rows = [list(row) for row in entry["cam_from_world"]]
-        rows[0][3] -= 1e8
-        entry["cam_from_world"] = rows
-    path = read_path(written(tmp_path, far), np.array([1e8, 0, 0]))
-    np.testing.assert_allclose(path.cameras.centers[:, 0].numpy(), wanted, atol=1e-6)
-
-
-def test_a_frozen_camera_and_a_frozen_time(tmp_path: Path) -> None:
-    still = read_path(written(tmp_path, keyed([key(3, time=0), key(3, time=1)], num_frames=5)))
-    assert set(still.cameras.centers[:, 0].tolist()) == {3.0}
-    assert still.times == pytest.approx((0, 0.25, 0.5, 0.75, 1))
-    frozen = [key(0, time=0.5), key(4, time=0.5)]
-    assert read_path(written(tmp_path, keyed(frozen, num_frames=5))).times == (0.5,) * 5
 
 
 def test_a_loop_leads_back_without_showing_the_first_frame_twice(tmp_path: Path) -> None:
@@ -223,46 +187,31 @@ SPINE = keyed([key(0), key(1)])
 @pytest.mark.parametrize(
     ("document", "problem"),
     [
-        (GOOD | {"width": None}, "'width' is missing"),
         (GOOD | {"width": 0}, "'width' is 0"),
-        (GOOD | {"fps": "fast"}, "'fps'"),
         (GOOD | {"frames": []}, "'frames'"),
-        (GOOD | {"frames": [3]}, r"frames\[0\]"),
         (GOOD | {"frames": [{}]}, r"frames\[0\].*cam_from_world"),
-        (GOOD | {"fl_x": True}, "'fl_x'"),
         (GOOD | {"frames": [{"cam_from_world": [[1, 2], [3]]}]}, r"frames\[0\].*4x4"),
-        (GOOD | {"frames": [{"cam_from_world": [[10**400, 2], [3, 4]]}]}, r"frames\[0\].*4x4"),
         (GOOD | {"frames": [{"cam_from_world": (2 * np.eye(4)).tolist()}]}, r"frames\[0\]"),
         (GOOD | {"frames": [{"cam_from_world": np.full((4, 4), np.nan).tolist()}]}, "NaN"),
         (GOOD | {"frames": [FRAME | {"time": "late"}]}, "'time'"),
-        (GOOD | {"frames": [FRAME | {"time": math.nan}]}, "'time'"),
         (GOOD | {"keyframes": [FRAME]}, "one non-empty list"),
         (GOOD | {"frames": [FRAME, FRAME | {"time": 0.5}]}, "no 'time'"),
         ({"path": [{"R": [0, 0, 0, 1], "T": [0.5, 0.5, 0.5]}]}, "a path of instant-ngp"),
         (nerfstudio(camera_type="equirectangular"), "equirectangular"),
-        (nerfstudio(camera_path=[]), "needs a list of cameras"),
         (nerfstudio(camera_path=[{"camera_to_world": [1] * 16, "fov": "wide"}]), "'fov' is 'wide'"),
-        (nerfstudio(camera_path=[{"fov": 50}]), "'transform_matrix': the pose must be"),
         (nerfstudio(render_height=10**400), "'render_height' is 1000"),
-        (nerfstudio(render_width=1e9), "'width' is 1000000000"),
         ([3], "needs a list of cameras"),
-        ([of_3dgs(0, rotation=[[1, 2, 3]])], "'rotation' must hold 3x3"),
         ([of_3dgs(0, position=[1, 2, math.nan])], "'position' must hold 3"),
-        ([of_3dgs(0, fx=None)], "'fl_x' is missing"),
         ([of_3dgs(0), of_3dgs(1, width=7)], "another size than the first"),
         (transforms(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
         ({"frames": [{"w": 8, "h": 8}, {"w": 9, "h": 8}]}, "differ in size"),
         ("frames", "a camera path is a JSON object"),
         (keyed([key(0, time=0.1), key(1)]), r"keyframes\[1\] has no 'time'"),
-        (keyed([key(0), key(1, at=1)]), r"keyframes\[0\] has no 'at'"),
         (keyed([key(0, at=2), key(1, at=2)]), r"keyframes\[1\] is 'at' 2 s"),
-        (keyed([key(0, at=-1)]), "'at' is -1"),
         (SPINE | {"loop": 1}, "'loop' is 1"),
-        (SPINE | {"num_frames": 0}, "'num_frames' is 0"),
         (SPINE | {"num_frames": 2.5}, "whole number"),
         (SPINE | {"num_frames": 3, "seconds": 2}, "give one of them"),
         (SPINE | {"seconds": 1e6}, "at most 100000"),
-        (keyed([key(0, at=0), key(1, at=9e5)]), "at most 100000"),
         (keyed([key(0, at=0), key(1, at=2)], seconds=2, loop=True), "make it longer"),
     ],
 )
@@ -391,18 +340,6 @@ def test_a_thrown_camera_follows_its_parabola() -> None:
     np.testing.assert_allclose(centers_of(made), parabola(seconds), atol=1e-9)
 
 
-@pytest.mark.parametrize("period", [None, 4.7])
-def test_no_jump_in_velocity(period: float | None) -> None:
-    """At the keys, and where a loop closes, the velocity before is the velocity after."""
-    rng = np.random.default_rng(3)
-    keys = keys_at(rng.normal(size=(5, 3)), np.array([0.0, 0.5, 1.7, 2.0, 3.1]), period)
-    seconds = keys.seconds[1:-1] if period is None else np.append(keys.seconds, 4.7)
-    h = 1e-5
-    before, here, after = (centers_of(interpolate_keyframes(keys, seconds + d)) for d in (-h, 0, h))
-    np.testing.assert_allclose((here - before) / h, (after - here) / h, atol=1e-2)
-    assert np.linalg.norm(after - before, axis=1).min() / h > 0.1, "it moves there"
-
-
 # Times and sizes.
 
 
@@ -433,21 +370,9 @@ def test_times_in_words() -> None:
         assert repr(text) in str(caught.value)
 
 
-sizes = st.integers(1, 400)
-
-
-@settings(max_examples=25, deadline=None)
-@given(old=st.tuples(sizes, sizes), new=st.tuples(sizes, sizes))
-def test_resizing_keeps_corners_inside_and_pixels_square(
-    old: tuple[int, int], new: tuple[int, int]
-) -> None:
-    intrinsics = torch.tensor([[[300.0, 0, old[0] / 2 + 3], [0, 300.0, old[1] / 2 - 2], [0, 0, 1]]])
-    cameras = resize_cameras(Cameras(torch.eye(4)[None], intrinsics, *old), *new)
-    corners = torch.tensor([[0.0, 0.0, 1.0], [old[0], old[1], 1.0]])
-    seen = (cameras.intrinsics[0] @ torch.linalg.inv(intrinsics[0]) @ corners.T).T[:, :2]
-    slack = 1e-3 * max(*old, *new)  # float32
-    assert (cameras.width, cameras.height) == new
-    assert (seen >= -slack).all()
-    assert (seen <= torch.tensor(new) + slack).all()
-    assert cameras.intrinsics[0, 0, 0] == pytest.approx(float(cameras.intrinsics[0, 1, 1]))
-    assert torch.allclose(seen.mean(dim=0), torch.tensor(new) / 2, atol=slack)
+def test_resizing_keeps_the_image_inside_and_pixels_square() -> None:
+    intrinsics = torch.tensor([[[300.0, 0, 53], [0, 300.0, 18], [0, 0, 1]]])
+    cameras = resize_cameras(Cameras(torch.eye(4)[None], intrinsics, 100, 40), 200, 200)
+    assert (cameras.width, cameras.height) == (200, 200)
+    wanted = [[600.0, 0, 106], [0, 600.0, 96], [0, 0, 1]]
+    assert cameras.intrinsics[0].tolist() == wanted

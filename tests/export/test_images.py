@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,22 +154,6 @@ def test_split_of_a_run(run: Opened, tmp_path: Path) -> None:
     assert not (tmp_path / "val").exists()
 
 
-def test_images_of_the_capture_are_not_replaced(run: Opened, tmp_path: Path) -> None:
-    """Views and their images have the same names; so may frames of a path."""
-    image = run.capture.splits["test"][0].image_path
-    folder = image.parent
-    before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-    (tmp_path / "link").symlink_to(folder)
-    for out in (folder, tmp_path / "link"):
-        with pytest.raises(DyngsError, match="exists and lies in"):
-            write_split_images(run, "test", out)
-    (tmp_path / "links").mkdir()
-    os.link(image, tmp_path / "links" / "frame_0000.png")
-    with pytest.raises(DyngsError, match=r"holds frame_0000\.png, a link to"):
-        write_path_images(run, CameraPath(cameras_around(1)), tmp_path / "links")
-    assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
-
-
 @pytest.mark.parametrize(
     ("given_names", "stems"),
     [
@@ -212,14 +195,6 @@ def test_sheet_holds_truth_render_and_error() -> None:
     assert panels[2].max() <= 4, "no error is black (magma's darkest)"
     expected = color_map(np.full((1, 1), 5 * 25 / 255), "magma")[0, 0]
     assert np.array_equal(sheet[-GAP - 4, -GAP - 4], expected)
-
-
-def test_large_and_unequal_images_fit() -> None:
-    rows = [
-        ("a" * 200, *[np.zeros((h, w, 3), np.uint8)] * 2) for h, w in ((40, 960), (10, 10), (1, 1))
-    ]
-    sheet = contact_sheet(rows)
-    assert sheet.shape == (3 * LABEL + 20 + 10 + 1 + GAP, GAP + 3 * (480 + GAP), 3)
 
 
 def test_near_is_red_far_is_blue_nothing_is_black() -> None:

@@ -232,10 +232,3 @@ def test_fixed_cameras_are_visited_once_each() -> None:
     once = path_along(cameras_at(poses), 9).cameras
     np.testing.assert_allclose(many.cameras.centers.numpy(), once.centers.numpy(), atol=1e-9)
     assert many.times is None
-
-
-def test_another_up_levels_the_path() -> None:
-    up = np.array([0.0, 0.1, 1.0])
-    path = path_along(cameras_at(walk(30, shake=0.1)), 30, up=up)
-    rights = path.cameras.cam_from_world[:, 0, :3].numpy()
-    np.testing.assert_allclose(rights @ up, 0, atol=1e-9)

@@ -30,11 +30,10 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, PointCloud
 from dyngs.data.read import read_capture
-from dyngs.deform.bodies.field import BodyField, BodyRest, bodies_of
+from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
 from dyngs.export import splat_files
-from dyngs.export.body_nodes import write_bodies
 from dyngs.export.cameras import NAME, write_cameras
 from dyngs.export.redrawn import compare_run, compare_splats
 from dyngs.export.splat_files import (
@@ -45,6 +44,7 @@ from dyngs.export.splat_files import (
     splats_at,
     tracks_of,
     up_of,
+    write_bodies,
     write_moving,
     write_run_sequence,
     write_run_splats,
@@ -156,8 +156,7 @@ def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
     assert how.turn == turn_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
     assert "the axes of the capture are kept" in writing_of(near, name)[1]
-    data = near.config.data.model_copy(update={"root": Path("no")})
-    lost = replace(near, captured=Captured(data, near.info))
+    lost = replace(near, captured=Captured(near.config.data, DyngsError("gone")))
     assert up_of(lost) is None
     how, line = writing_of(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
@@ -259,14 +258,6 @@ def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixtur
     assert main(["export", run, "--sh-degree", "3", "--out", str(tmp_path / "c.4dgs")]) == 2
 
 
-def test_without_the_package_of_moving_files(
-    tmp_path: Path, near: Opened, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "fourdgs", None)
-    with pytest.raises(DyngsError, match=r"pip install 'dyngs\[4dgs\]'"):
-        write_moving(near, tmp_path / "a.4dgs", [0.0])
-
-
 @pytest.fixture(scope="module")
 def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     """Of five balls the second and the fourth are one body, which turns by 0.9 times half a turn
@@ -315,25 +306,6 @@ def test_the_animation_of_bodies_shows_the_scene_at_all_times(
         means = splats_at(rolling, rolling.scene, time, how).gaussians.means[list(MOVING_ROWS)]
         atol = 1e-5 if time != 0.3 else 0.02  # between two poses of the file
         np.testing.assert_allclose(turns(now).apply(local) + place, means.numpy(), atol=atol)
-
-
-def test_bodies_that_stand_and_runs_without_bodies(
-    tmp_path: Path, rolling: Opened, near: Opened, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert isinstance(rolling.scene, DynamicScene)
-    body = bodies_of(rolling.scene.field)
-    assert body is not None
-    # splines of zeros, from a damaged or forged run
-    blank = {name: torch.zeros_like(body.parameters[name].detach()) for name in ("places", "quats")}
-    field = BodyField(body.others, body.rest, blank)
-    damaged = rolling.showing(replace(rolling.scene, field=field))
-    assert len(read_splats(write_bodies(damaged, tmp_path / "a.glb", 0.0).path).gaussians) == 5
-    with pytest.raises(DyngsError, match="no body that turns"):
-        write_bodies(near, tmp_path / "b.glb", 0.0)
-    for wrong in ("--out a.ply", "--times 0:1:3", "--static", "--sh-degree 1", "--format ply"):
-        assert main(["export", str(near.path), "--bodies", *wrong.split()]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]
 
 
 @pytest.fixture

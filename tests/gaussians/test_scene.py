@@ -18,10 +18,11 @@ from dyngs.config import FixedStrategy
 from dyngs.core.state import Role, part_of, tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.static.keys import StaticModel
-from dyngs.training.new_trainer import assemble, restored_scene
+from dyngs.training.new_trainer import assemble
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 

@@ -16,13 +16,14 @@ from dyngs.config.io import load_config
 from dyngs.config.kinds import kind_names, section_of_kind
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role
+from dyngs.gaussians.restored import restored_model
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.predict.ghg.learner import PersonPredictor, new_network
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.kind import HasGaussians, Predicts, capability, kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
-from dyngs.training.new_trainer import build, restored_model
+from dyngs.training.new_trainer import build
 from dyngs.training.trainer import Trainer
 
 TRAINED = {

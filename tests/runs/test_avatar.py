@@ -3,10 +3,9 @@ one is one line."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from synthetic_bodies import model, write_npz
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.cli import main
 from dyngs.config import Config, DataConfig, DefaultStrategy, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
@@ -24,13 +22,11 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.io.formats.similarity import Similarity
 from dyngs.io.tensor_file import read_tensors, write_tensors
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.runs import avatar
 from dyngs.runs.avatar import read_avatar, write_avatar
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.runs.frame import RunFrame
 from dyngs.runs.opened import open_run, open_scene
 
 
@@ -183,79 +179,3 @@ def test_only_people_are_exported(tmp_path: Path, run_dir: Path) -> None:
         write_avatar(run, tmp_path / "a.safetensors")
     with pytest.raises(DyngsError, match=r"a\.npz: an avatar is written as \.safetensors"):
         write_avatar(load_run(run_dir), tmp_path / "a.npz")
-
-
-def test_the_command_line_takes_the_file_for_the_run(
-    run_dir: Path, tmp_path: Path, motion: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "ann.safetensors"
-    assert main(["export", str(run_dir), "--format", "avatar", "--out", str(file)]) == 0
-    words = ["--out", str(tmp_path / "walk"), "--motion", str(motion)]
-    assert main(["render", str(file), *words, "--size", "24x24"]) == 0
-    assert len(list((tmp_path / "walk").glob("*.png"))) == 3
-    words = ["--out", str(tmp_path / "orbit"), "--path", "orbit", "--frames", "2"]
-    assert main(["render", str(file), *words, "--size", "24x24"]) == 0
-    assert len(list((tmp_path / "orbit").glob("*.png"))) == 2
-    words = [
-        "--out",
-        str(tmp_path / "spiral"),
-        "--motion",
-        str(motion),
-        "--path",
-        "spiral",
-        "--times",
-        "0:1:2",
-    ]
-    assert main(["render", str(file), *words, "--size", "24x24"]) == 0
-    assert len(list((tmp_path / "spiral").glob("*.png"))) == 2
-    words = ["--out", str(tmp_path / "splats"), "--motion", str(motion)]
-    assert main(["export", str(file), *words]) == 0
-    assert len(list((tmp_path / "splats").glob("*.ply"))) == 3
-    capsys.readouterr()
-    for wrong, line in (
-        (["export", str(file)], "is exported as Gaussians or tracks, with --out PATH"),
-        (["render", str(file), "--out", "x", "--view", "3"], "holds no views"),
-        (
-            ["export", str(run_dir), "--format", "avatar", "--time", "0.5"],
-            "--time does not go with --format avatar",
-        ),
-    ):
-        assert main(wrong) == 2
-        assert line in capsys.readouterr().err
-
-
-def test_a_person_of_a_file_becomes_a_page(
-    file: Path, motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    page = tmp_path / "page.html"
-    assert main(["export", str(file), "--motion", str(motion), "--out", str(page)]) == 0
-    header = json.loads(
-        page.read_text(encoding="utf-8").split('id="header">')[1].split("</script>")[0]
-    )
-    assert header["moves"]
-    assert len(header["bones"]["parents"]) == 55
-    assert header["up"] == pytest.approx([0.0, 1.0, 0.0], abs=1e-6)
-    capsys.readouterr()
-    assert main(["export", str(file), "--format", "html"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "Give --out FILE.html" in line
-
-
-def test_a_person_of_an_edited_run_is_in_its_frame(
-    capture: Path, run_dir: Path, motion: Path, tmp_path: Path
-) -> None:
-    """Files that hold nothing but the person have them where all other exports do."""
-    how = Similarity((0.6, 0.0, 0.0, 0.8), 2.5, (1.0, -2.0, 0.5))
-    opened = open_run(run_dir)
-    for one in (opened.in_motion(motion), opened.at_rest()):
-        moved = replace(one, edited=RunFrame(how, up="z")).in_own_frame()
-        assert moved.edited is None
-        for time in (0.0, 0.7):
-            wanted = how.gaussians(one.scene.at(time))
-            found = moved.scene.at(time)
-            torch.testing.assert_close(found.means, wanted.means, rtol=0, atol=2e-5)
-            torch.testing.assert_close(found.scales, wanted.scales, rtol=1e-4, atol=0)
-    edited = replace(opened, edited=RunFrame(how, up="z")).in_own_frame()
-    read = open_scene(write_avatar(edited, tmp_path / "there.safetensors"))
-    sizes = [x.scene.at(None).means.std(0).norm() for x in (read, opened.at_rest())]
-    assert float(sizes[0] / sizes[1]) == pytest.approx(2.5, rel=1e-4)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_people import people
 
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
@@ -19,7 +17,7 @@ from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import change_coordinates
 from dyngs.io.write import write_image
-from dyngs.runs.capture_record import RECORD_NAME, SAMPLE_BYTES, changed_files, named, write_record
+from dyngs.runs.capture_record import RECORD_NAME, SAMPLE_BYTES, changed_files, write_record
 
 
 @pytest.fixture
@@ -33,14 +31,6 @@ def capture(still: Path, tmp_path: Path) -> Path:
 
 def changes(root: Path, record: Path) -> list[str]:
     return changed_files(record, DataConfig(root=root), read_capture(root))
-
-
-def test_copied_and_touched_files_are_the_same(capture: Path, tmp_path: Path) -> None:
-    assert changes(capture, tmp_path) == []
-    shutil.copytree(capture, tmp_path / "elsewhere")
-    for path in (tmp_path / "elsewhere").rglob("*"):
-        os.utime(path, (1e9, 1e9))
-    assert changes(tmp_path / "elsewhere", tmp_path) == []
 
 
 def test_an_image_that_was_replaced_is_named(capture: Path, tmp_path: Path) -> None:
@@ -140,17 +130,6 @@ def test_where_the_reader_puts_the_origin_does_not_matter(capture: Path, tmp_pat
         changed_files(tmp_path, DataConfig(root=capture), elsewhere)
 
 
-def test_the_people_of_a_network_are_known(tmp_path: Path) -> None:
-    data = DataConfig(root=people(tmp_path / "people", (1, 2)))
-    write_record(tmp_path, data, None)
-    assert changed_files(tmp_path, data, None) == []
-    (tmp_path / "people" / "p1" / "more.txt").write_text("more")
-    assert changed_files(tmp_path, data, None) == ["p1"]
-    shutil.rmtree(tmp_path / "people" / "p2")
-    with pytest.raises(DyngsError, match=r"\(without training views p2\)"):
-        changed_files(tmp_path, data, None)
-
-
 @pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"views": {}}'])
 def test_a_run_without_a_record_goes_on(text: str | None, capture: Path, tmp_path: Path) -> None:
     (tmp_path / RECORD_NAME).unlink()
@@ -158,8 +137,3 @@ def test_a_run_without_a_record_goes_on(text: str | None, capture: Path, tmp_pat
         (tmp_path / RECORD_NAME).write_text(text)
     resize(capture)
     assert changes(capture, tmp_path) == []
-
-
-def test_many_names_are_counted() -> None:
-    assert named(["a", "b"]) == "a, b"
-    assert named(list("abcde")) == "a, b, c and 2 more"

@@ -20,6 +20,7 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
+from dyngs.gaussians.restored import restored_scene
 from dyngs.io import tensor_file
 from dyngs.io.tensor_file import write_tensors
 from dyngs.runs import checkpoint
@@ -35,7 +36,6 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.stored_file import drawable
 from dyngs.static.keys import StaticModel
-from dyngs.training.new_trainer import restored_scene
 
 
 def _checkpoint(step: int) -> Checkpoint:

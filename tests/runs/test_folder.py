@@ -16,23 +16,18 @@ import pytest
 from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.cli import main
 from dyngs.cli.demo_run import is_unused
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.export.splat_files import write_run_sequence
 from dyngs.io.lock import LOCK_NAME, InUseError, writing
-from dyngs.io.outputs import new_folder, require_new_folder
+from dyngs.io.outputs import require_new_folder
 from dyngs.runs.checkpoint import (
     KEEP_CHECKPOINTS,
     checkpoint_paths,
-    latest_checkpoint,
-    load_run,
-    save_checkpoint,
 )
-from dyngs.runs.folder import default_folder, require_empty, tidy
-from dyngs.runs.log import RunLog
+from dyngs.runs.folder import tidy
 from dyngs.runs.opened import open_run
 from dyngs.static.keys import StaticModel
 
@@ -121,31 +116,6 @@ def test_what_a_run_would_replace_is_never_replaced(
     assert _contents(out) == before
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_files_of_others_stay(still: Path, run_dir: Path, tmp_path: Path, command: str) -> None:
-    out = _filled(tmp_path / "out", FOREIGN)
-    before = _contents(out)
-    if command in ("compact", "synth", "demo", "resume"):
-        with pytest.raises(DyngsError):
-            COMMANDS[command](still, run_dir, out)
-        assert _contents(out) == before
-        return
-    COMMANDS[command](still, run_dir, out)
-    assert before.items() <= _contents(out).items()
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_file_in_place_of_the_folder_stays(
-    still: Path, run_dir: Path, tmp_path: Path, command: str
-) -> None:
-    (tmp_path / "out").write_text("mine")
-    with pytest.raises(DyngsError) as caught:
-        COMMANDS[command](still, run_dir, tmp_path / "out")
-    assert "\n" not in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    assert (tmp_path / "out").read_text() == "mine"
-
-
 @pytest.mark.parametrize("command", ["train", "compact", "export", "resume", "sequence"])
 def test_a_folder_that_cannot_be_written_is_told(
     still: Path, run_dir: Path, tmp_path: Path, command: str
@@ -161,18 +131,6 @@ def test_a_folder_that_cannot_be_written_is_told(
         assert "\n" not in str(caught.value)
     finally:
         out.chmod(0o700)
-
-
-def test_a_finished_run_that_cannot_be_written_is_finished(run_dir: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(run_dir, run)
-    before = _contents(run)
-    run.chmod(0o500)
-    try:
-        assert train(load_resolved(run), resume_from=run) == run
-        assert _contents(run) == before
-    finally:
-        run.chmod(0o700)
 
 
 def test_a_run_that_is_only_stored_stays(still: Path, run_dir: Path, tmp_path: Path) -> None:
@@ -259,55 +217,6 @@ def test_nothing_is_removed_through_a_link(tmp_path: Path) -> None:
     assert _contents(outside) == before
 
 
-def test_a_torn_last_line_of_the_log_is_dropped_once(run_dir: Path, tmp_path: Path) -> None:
-    lines = (run_dir / "log.jsonl").read_text().splitlines()
-    for cut in range(1, len(lines[3]) + 1):
-        (tmp_path / "log.jsonl").write_text("\n".join(lines[:3]) + "\n" + lines[3][:cut])
-        with RunLog(tmp_path, 4):
-            pass
-        whole = 4 if cut == len(lines[3]) else 3  # only its end of line lacked
-        assert (tmp_path / "log.jsonl").read_text() == "".join(
-            line + "\n" for line in lines[:whole]
-        )
-
-
-def test_the_time_of_a_checkpoint_is_there_as_soon_as_it_is(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A kill right after its rename loses no time of training, which train.minutes counts."""
-    checkpoint = latest_checkpoint(run_dir)
-    real = os.replace
-
-    def killed_after_checkpoint(source: Path, target: Path) -> None:
-        real(source, target)
-        if target.name.startswith("step_"):
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "replace", killed_after_checkpoint)
-    shutil.copy(run_dir / "config.yaml", tmp_path / "config.yaml")
-    with pytest.raises(KeyboardInterrupt):
-        save_checkpoint(tmp_path, checkpoint, 12.5)
-    assert load_run(tmp_path).seconds_train == 12.5
-
-
-def test_a_new_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with pytest.raises(DyngsError), new_folder(out, require_empty) as started:
-        _require(not _filled(started, {"a": ""}).is_dir())
-    assert not list(tmp_path.iterdir())
-    out.mkdir()
-    (out / LOCK_NAME).touch()  # of a process that was killed
-    with new_folder(out, require_empty) as started:
-        (started / "a").touch()
-    assert [path.name for path in out.iterdir()] == ["a"]
-    with (
-        pytest.raises(DyngsError, match="exists already"),
-        new_folder(tmp_path / "new", require_empty) as started,
-    ):
-        _filled(tmp_path / "new", {"b": "of somebody else"})
-    assert _contents(tmp_path) == {"out/a": b"", "new/b": b"of somebody else"}
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 def test_a_few_kills_lose_nothing(tmp_path: Path) -> None:
     """The first seconds of benchmarks/soak.py, which does this for long."""
@@ -338,23 +247,3 @@ def test_nothing_is_written_while_another_writes(
         with pytest.raises(InUseError, match=f"process {os.getpid()} on "):
             COMMANDS[command](still, out if command == "export" else run_dir, out)
         assert _contents(out) == before
-
-
-def test_the_command_says_it_in_one_line(
-    still: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["train", "static", f"data.root={still}", f"run.dir={run_dir}"]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "another one" in told
-    assert "run.dir" in told
-
-
-@pytest.mark.parametrize("name", ["", ".", "..", "a/../..", "/a"])
-def test_a_name_that_is_no_folder_below_runs_is_refused(name: str) -> None:
-    with pytest.raises(DyngsError, match=r"run\.name=.* must name a folder below runs"):
-        default_folder(name)
-
-
-def test_a_name_may_have_folders() -> None:
-    assert default_folder("scans/bench") == Path("runs/scans/bench")

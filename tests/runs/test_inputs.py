@@ -3,7 +3,6 @@ at it."""
 
 from __future__ import annotations
 
-import ast
 import os
 import shutil
 from collections.abc import Callable
@@ -20,7 +19,6 @@ from dyngs.config import DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
-from dyngs.evaluate.report import evaluate_run
 from dyngs.export.cameras import write_cameras
 from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.html.page import write_page
@@ -76,58 +74,6 @@ UNCHECKED = {
 """Functions that write without a check of their own, each with its reason."""
 
 
-def names_called(function: ast.AST) -> set[str]:
-    calls = (node.func for node in ast.walk(function) if isinstance(node, ast.Call))
-    return {
-        f.attr if isinstance(f, ast.Attribute) else f.id
-        for f in calls
-        if isinstance(f, ast.Attribute | ast.Name)
-    }
-
-
-def functions() -> dict[str, ast.FunctionDef]:
-    """Public functions outside the lowest rooms that take a path."""
-    found = {}
-    for file in sorted(PACKAGE.rglob("*.py")):
-        name = file.relative_to(PACKAGE).as_posix()
-        for node in ast.parse(file.read_text(encoding="utf-8")).body:
-            if (
-                isinstance(node, ast.FunctionDef)
-                and not node.name.startswith("_")
-                and not name.startswith(ROOMS_BELOW)
-            ):
-                given = [*node.args.args, *node.args.kwonlyargs]
-                if any(
-                    "Path" in ast.unparse(a.annotation) for a in given if a.annotation is not None
-                ):
-                    found[f"{name}:{node.name}"] = node
-    return found
-
-
-def unchecked() -> set[str]:
-    """Functions that write, or call such a function, and check nothing."""
-    known = functions()
-    writing = set(WRITERS)
-    while True:
-        found = {
-            name
-            for name, node in known.items()
-            if names_called(node) & writing
-            and not names_called(node) & CHECKS
-            and not name.startswith("cli/")
-        }
-        more = writing | {name.split(":")[1] for name in found}
-        if more == writing:
-            return found
-        writing = more
-
-
-def test_every_function_that_writes_checks_its_output() -> None:
-    """A new one calls ``require_output``, makes a new folder, or is named in ``UNCHECKED`` with its
-    reason."""
-    assert unchecked() == UNCHECKED.keys()
-
-
 def write_all(run: Path, out: Path) -> dict[str, Callable[[], object]]:
     """Functions of the Python API that write of a run, each to ``out``."""
     loaded = load_run(run)
@@ -179,14 +125,6 @@ def test_points_beside_exported_cameras_replace_nothing(tmp_path: Path, colmap_r
     with pytest.raises(DyngsError, match="exists and lies in"):
         write_cameras(colmap_root / "new.json", capture, capture.splits)
     assert (colmap_root / "points.ply").read_text() == "mine"
-
-
-def test_scores_replace_no_link_to_an_input(tmp_path: Path) -> None:
-    run = write_moving_run(tmp_path)
-    image = next(load_resolved(run).data.root.rglob("*.png"))
-    os.link(image, run / "metrics.json")
-    with pytest.raises(DyngsError, match="is the file that is read, as"):
-        evaluate_run(run)
 
 
 def test_what_a_run_reads(tmp_path: Path) -> None:

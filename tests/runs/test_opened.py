@@ -16,32 +16,12 @@ from two_balls import two_balls
 from dyngs.core.errors import DyngsError
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.runs import opened as opened_module
-from dyngs.runs.opened import FRAME_RATE, SHORTEST, Opened, open_run, open_scene
+from dyngs.runs.opened import FRAME_RATE, SHORTEST, Opened, open_scene
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_moving_run(tmp_path_factory.mktemp("run"), offset=(1.0, 2.0, 3.0))
-
-
-def test_a_capture_is_read_once_and_only_when_it_is_needed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read = opened_module.read_capture_of
-    calls = []
-    monkeypatch.setattr(opened_module, "read_capture_of", lambda *of: calls.append(of) or read(*of))
-    opened = open_scene(folder)
-    assert opened.background.tolist() == [1, 1, 1]
-    assert opened.world_offset.tolist() == [1, 2, 3]
-    assert not calls
-    for other in (opened, opened.on_background("black"), replace(opened, stated_up="y")):
-        assert other.cameras is not None
-        assert other.capture is opened.capture
-        assert other.seconds >= SHORTEST
-    assert len(calls) == 1
-    assert open_run(folder, opened.capture).capture is opened.capture
-    assert len(calls) == 1
 
 
 def test_without_its_capture_a_run_is_opened_all_the_same(tmp_path: Path) -> None:
@@ -74,11 +54,6 @@ def test_a_file_has_no_capture(name: str, tmp_path: Path) -> None:
     assert opened.scene.is_static
     with pytest.raises(DyngsError, match=f"{name}: a file, without the capture"):
         _ = opened.capture
-
-
-def test_a_run_is_named_by_its_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    assert open_scene(Path(".")).name == folder.name
 
 
 def test_another_background_is_drawn(folder: Path) -> None:

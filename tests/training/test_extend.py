@@ -13,7 +13,6 @@ from tiny_people import TINY
 
 from dyngs.api.train import train
 from dyngs.config import (
-    BudgetConfig,
     Config,
     DataConfig,
     DefaultStrategy,
@@ -117,15 +116,6 @@ def test_a_finished_run_goes_on_to_the_same_bytes_also_when_it_is_stopped(
     assert (one / "config.yaml").read_bytes() == (other / "config.yaml").read_bytes()
 
 
-def test_gaussians_are_added_again_where_the_new_schedule_says_so(
-    captures: Path, tmp_path: Path
-) -> None:
-    run = train(_config(captures, tmp_path / "run", "default"))
-    before = len(load_run(run).scene)
-    _to(run, 48)
-    assert len(load_run(run).scene) > before
-
-
 def test_a_run_that_was_stopped_may_become_longer_or_shorter(
     captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,29 +131,6 @@ def test_a_run_that_was_stopped_may_become_longer_or_shorter(
         shutil.copytree(run, copy)
         _to(copy, steps)
         assert load_run(copy).step == load_resolved(copy).train.steps == steps
-
-
-def test_limits_hold_on_but_that_of_time(
-    captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = BudgetConfig(max_gaussians=70, max_mb=1.0)
-    run = train(
-        _config(
-            captures,
-            tmp_path / "run",
-            "default",
-            budget=asked,
-            train=TrainConfig(steps=12, minutes=5),
-        )
-    )
-    capsys.readouterr()
-    _to(run, 24)
-    assert "train.minutes holds no longer" in capsys.readouterr().out
-    assert load_resolved(run).budget == asked
-    assert load_resolved(run).train.minutes is None
-    assert load_run(run).step == 24
-    assert len(load_run(run).scene) <= 70
-    assert load_run(run / "export").step == 24
 
 
 def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path: Path) -> None:

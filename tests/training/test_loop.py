@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 from collections.abc import Callable
 from functools import partial
 
@@ -12,7 +11,7 @@ from steps import Counting
 
 from dyngs.core.errors import DyngsError
 from dyngs.training.clock import Stopwatch
-from dyngs.training.events import Event, Message, Started, StepDone, TotalChanged
+from dyngs.training.events import Event, Message, Started, StepDone
 from dyngs.training.loop import Interrupts, Loop
 
 SIGNALS = [
@@ -48,62 +47,6 @@ def test_events_come_in_order_and_all_listeners_hear_them() -> None:
     assert events[2] == Message("step 2: something")
 
 
-def test_a_listener_sees_every_step_as_it_is() -> None:
-    seen = []
-
-    def listener(event: Event) -> None:
-        if isinstance(event, StepDone):
-            seen.append(
-                (event.step, event.is_last, event.total, event.num_gaussians, event.num_moving)
-            )
-            assert event.loop.trainer is trainer
-            assert event.report.loss == 0.5
-            trainer.num_gaussians += 1  # the next listener finds it so
-            assert event.num_gaussians == trainer.num_gaussians
-            assert event.bad_gradients == 0
-            assert event.seconds >= 0
-
-    trainer = Counting(done=4, num_gaussians=5, num_moving=2)
-    looped(trainer, 7, listener).run()
-    assert seen == [(5, False, 7, 5, 2), (6, False, 7, 6, 2), (7, True, 7, 7, 2)]
-
-
-def test_a_listener_may_exchange_the_trainer() -> None:
-    """From the next step on the other one is trained; listeners find it in the loop."""
-    first = Counting(num_gaussians=5)
-    second = Counting(done=10, num_gaussians=7)
-    seen = []
-
-    def exchanging(event: Event) -> None:
-        if isinstance(event, StepDone) and event.step == 2:
-            event.loop.trainer = second
-
-    def seeing(event: Event) -> None:
-        if isinstance(event, StepDone):
-            seen.append((event.step, event.num_gaussians))
-
-    looped(first, 12, exchanging, seeing).run()
-    assert seen == [(1, 5), (2, 7), (11, 7), (12, 7)]
-    assert (first.done, second.done) == (2, 12)
-
-
-@pytest.mark.parametrize(("total", "steps"), [(2, 2), (5, 5)])
-def test_another_number_of_steps_is_told_and_done(total: int, steps: int) -> None:
-    told: list[Event] = []
-
-    def listener(event: Event) -> None:
-        told.append(event)
-        if isinstance(event, StepDone) and event.step == 2:
-            event.loop.expect(total)
-            assert event.total == total
-            assert event.is_last == (total == 2)
-
-    trainer = Counting()
-    looped(trainer, 3, listener).run()
-    assert trainer.done == steps
-    assert [event for event in told if isinstance(event, TotalChanged)] == [TotalChanged(total)]
-
-
 def test_it_stops_between_two_steps() -> None:
     trainer = Counting()
     loop = looped(trainer, 9)
@@ -111,21 +54,6 @@ def test_it_stops_between_two_steps() -> None:
     assert trainer.done == 4
     loop.run()
     assert trainer.done == 9
-
-
-def test_nothing_is_done_after_the_end() -> None:
-    told: list[Event] = []
-    looped(Counting(done=3), 3, told.append).run()
-    assert told == [Started(3, 3)]
-
-
-def test_a_later_listener_hears_what_comes_later() -> None:
-    told: list[Event] = []
-    loop = looped(Counting(), 2)
-    loop.tell(Message("before"))
-    loop.subscribe(told.append)
-    loop.tell(Message("after"))
-    assert told == [Message("after")]
 
 
 def test_advice_is_added_to_a_failing_step() -> None:
@@ -144,15 +72,6 @@ def test_advice_is_added_to_a_failing_step() -> None:
     assert [event.step for event in told if isinstance(event, StepDone)] == [1, 2]
     with pytest.raises(DyngsError, match=r"^step 3: the loss is nan$"):
         looped(trainer, 5).run()
-
-
-def test_the_watch_leaves_pauses_out() -> None:
-    watch = Stopwatch()
-    before = watch.seconds
-    watch.pause(-1000)
-    assert 1000 <= watch.seconds - before < 1060
-    watch.pause(400)
-    assert 600 <= watch.seconds - before < 660
 
 
 @pytest.mark.parametrize("which", SIGNALS)
@@ -185,16 +104,3 @@ def test_nohup_is_respected() -> None:
             assert not interrupts.requested
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_other_threads_may_train_too() -> None:
-    seen = []
-
-    def work() -> None:
-        with Interrupts() as interrupts:
-            seen.append(interrupts.requested)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert seen == [False]

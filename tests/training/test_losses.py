@@ -25,24 +25,6 @@ def image() -> Image:
     return Image("r_7", cameras, torch.zeros(2, 2, 3), alpha=None, mask=None, time=0.25)
 
 
-def test_the_loss_is_the_sum_of_its_terms(image: Image) -> None:
-    terms = {
-        "image": torch.tensor(0.5, requires_grad=True),
-        "alpha": torch.tensor(0.125, dtype=torch.float64),
-    }
-    assert (
-        StepCheck(terms, random_scene().gaussians.tensors(), CPU).loss(3, image, MOVES_BY) == 0.625
-    )
-    assert StepCheck(terms, {}, CPU).loss(3, image, MOVES_BY) == 0.625
-
-
-def test_the_value_is_that_of_the_moment_of_asking(image: Image) -> None:
-    term = torch.tensor(0.5)
-    check = StepCheck({"image": term}, {}, CPU)
-    term.fill_(torch.nan)
-    assert check.loss(3, image, MOVES_BY) == 0.5
-
-
 @pytest.mark.parametrize(
     ("name", "advice"), [("image", "look at that image"), ("alpha", "lower its weight")]
 )

@@ -10,7 +10,6 @@ import torch
 from flat_wall import (
     BLACK,
     DISTANCE,
-    SIZE,
     cameras_before_wall,
     learned,
     seen_from,
@@ -73,13 +72,6 @@ def test_colours_lie_on_the_background_and_masked_cells_do_not_count() -> None:
     assert bool(counts[:, 20:].all())
 
 
-@pytest.mark.parametrize(
-    ("size", "grid"), [((80, 60), (30, 40)), ((60, 80), (40, 30)), ((1000, 3), (1, 40))]
-)
-def test_the_longest_side_has_so_many_cells(size: tuple[int, int], grid: tuple[int, int]) -> None:
-    assert grid_of(*size) == grid
-
-
 def test_places_are_found_by_cameras_as_they_are_by_now() -> None:
     """Wrong cameras that are corrected find what the right ones do."""
     right = cameras_before_wall(6)
@@ -139,38 +131,3 @@ def test_what_stands_in_front_of_some_does_not_matter() -> None:
         images[i] = with_block(images[i], slice(15, 45), slice(20, 50))
     wanted = GAINS.log() - GAINS.log().mean(0)
     torch.testing.assert_close(found(images), wanted, atol=0.08, rtol=0)
-
-
-def test_images_that_are_held_out_are_not_looked_at() -> None:
-    images = images_with(GAINS)
-    which = [i for i in range(COUNT) if i != 5]
-    before = found(images, which)
-    images[5] = replace(images[5], rgb_premultiplied=torch.rand(SIZE[1], SIZE[0], 3))
-    assert torch.equal(found(images, which), before)
-    assert not bool(before[5].any())
-
-
-@pytest.mark.parametrize("hidden", ["masked", "transparent", "far"])
-def test_without_shared_places_nothing_is_corrected(hidden: str) -> None:
-    images = images_with(GAINS)
-    nothing = torch.zeros(SIZE[1], SIZE[0])
-    if hidden == "masked":
-        images = [replace(x, mask=nothing) for x in images]
-    elif hidden == "transparent":
-        images = [replace(x, alpha=nothing) for x in images]
-    else:
-        cameras = cameras_before_wall(COUNT, step=50.0)
-        images = [replace(x, cameras=camera) for x, camera in zip(images, cameras, strict=True)]
-    torch.testing.assert_close(found(images), torch.zeros(COUNT, 3), atol=1e-6, rtol=0)
-
-
-def test_what_the_scene_looks_like_does_not_matter() -> None:
-    """Only its depth does."""
-    images = images_with(GAINS)
-    assert float(learned(images[0].cameras).std()) > 0
-    dark = log_gains(
-        images,
-        list(range(COUNT)),
-        lambda cameras, time: replace(with_depth(cameras), rgb=0.1 * with_depth(cameras).rgb),
-    )
-    assert torch.equal(dark, found(images))

@@ -13,7 +13,8 @@ from tiny_people import config, people
 from dyngs.api.train import train
 from dyngs.core.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
-from dyngs.training.prediction import network_trainer, rate_at
+from dyngs.training.new_trainer import build
+from dyngs.training.prediction import NetworkTrainer, rate_at
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +32,14 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) ->
     before, after = (load_checkpoint(path).part("model.network") for path in (middle, last))
     assert any(not torch.equal(before[name], after[name]) for name in before)
     with pytest.raises(DyngsError, match="not of this network"):
-        network_trainer(config(folder, tmp_path, widths=(8, 16))).restore(load_checkpoint(last))
+        build(config(folder, tmp_path, widths=(8, 16))).restore(load_checkpoint(last))
 
 
 def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_path: Path) -> None:
     """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the
     next step is good."""
-    trainer = network_trainer(config(folder, tmp_path))
+    trainer = build(config(folder, tmp_path))
+    assert isinstance(trainer, NetworkTrainer)
     trainer.step()
     for count, factor in enumerate((1e25, float("nan")), 1):
         before = {name: x.clone() for name, x in trainer.learner.network.state_dict().items()}

@@ -10,18 +10,16 @@ import pytest
 import torch
 from pretend_gpu import GPU, OnGpu, pretend_gpu
 from small_fields import NERF, NGP
-from tiny_people import NET, people
 
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.images import write_split_images
-from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import open_run
-from dyngs.training.new_trainer import assemble, build
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -109,51 +107,6 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     assert [key for key, x in expected.items() if not torch.equal(found[key], x)] == []
 
 
-def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = people(tmp_path / "people", (1,))
-    steps = 2
-
-    def checkpoints(device: torch.device) -> list[Checkpoint]:
-        """After the last step but one and the last, which is done on what was stored."""
-        monkeypatch.setattr("dyngs.human.predict.ghg.learner.device_for", lambda _: device)
-        config = Config.model_validate(
-            {"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}}
-        )
-        trainer = build(config)
-        resumed = build(config)
-        for _ in range(steps - 1):
-            trainer.step()
-        found = [trainer.checkpoint()]
-        resumed.restore(found[0])
-        resumed.step()
-        return [*found, resumed.checkpoint()]
-
-    expected = checkpoints(torch.device("cpu"))
-    with pretend_gpu():
-        found = checkpoints(GPU)
-    for there, here in zip(found, expected, strict=True):
-        assert [
-            key for key, x in here.tensors.items() if not torch.equal(there.tensors[key], x)
-        ] == []
-
-
-def test_a_network_too_large_for_the_kernel_is_computed_by_torch(
-    still: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = config_of("static", still, *STATIC, "colour.kind=network")
-    expected = trained(config, monkeypatch, torch.device("cpu")).model.colours.network
-    assert expected is not None
-    monkeypatch.setattr("dyngs.ops.perceptron.GPU_WIDTH", 31)
-    monkeypatch.setattr("dyngs.ops.perceptron.perceptron_op", None)  # the CPU has had it
-    with pretend_gpu():
-        network = trained(config, monkeypatch, GPU).model.colours.network
-        assert network is not None
-        found = network.layers[0].weight.detach().cpu()
-    torch.testing.assert_close(found, expected.layers[0].weight, rtol=1e-3, atol=1e-4)
-
-
 def test_a_run_goes_on_there_from_a_checkpoint(
     still: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,44 +129,6 @@ def test_a_run_goes_on_there_from_a_checkpoint(
     assert [
         key for key, x in expected.checkpoint().tensors.items() if not torch.equal(found[key], x)
     ] == []
-
-
-@pytest.mark.parametrize("name", ["static", "nodes", "hexplane", "human", "ngp"])
-def test_how_often_the_host_waits_in_a_step(
-    name: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Once for the loss; the number of tile entries, which the kernels read back, is not seen here
-    (docs/gpu.md).
-
-    Of a field also for the number of samples, and of those that are reached.
-    """
-    kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
-    sizes = {"item": 2, "nonzero": 2} if name == "ngp" else {}
-    # nothing but steps happens in those counted
-    long = ("train.steps=60", *([] if sizes else ["strategy.kind=fixed"]))
-    config = config_of(kind, request.getfixturevalue(capture), *more, *long)
-    with pretend_gpu() as gpu:
-        monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
-        trainer = assemble(config)
-        for _ in range(8):
-            trainer.step()
-        gpu.waits.clear()
-        for _ in range(2):
-            trainer.step()
-        queued = gpu.waits.pop("queued to the GPU")
-        assert gpu.waits == {"to the CPU": 2} | sizes
-        assert queued <= 2 * 12
-
-
-def test_images_that_do_not_fit_there_are_streamed(
-    still: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = config_of("static", still, *STATIC)
-    with pretend_gpu():
-        kept = trained(config, monkeypatch, GPU).checkpoint().tensors
-        monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: (0, 0))
-        streamed = trained(config, monkeypatch, GPU).checkpoint().tensors
-    assert [key for key, x in kept.items() if not torch.equal(streamed[key], x)] == []
 
 
 SCORED = {

@@ -10,7 +10,7 @@ import torch
 from several_processes import run_in, summed
 
 from dyngs.core.errors import DyngsError
-from dyngs.training.processes import Processes, _checksum, numbers_of_torchrun
+from dyngs.training.processes import Processes, _checksum
 
 
 def test_views_are_shared_evenly_in_order_and_each_once() -> None:
@@ -25,36 +25,6 @@ def test_views_are_shared_evenly_in_order_and_each_once() -> None:
         Processes(0, 2).share(3)
     with pytest.raises(DyngsError, match="cannot be shared"):
         Processes(0, 2).share(0)
-
-
-def test_alone_nothing_is_exchanged() -> None:
-    alone = Processes()
-    x = torch.ones(3, requires_grad=True)
-    with alone:
-        alone.sum_([x])
-        alone.sum_gradients_([x], torch.ones(1))
-        alone.require_same({"x": x}, "now")
-    assert x.tolist() == [1, 1, 1]
-    assert x.grad is None
-    assert alone.is_first
-
-
-def test_what_torchrun_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = {
-        "RANK": "1",
-        "WORLD_SIZE": "4",
-        "LOCAL_WORLD_SIZE": "2",
-        "MASTER_ADDR": "here",
-        "MASTER_PORT": "1",
-    }
-    for name, value in names.items():
-        monkeypatch.delenv(name, raising=False)
-        assert numbers_of_torchrun() is None
-        monkeypatch.setenv(name, value)
-    assert numbers_of_torchrun() == (1, 4, 2)
-    monkeypatch.setenv("WORLD_SIZE", "many")
-    with pytest.raises(DyngsError, match="must be numbers, as torchrun sets them"):
-        Processes.of_torchrun()
 
 
 @pytest.mark.parametrize("changed", [0, 1, 5])

@@ -153,51 +153,6 @@ def test_a_scene_of_another_kind_is_trained(capture: Path) -> None:
     assert trainer.bad_gradients == 3 * 31
 
 
-def test_penalties_of_the_training_are_part_of_the_loss(capture: Path) -> None:
-    penalizing = _Lifted()
-    penalizing.penalty = 0.01
-    plain = _trained_by(_trainer(capture), _Lifted())
-    penalized = _trained_by(_trainer(capture), penalizing)
-    heights = plain.model.scene.gaussians.means.detach()[:, 2].abs()
-    assert penalized.step().loss == pytest.approx(
-        plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5
-    )
-    for _ in range(20):
-        penalized.step()
-    assert penalized.model.scene.gaussians.means.detach()[:, 2].abs().mean() < heights.mean()
-
-
-class _Growing(_Lifted):
-    """It wants each Gaussian once more after step 2."""
-
-    def revised(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
-        assert self.steps[-1] == step, "it has followed the step already"
-        if step != 2:
-            return None
-        num = len(scene)
-        edit = TopologyEdit(torch.arange(2 * num) % num, torch.arange(2 * num) >= num)
-        return scene.edited(edit), EditResult(edit)
-
-
-def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
-    """At once, and the run goes on with it; new rows have no moments."""
-    trainer = _trained_by(_trainer(capture), _Growing())
-    counts = []
-    for _ in range(4):
-        trainer.step()
-        counts.append(len(trainer.model.scene.gaussians))
-        if trainer.done == 2:
-            moments = trainer.model.state()["exp_avg_sq.means"].tensor
-            assert moments[:50].any()
-            assert not moments[50:].any()
-            other = _trained_by(_trainer(capture), _Growing())
-            other.restore(trainer.checkpoint())
-    assert counts == [50, 100, 100, 100]
-    for _ in range(2):
-        other.step()
-    assert torch.equal(other.model.scene.gaussians.means, trainer.model.scene.gaussians.means)
-
-
 class _Exploding(_Lifted):
     """From step 3 on it draws positions and rotations that are not finite."""
 
@@ -209,14 +164,6 @@ class _Exploding(_Lifted):
         return GaussianTimeStep(
             now.replace(means=now.means * factor, quats=now.quats * factor), image.time
         )
-
-
-class _Overweight(_Lifted):
-    """From step 3 on it has an infinite penalty."""
-
-    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
-        self.penalty = 0.0 if step < 3 else float("inf")
-        return super().time_step(scene, image, step)
 
 
 def _stops_in_step_3(trainer: GaussianTrainer) -> str:
@@ -250,14 +197,6 @@ def test_what_is_not_finite_is_named_in_one_line(
     )
 
 
-def test_a_term_that_is_not_finite_is_named_in_one_line(capture: Path) -> None:
-    message = _stops_in_step_3(_trained_by(_trainer(capture), _Overweight()))
-    assert re.fullmatch(
-        r"step 3, view 'train/r_00\d': the loss term 'height' is inf; lower its weight or rate",
-        message,
-    )
-
-
 def test_only_times_that_the_training_wants_are_trained_on(tmp_path: Path) -> None:
     class _Early(_Lifted):
         def trains_on(self, time: float | None, step: int) -> bool:
@@ -267,27 +206,6 @@ def test_only_times_that_the_training_wants_are_trained_on(tmp_path: Path) -> No
     seen = [trainer.step().image.time for _ in range(40)]
     assert all(time is not None and time <= 0.1 * (i + 1) for i, time in enumerate(seen))
     assert set(seen[20:]) == set(TRAIN_TIMES)
-
-
-@pytest.mark.parametrize(("choice", "value"), [("white", 1.0), ("black", 0.0), ("auto", 1.0)])
-def test_truth_and_render_share_the_background(capture: Path, choice: str, value: float) -> None:
-    report = _trainer(capture, background=choice).step()
-    assert report.image.alpha is not None
-    empty = report.image.alpha == 0
-    assert empty.any()
-    assert (report.truth[empty] == value).all()
-
-
-def test_a_random_background_is_new_in_each_step(capture: Path) -> None:
-    trainer = _trainer(capture, background="random")
-    colours = []
-    for _ in range(3):
-        report = trainer.step()
-        assert report.image.alpha is not None
-        shown = report.truth[report.image.alpha == 0].unique(dim=0)
-        assert len(shown) == 1
-        colours.append(tuple(shown[0].tolist()))
-    assert len(set(colours)) == 3
 
 
 def test_a_checkpoint_of_another_model_is_refused(capture: Path) -> None:
@@ -380,29 +298,6 @@ def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> N
     assert not torch.equal(nothing["sh"], counting["sh"])
 
 
-def test_what_is_transparent_is_trained_on_as_background(capture: Path, tmp_path: Path) -> None:
-    """Colours below transparent pixels change nothing, but transparency itself does: the scene must
-    be empty there."""
-
-    def transparent(colour: int, alpha: int) -> Callable[[np.ndarray], np.ndarray]:
-        def edit(pixels: np.ndarray) -> np.ndarray:
-            pixels[:, 8:, :3], pixels[:, 8:, 3] = colour, alpha
-            return pixels
-
-        return edit
-
-    dark, light, opaque = (
-        trained_state(with_images(capture, tmp_path / name, edit, None))
-        for name, edit in (
-            ("a", transparent(0, 0)),
-            ("b", transparent(200, 0)),
-            ("c", transparent(200, 255)),
-        )
-    )
-    assert all(torch.equal(x, light[name]) for name, x in dark.items())
-    assert not torch.equal(dark["sh"], opaque["sh"])
-
-
 def test_two_equal_views_in_a_step_are_one_seen_twice(tmp_path: Path) -> None:
     """The mean of two equal gradients has the bytes of either; densification counts both views."""
     write_still_capture(tmp_path, StillOptions(size=16, num_train=1, num_test=1, samples=1))
@@ -461,15 +356,3 @@ def test_only_what_is_wanted_is_drawn_and_each_once_per_epoch(wanted: set[int], 
     for _ in range(3):
         epoch = [sampler.next(generator, lambda i: i in wanted) for _ in wanted]
         assert sorted(epoch) == sorted(wanted)
-
-
-def test_views_that_are_not_wanted_do_not_cost_randomness() -> None:
-    """As long as an epoch lasts, whatever is passed over: the generator is drawn from once."""
-    sampler = ViewSampler(6)
-    generator = torch.Generator().manual_seed(0)
-    sampler.next(generator, lambda i: i == 3)
-    state = generator.get_state()
-    rest = 6 - int(sampler.state()["position"])
-    for _ in range(rest):
-        sampler.next(generator, anything)
-    assert torch.equal(generator.get_state(), state)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +15,6 @@ from moving_scene import (
     TEST_TIMES,
     TRAIN_TIMES,
     camera,
-    row_of_balls,
     write_moving_run,
 )
 from pretend_gpu import GPU, pretend_gpu
@@ -31,8 +29,6 @@ from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.io.formats.formats import write_splats
-from dyngs.io.formats.splat_file import SplatFile
 from dyngs.runs.opened import Opened, open_run, open_scene
 from dyngs.view.controls import Frusta, distinct, frustum_size
 from dyngs.view.layers import (
@@ -43,9 +39,7 @@ from dyngs.view.layers import (
     draw,
     motion_colours,
     shows_filled,
-    truth_in_window,
 )
-from dyngs.view.source import open_to_view
 from dyngs.view.views import (
     Viewpoint,
     camera_at,
@@ -104,15 +98,6 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
         coarser(balls(), 300)
 
 
-def test_parts_together_are_all() -> None:
-    seen = {
-        part: draw(balls(), Shot(camera(80, 56), 0.0, "alpha", part))[..., 0] > 128
-        for part in PARTS
-    }
-    assert np.array_equal(seen["all"], seen["moving"] | seen["still"])
-    assert 0 < seen["moving"].sum() < seen["all"].sum()
-
-
 def test_motion_is_red_where_it_is_far_and_dark_where_nothing_moves() -> None:
     colours = motion_colours(balls())
     moving = colours[list(MOVING_ROWS)]
@@ -131,20 +116,6 @@ def test_the_moment_of_a_time_is_computed_once() -> None:
     assert asked.calls == 2
 
 
-@pytest.mark.parametrize("size", [(48, 48), (96, 48), (30, 60)])
-def test_the_truth_fits_the_window(run: Opened, size: tuple[int, int]) -> None:
-    truth = truth_in_window(run, 0, size)
-    assert truth is not None
-    assert truth.shape == (size[1], size[0], 3)
-    inside = ~np.isnan(truth).any(-1)
-    side = min(size)
-    assert inside.sum() == side * side  # the images are square
-    images = views_of(run).images
-    assert images is not None
-    mean = images[0].composite(run.background).mean((0, 1)).numpy()
-    assert truth[inside].mean(0) == pytest.approx(mean, abs=0.02)
-
-
 def test_the_line_divides_render_and_truth(run: Opened) -> None:
     def shown(divide: float) -> np.ndarray:
         return draw(run, Shot(camera(64, 64), 0.0, view=2, divide=divide))
@@ -155,21 +126,6 @@ def test_the_line_divides_render_and_truth(run: Opened) -> None:
     assert np.array_equal(both[:, :31], render[:, :31])
     assert np.array_equal(both[:, 33:], truth[:, 33:])
     assert not np.array_equal(render, truth)
-
-
-def test_the_error_is_that_of_render_and_truth(run: Opened) -> None:
-    window = truth_in_window(run, 1, (32, 32))
-    assert window is not None
-    render = draw(run, Shot(camera(32, 32), view=1)) / 255.0
-    error = draw(run, Shot(camera(32, 32), layer="error", view=1)).sum(-1).astype(float)
-    wanted = np.abs(render - window).mean(-1)
-    assert np.corrcoef(error.ravel(), np.minimum(wanted * 4, 1).ravel())[0, 1] > 0.9
-
-
-def test_beside_the_true_image_it_is_darker(run: Opened) -> None:
-    wide = draw(run, Shot(camera(96, 48), view=0, divide=1.0))
-    assert wide[:, :20].mean() <= 128
-    assert wide[:, 40:56].mean() > 128
 
 
 def test_what_no_training_view_shows_of_a_person_is_marked() -> None:
@@ -228,28 +184,6 @@ def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) ->
     begin = viewpoint_of(opened)
     assert torch.equal(begin.start.cam_from_world, shown.cameras[0].cam_from_world)
     assert views_of(replace(opened, as_captured=False)).images is None
-
-
-def test_a_run_without_its_capture_is_shown_all_the_same(tmp_path: Path) -> None:
-    run = write_moving_run(tmp_path, offset=(1.0, 2.0, 3.0))
-    shutil.rmtree(tmp_path / "capture")
-    opened = open_to_view(run, "run", "-y")
-    assert len(views_of(opened)) == 0
-    assert "without the capture" in opened.notes[0]
-    assert viewpoint_of(opened).up.tolist() == [0, -1, 0]
-
-
-def test_a_file_is_seen_from_where_all_of_it_is_in_view(tmp_path: Path) -> None:
-    write_splats(tmp_path / "balls.spz", SplatFile(row_of_balls(201)))
-    opened = open_to_view(tmp_path / "balls.spz", "balls")
-    start = viewpoint_of(opened).start
-    assert not has_timeline(opened)
-    places = start.cam_from_world[0, :3, :3] @ opened.scene.gaussians.means.T
-    shown = start.intrinsics[0] @ (places + start.cam_from_world[0, :3, 3:])
-    pixels = shown[:2] / shown[2]
-    assert bool((shown[2] > 0).all())
-    inside = (pixels >= 0).all(0) & (pixels[0] <= 960) & (pixels[1] <= 720)
-    assert float(inside.float().mean()) > 0.95
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-9])

@@ -193,15 +193,6 @@ def test_two_browsers_have_cameras_of_their_own_and_one_may_go(
     assert threading.active_count() <= threads + 2  # viser's pool may have grown
 
 
-def test_a_dead_server_is_shown_as_such(viewer: Viewer, browser: Browser) -> None:
-    page, _ = opened(viewer, browser)
-    assert page.driven.get_by_text("Connected", exact=True).is_visible()
-    viewer.__exit__()
-    page.driven.get_by_text("Connecting...").wait_for(timeout=15_000)
-    assert not page.driven.get_by_text("Connected", exact=True).is_visible()
-    page.close()
-
-
 SCRIPT = "<img src=x onerror=window.ran=1>"
 FRAME = '<iframe srcdoc="<script>parent.ran=1</script>"></iframe>'
 LINKS = "[a](javascript:window.ran=1) ![b](x) <a href=http://evil.example>c</a>"

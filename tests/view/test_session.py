@@ -135,17 +135,6 @@ def test_cameras_that_cannot_be_are_ignored(change: dict[str, Any]) -> None:
     assert looked.session.eye == eye()
 
 
-def test_the_newest_camera_wins() -> None:
-    looked = Looked()
-    for x in (0.1, 0.2, 0.3):
-        looked.session.move(eye(x))
-    looked.after(0)
-    assert len(looked.sent) == 1
-    small = looked.sent[0].image
-    wanted = draw(opened(), Shot(eye(0.3).camera((small.shape[1], small.shape[0])), 0.0))
-    assert np.array_equal(small, wanted)
-
-
 def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
     looked = Looked()
     looked.session.move(eye())
@@ -186,18 +175,6 @@ def test_a_preview_shows_the_recorded_cameras_and_then_the_browser_s_own() -> No
     looked.after(2)
     own = looked.session.shot().camera.cam_from_world
     assert torch.allclose(own, eye().camera().cam_from_world)
-
-
-def test_an_error_is_not_drawn_again_until_something_changes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    looked = Looked()
-    looked.session.move(eye())
-    monkeypatch.setattr(session, "draw", lambda *_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        looked.session.draw_next()
-    looked.clock.now += 9
-    assert looked.session.due() is None
 
 
 def test_jobs_and_who_has_gone() -> None:

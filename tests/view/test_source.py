@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 from moving_scene import write_moving_run
-from pretend_gpu import GPU, pretend_gpu
 from scene_kinds import scene_of_kind
 from tiny_people import NET, people
 from view_sessions import looking_at_balls, opened_at
@@ -48,15 +47,6 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     assert first.name == "b/run"
     assert "left out" in first.notes[0]
     assert open_source(tmp_path / "b" / "run").names == ("run",)
-
-
-def test_levels_are_for_still_scenes(tmp_path: Path) -> None:
-    still, moving = (
-        write_moving_run(tmp_path / name, moves=name == "moving") for name in ("still", "moving")
-    )
-    assert "at most 9 Gaussians" in first_of(open_source(still, most=9)).notes[-1]
-    with pytest.raises(DyngsError, match="for still scenes"):
-        first_of(open_source(moving, most=9))
 
 
 def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
@@ -109,18 +99,6 @@ def test_sliders_at_zero_are_the_rest_pose(opened: Opened) -> None:
     assert rest.scene.is_static
     assert torch.allclose(rest.scene.at(None).means, zero.scene.at(None).means, atol=1e-6)
     assert in_motion(opened, AS_CAPTURED, {}, {}) is opened
-
-
-def test_a_person_on_a_gpu_is_posed_there(opened: Opened) -> None:
-    angles = {"pelvis": (0.0, 90.0, 0.0)}
-    expected = in_motion(opened, BY_SLIDERS, {}, angles).scene.at(None).means
-    rest = in_motion(opened, AT_REST, {}, {}).scene.at(None).means
-    assert float((expected - rest).norm(dim=1).max()) > 1e-3
-    with pretend_gpu():
-        posed_there = in_motion(opened.to(GPU), BY_SLIDERS, {}, angles).scene.at(None).means
-        assert posed_there.device == GPU
-        found = posed_there.cpu()
-    assert torch.equal(found, expected)
 
 
 def test_motion_files_are_found_by_suffix(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from dyngs.compress.measure import storage_plan
 from dyngs.compress.stage import highest, probe_images, quality_of, scores_of
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.errors import DyngsError, counted
+from dyngs.gaussians.restored import restored_model
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.renderable import Renderable
@@ -23,7 +24,6 @@ from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.stored_file import decoded, drawable, encoded, step_below, write_scene
-from dyngs.training.new_trainer import restored_model
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7

@@ -1,15 +1,18 @@
 """The numbers that a page draws: Gaussians, what moves them, what colours them, or triangles;
-``data.js`` reads them.
+``data.js`` reads them. Motion is written as splines of a few drivers, which a program without dyngs
+can play: a driver is a control node that several Gaussians follow, or the own one of each Gaussian
+where a field has no nodes.
 
 Local letters: N Gaussians, M of them moving, J joints, F frames of a clip; R rows and D columns of
-a list.
+a list; S drivers, P control points, B drivers that one Gaussian follows.
 """
 
 from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,10 +23,11 @@ from torch import Tensor
 from dyngs.baselines.triangles.patches import CORNERS
 from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.gaussians import storage_order
-from dyngs.deform.field import Offsets
-from dyngs.deform.fields import EDGE, OPEN
+from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
+from dyngs.deform.field import DeformationField, Offsets
+from dyngs.deform.fields import EDGE, OPEN, WindowedField
+from dyngs.deform.free import FreePrimitives
 from dyngs.deform.scene import DynamicScene, field_scene_of
-from dyngs.export.html.curves import Curves, curves_of, fitted_curves
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.levels import BLOCK, MERGED, PIXELS, Block, Levels
@@ -72,14 +76,8 @@ class Lists:
         planes = [quantised >> 8, quantised & 255] if bits == 16 else [quantised]
         # (D, planes, R)
         bytes_of = np.stack([plane.T.astype(np.uint8) for plane in planes], axis=1)
-        self._add(
-            name,
-            ranges.tobytes() + bytes_of.tobytes(),
-            "quantised",
-            values.shape,
-            bits=bits,
-            chunk=CHUNK,
-        )
+        data = ranges.tobytes() + bytes_of.tobytes()
+        self._add(name, data, "quantised", values.shape, bits=bits, chunk=CHUNK)
 
     def exact(self, name: str, values: NDArray[Any]) -> None:
         """Add ``values`` (R, D) as they are: uint8, uint16 or float32."""
@@ -103,13 +101,8 @@ class Lists:
 
     def _add(self, name: str, data: bytes, kind: str, shape: tuple[int, ...], **more: int) -> None:
         rows, columns = shape
-        self.layout[name] = {
-            "kind": kind,
-            "rows": rows,
-            "columns": columns,
-            "at": self._size,
-            **more,
-        }
+        place = {"kind": kind, "rows": rows, "columns": columns, "at": self._size}
+        self.layout[name] = place | more
         self._parts.append(data)
         self._size += len(data)
 
@@ -121,25 +114,24 @@ def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str,
     """
     person = avatar_of(scene)
     moved = field_scene_of(scene)
+    gaussians = scene.gaussians
     if person is not None:
-        order = torch.from_numpy(
-            storage_order(_numpy(scene.gaussians.means), np.arange(len(scene)))
-        )
-        gaussians = scene.gaussians.select(order)
-        told = _add_person(person, order, lists, tolerance)
+        moving = torch.arange(len(scene), device="cpu")
     elif moved is not None:
-        order = torch.from_numpy(storage_order(_numpy(scene.gaussians.means), moved.moving.numpy()))
-        gaussians = scene.gaussians.select(order)
-        told = _add_motion(moved, order, lists, tolerance)
+        moving = moved.moving
     else:
-        still = scene.at(None)
-        order = torch.from_numpy(storage_order(_numpy(still.means), np.zeros(0, dtype=np.int64)))
-        gaussians = still.select(order)
-        told = {}
-    told |= _add_gaussians(gaussians.detach(), lists, with_rest=scene.colour is None)
-    if scene.colour is not None:
-        told["network"] = _add_network(scene.colour, lists)
-    return told | {"count": len(scene), "frames": len(scene.times), "moves": not scene.is_static}
+        gaussians = scene.at(None)
+        moving = torch.zeros(0, dtype=torch.long, device="cpu")
+    order = torch.from_numpy(storage_order(_numpy(gaussians.means), moving.numpy()))
+    told: dict[str, Any] = {"count": len(scene), "frames": len(scene.times)}
+    told["moves"] = not scene.is_static
+    if person is not None:
+        told |= _add_person(person, order, lists, tolerance)
+    elif moved is not None:
+        told |= _add_motion(moved, order, lists, tolerance)
+    with_rest = scene.colour is None
+    told |= _add_gaussians(gaussians.select(order).detach(), lists, with_rest=with_rest)
+    return told if scene.colour is None else told | _add_network(scene.colour, lists)
 
 
 def add_levels(levels: Levels, colour: ColourNetwork | None, lists: Lists) -> dict[str, Any]:
@@ -148,25 +140,14 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: Lists) -> di
 
     The page fetches the blocks, see ``block_numbers``.
     """
-    told: dict[str, Any] = {} if colour is None else {"network": _add_network(colour, lists)}
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
     coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), with_rest=colour is None)
     sizes = [len(level) for level in levels.levels]
-    known = {
-        "sizes": sizes,
-        "block": BLOCK,
-        "merged": MERGED,
-        "pixels": PIXELS,
-        "layout": coarsest.layout,
-    }
+    known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": PIXELS}
     degree = levels.levels[0].sh_degree if colour is None else 0
-    return told | {
-        "levels": known,
-        "degree": degree,
-        "count": sizes[0],
-        "frames": 0,
-        "moves": False,
-    }
+    told: dict[str, Any] = {"count": sizes[0], "frames": 0, "moves": False, "degree": degree}
+    told["levels"] = known | {"layout": coarsest.layout}
+    return told if colour is None else told | _add_network(colour, lists)
 
 
 def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> Lists:
@@ -185,10 +166,8 @@ def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes
     """Yield names and bytes of the files of all blocks, as ``levels.js`` asks for them."""
     for level, balls in enumerate(levels.blocks):
         for place in range(len(balls)):
-            yield (
-                f"{level}-{place}.bin",
-                block_numbers(levels, (level, place), with_rest=with_rest).deflated(),
-            )
+            numbers = block_numbers(levels, (level, place), with_rest=with_rest)
+            yield f"{level}-{place}.bin", numbers.deflated()
 
 
 def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
@@ -201,30 +180,24 @@ def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
     lists.quantised("colours", _numpy(patches.colours[order].flatten(1)), 8)
     if patches.sh_degree:
         lists.quantised("rest", _numpy(patches.harmonics[order].flatten(1)), 8)
-    told = {
-        "degree": patches.sh_degree,
-        "texture": patches.texture,
-        "segments": scene.options.segments,
-    }
-    return told | {
-        "bounds": scene.bounds.tolist(),
+    return {
         "count": len(scene),
         "frames": 0,
         "moves": False,
+        "degree": patches.sh_degree,
+        "texture": patches.texture,
+        "segments": scene.options.segments,
+        "bounds": scene.bounds.tolist(),
     }
 
 
 def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    unit = torch.where(unit[:, :1] < 0, -unit, unit)
+    logits = gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)
     lists.quantised("means", _numpy(gaussians.means), 16)
-    lists.quantised("quats", _numpy(unit), 8)
+    lists.quantised("quats", _numpy(torch.where(unit[:, :1] < 0, -unit, unit)), 8)
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
-    lists.quantised(
-        "logit_opacities",
-        _numpy(gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)[:, None]),
-        8,
-    )
+    lists.quantised("logit_opacities", _numpy(logits[:, None]), 8)
     lists.quantised("base", _numpy(gaussians.sh[:, 0]), 8)
     degree = gaussians.sh_degree if with_rest else 0
     if degree:
@@ -259,22 +232,24 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
     """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order``
     (M,)."""
     count, points, _ = curves.heads["means"].shape
-    told: dict[str, Any] = {
-        "count": count,
-        "points": points,
-        "moving": len(order),
-        "error": curves.error,
-    }
+    told: dict[str, Any] = {"count": count, "points": points, "moving": len(order)}
+    told["error"] = curves.error
+    has_nodes = curves.pivots is not None  # few, each of which moves many
+    splines: dict[str, tuple[Tensor, int]] = {}
+    for name, x in curves.heads.items():
+        bits = 32 if curves.is_steep else 16 if has_nodes and name in FINE else 8
+        splines[f"curve_{name}"] = (x if has_nodes else x[order], bits)
     pieces = points - SPAN + 1
-    chunk = _pieces_of_chunk(curves)
+    bits_of_piece = sum(len(x) * x.shape[2] * bits for x, bits in splines.values())
+    chunk = max(CHUNK_BYTES * 8 // max(bits_of_piece, 1), 1)
     chunks = lists.chunks
     if chunks is None or chunk >= pieces:
-        _add_splines(curves, slice(None), order, lists)
+        _add_splines(splines, slice(None), lists)
     else:
         for first in range(0, pieces, chunk):
             rows = torch.arange(first, first + chunk + SPAN - 1, device="cpu").clamp_max(points - 1)
             chunks.append(Lists())
-            _add_splines(curves, rows, order, chunks[-1])
+            _add_splines(splines, rows, chunks[-1])
         told |= {"chunk": chunk, "layout": chunks[0].layout}
     if curves.pivots is not None and curves.followed is not None and curves.fractions is not None:
         lists.exact("pivots", _numpy(curves.pivots))
@@ -286,28 +261,16 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
     return told
 
 
-def _add_splines(curves: Curves, rows: Tensor | slice, order: Tensor, lists: Lists) -> None:
+def _add_splines(
+    splines: dict[str, tuple[Tensor, int]], rows: Tensor | slice, lists: Lists
+) -> None:
     """Add the control points ``rows`` of all splines."""
-    has_nodes = curves.pivots is not None  # few, each of which moves many
-    for name, points in curves.heads.items():
-        own = _numpy((points if has_nodes else points[order])[:, rows].flatten(1))
-        if curves.is_steep:
-            lists.exact(f"curve_{name}", own)
+    for name, (points, bits) in splines.items():
+        own = _numpy(points[:, rows].flatten(1))
+        if bits == 32:
+            lists.exact(name, own)
         else:
-            lists.quantised(f"curve_{name}", own, _bits(curves, name))
-
-
-def _bits(curves: Curves, name: str) -> Literal[8, 16]:
-    return 16 if curves.pivots is not None and name in FINE else 8
-
-
-def _pieces_of_chunk(curves: Curves) -> int:
-    """Return the pieces of a chunk of time of some ``CHUNK_BYTES``."""
-    wide = 32 if curves.is_steep else 0
-    sizes = (
-        x.shape[0] * x.shape[2] * (wide or _bits(curves, name)) for name, x in curves.heads.items()
-    )
-    return max(CHUNK_BYTES * 8 // max(sum(sizes), 1), 1)
+            lists.quantised(name, own, 16 if bits == 16 else 8)
 
 
 def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
@@ -352,13 +315,16 @@ def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
         bias[: len(layer.bias)] = _numpy(layer.bias.detach())
         parts += [weight.ravel(), bias]
     lists.exact("network", np.concatenate(parts).reshape(-1, 4))
-    told = {
-        "layers": len(network.layers),
-        "width": width,
-        "first": first,
-        "box": network.box.flatten().tolist(),
+    return {
+        "network": {
+            "layers": len(network.layers),
+            "width": width,
+            "first": first,
+            "box": network.box.flatten().tolist(),
+            "time": network.sees_time,
+            "normals": network.sees_normals,
+        }
     }
-    return told | {"time": network.sees_time, "normals": network.sees_normals}
 
 
 def _fractions(fractions: Tensor) -> NDArray[np.uint8]:
@@ -368,3 +334,107 @@ def _fractions(fractions: Tensor) -> NDArray[np.uint8]:
 
 def _numpy(x: Tensor) -> NDArray[np.float32]:
     return x.detach().float().numpy()
+
+
+SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
+FEWEST_PIECES, MOST_PIECES = 8, 256
+# Pieces, however few training times there are: between those a network moves as it likes
+ALWAYS_ALLOWED = 32
+# Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance
+CHECKED = 0.95
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Offsets of S drivers, uniform cubic B-splines over the clip, and who follows them.
+
+    Attributes:
+        heads: control points (S, P, size) by attribute of ``Offsets``; always "means".
+        pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own,
+            about itself.
+        followed: (M, B) drivers of each Gaussian, B = 4; None as above.
+        fractions: (M, B) of theirs, rows sum to 1; None as above.
+        is_steep: control points lie far outside what is drawn, and are to be kept as they are.
+        windows: (M, 2) begin and end of each Gaussian's window in time (``WindowedField``); None:
+            all are always there.
+        error: of a driver's place: the quantile ``CHECKED``, in world units.
+    """
+
+    heads: dict[str, Tensor]
+    pivots: Tensor | None = None
+    followed: Tensor | None = None
+    fractions: Tensor | None = None
+    is_steep: bool = False
+    windows: Tensor | None = None
+    error: float = 0.0
+
+
+@torch.no_grad()
+def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> Curves:
+    """Return the motion of ``means`` (M, 3) as splines."""
+    match field:
+        case WindowedField(others=others):
+            return replace(curves_of(others, means, num_times, tolerance), windows=field.edges)
+        case ControlNodes():
+            return _curves_of_nodes(field, means)
+        case FreePrimitives():  # straight lines and parabolas
+            return Curves(_fit(lambda time: field.offsets(means, time), 1), is_steep=True)
+        case _:
+            heads, error = fitted_curves(
+                lambda time: field.offsets(means, time), num_times, tolerance
+            )
+            return Curves(heads, error=error)
+
+
+def fitted_curves(
+    offsets_at: Callable[[float], Offsets], num_times: int, tolerance: float
+) -> tuple[dict[str, Tensor], float]:
+    """Return control points (S, P, size), by attribute, of the splines nearest to offsets, and the
+    error of places.
+
+    The number of pieces is doubled until the error is within ``tolerance``, or there are two for
+    each training time.
+    """
+    pieces = FEWEST_PIECES
+    most = min(max(2 * (num_times - 1), ALWAYS_ALLOWED), MOST_PIECES)
+    while True:
+        heads = _fit(offsets_at, pieces)
+        error = _error(heads["means"], offsets_at, pieces)
+        if error <= tolerance or pieces >= most:
+            return heads, error
+        pieces = min(2 * pieces, most)
+
+
+def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tensor]:
+    count = SAMPLES_PER_PIECE * pieces + 1
+    times = torch.linspace(0, 1, count, dtype=torch.float64, device="cpu")
+    solver = torch.linalg.pinv(spline_basis(times, pieces)).float()  # (P, count)
+    sums: dict[str, Tensor] = {}
+    for time, fractions in zip(times.tolist(), solver.T, strict=True):
+        for name, x in vars(offsets_at(time)).items():
+            if x is not None:
+                rows = x.reshape(len(x), 1, -1)
+                sums.setdefault(name, rows.new_zeros(len(x), pieces + SPAN - 1, rows.shape[2]))
+                sums[name] += fractions[:, None] * rows
+    return sums
+
+
+def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) -> float:
+    """Return the quantile ``CHECKED`` of the splines' distances from the places, root mean squares
+    over the pieces."""
+    times = (torch.arange(pieces, dtype=torch.float64, device="cpu") + 0.5) / pieces
+    apart = [
+        (torch.einsum("p,spd->sd", fractions.float(), points) - offsets_at(time).means).norm(dim=1)
+        for time, fractions in zip(times.tolist(), spline_basis(times, pieces), strict=True)
+    ]
+    found = torch.stack(apart).square().mean(0).sqrt()
+    return float(found.sort().values[int(CHECKED * (len(found) - 1))]) if len(found) else 0.0
+
+
+def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
+    nodes = field.nodes_for(means)
+    more = 0, FOLLOWED - nodes.followed.shape[1]  # of which a Gaussian follows nothing
+    followed, fractions = (
+        torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
+    )
+    return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)

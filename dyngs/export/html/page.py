@@ -1,4 +1,5 @@
-"""The page of a scene: one file with everything in it, which asks no host for anything."""
+"""The page of a scene: one file with everything in it, which asks no host for anything, and the script
+that defines ``<dyngs-scene src="PAGE">``, which draws our pages and stands in those of others."""
 
 from __future__ import annotations
 
@@ -15,11 +16,9 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
 from dyngs.data.aim import look_at_point
-from dyngs.data.capture import Capture, View
 from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
-from dyngs.export.html.element import element_script, text_of
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
 from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.gaussians.levels import LevelScene
@@ -39,8 +38,7 @@ TOLERANCE = 0.25
 
 
 MOST_VIEWS = 24  # cameras of the capture that a page offers, evenly chosen
-_RING, _FRONT_RING = 8, 24
-"""Cameras around a scene without a capture; among how many the front of a person is looked for."""
+_RING = 8  # cameras around a scene without a capture
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ def write_page(
     inputs_of(opened).require_output(path)
     lists = Lists()
     header = _header(opened, time, views, lists)
-    text = _assembled(header | {"layout": lists.layout}, lists.text(), _title(opened, title))
+    text = _assembled(opened, header, lists, title)
     write_text(path, text)
     return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
 
@@ -95,16 +93,15 @@ def write_folder(
     lists = Lists(chunked=True)
     if most is not None or isinstance(opened.renderable, StaticScene):
         levelled = LevelScene.of(opened.renderable, most)
-        levels = levelled.levels
         colour = levelled.scene.colour
-        header = add_levels(levels, colour, lists) | _drawn(levelled.options)
+        header = add_levels(levelled.levels, colour, lists) | _drawn(levelled.options)
         header["levels"]["most"] = most
         header |= _shown(opened, time, *_beginning(opened, views))
-        parts = block_files(levels, with_rest=colour is None)
+        parts = block_files(levelled.levels, with_rest=colour is None)
     else:
         header = _header(opened, time, views, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
-    text = _assembled(header | {"layout": lists.layout}, lists.text(), _title(opened, title))
+    text = _assembled(opened, header, lists, title)
     with new_folder(folder) as started:
         write_text(started / PAGE, text)
         write_text(started / ELEMENT, element_script())
@@ -112,12 +109,6 @@ def write_folder(
             (started / name).write_bytes(data)
         size = sum(file.stat().st_size for file in started.iterdir())
     return WrittenPage(folder / PAGE, size, header, _notes(opened, header))
-
-
-def _title(opened: Opened, title: str | None) -> str:
-    if title is not None:
-        return title
-    return opened.name if opened.captured is not None else Path(opened.name).stem
 
 
 def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
@@ -156,8 +147,24 @@ def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists)
 
 
 def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
-    """Return the cameras of a page, ``views`` if there are any, and the point to look at."""
-    return (views, _middle(opened)) if views else _views(opened)
+    """Return the cameras to begin with and to go through, each a batch of one, and the point to
+    look at: ``views`` if there are any, else those of the capture, else around the scene."""
+    cameras = opened.cameras
+    if not views and cameras is not None:
+        capture = opened.capture
+        distinct = {view.cam_from_world.tobytes(): view for view in capture.splits["train"][::-1]}
+        others = list(distinct.values())[::-1]
+        rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
+        chosen = (view_to_show(capture), *(others[i] for i in rows))
+        return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
+    target = np.median(points_at(opened.renderable).cpu().numpy(), axis=0)
+    if not views:
+        ring = orbit_around(opened, _RING)
+        views = [ring.select(i) for i in range(_RING)]
+        if opened.person is not None:
+            views = [in_front_of(opened).select(1), *views]
+            target = look_at_point(ring)
+    return views, target.tolist()
 
 
 def _shown(
@@ -183,37 +190,6 @@ def _drawn(options: RenderOptions) -> dict[str, Any]:
     }
 
 
-def _views(opened: Opened) -> tuple[list[Cameras], list[float]]:
-    """Return the cameras to begin with and to go through, each a batch of one, and the point to
-    look at."""
-    cameras = opened.cameras
-    if cameras is not None:
-        capture = opened.capture
-        chosen = (view_to_show(capture), *_some(capture))
-        return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
-    ring = orbit_around(opened, _RING)
-    views = [ring.select(i) for i in range(_RING)]
-    if opened.person is None:
-        return views, _middle(opened)
-    return [in_front_of(opened).select(1), *views], look_at_point(ring).tolist()
-
-
-def _middle(opened: Opened) -> list[float]:
-    return np.median(points_at(opened.renderable).cpu().numpy(), axis=0).tolist()
-
-
-def _some(capture: Capture) -> list[View]:
-    views = []
-    seen = set()
-    for view in capture.splits["train"]:
-        pose = view.cam_from_world.tobytes()
-        if pose not in seen:
-            seen.add(pose)
-            views.append(view)
-    rows = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().astype(int)
-    return [views[i] for i in rows]
-
-
 def _view(camera: Cameras) -> dict[str, Any]:
     (k,) = camera.intrinsics.tolist()
     return {
@@ -224,23 +200,56 @@ def _view(camera: Cameras) -> dict[str, Any]:
     }
 
 
-def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
+def _assembled(opened: Opened, header: dict[str, Any], lists: Lists, title: str | None) -> str:
     """Return the text of the page. All that stems from a run is escaped; scripts are allowed by
     their hash alone."""
+    if title is None:
+        title = opened.name if opened.captured is not None else Path(opened.name).stem
     red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in header["background"])
     style = text_of("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
     script = element_script()
     page = text_of("page.html")
-    fixed = {"style": style, "script": script}
-    fixed |= {
+    fetches = "levels" in header or "chunk" in header.get("curves", {})
+    fixed = {
+        "style": style,
+        "script": script,
         "style_hash": source_hash(style),
         "script_hash": source_hash(script),
         "title": html.escape(title),
+        "header": script_safe(header | {"layout": lists.layout}),
+        "numbers": lists.text(),
+        "fetched": " connect-src 'self';" if fetches else "",  # nothing, but for its parts
     }
-    fixed |= {"header": script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
-    kind = "triangle" if "texture" in header else "Gaussian"
-    fetches = "levels" in header or "chunk" in header.get("curves", {})
-    fixed["about"] = counted(header["count"], kind) + ("" if fetches else f", {size / 1e6:.1f} MB")
-    fixed["fetched"] = " connect-src 'self';" if fetches else ""  # nothing, but for its parts
-    return filled(page, fixed)
+    about = counted(header["count"], "triangle" if "texture" in header else "Gaussian")
+    return filled(page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")})
+
+
+SCRIPTS = (
+    "fetched.js",
+    "data.js",
+    "chunks.js",
+    "motion.js",
+    "sort.js",
+    "drawing.js",
+    "renderer.js",
+    "levels.js",
+)
+SCRIPTS += ("triangles.js", "camera.js", "player.js", "controls.js", "element.js")
+SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
+SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
+
+
+def element_script() -> str:
+    """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages
+    may be of any."""
+    texts = {"STYLE": text_of("scene.css"), "SHADERS": {name: text_of(name) for name in SHADERS}}
+    constants = [f"const {name} = {script_safe(value)};" for name, value in texts.items()]
+    parts = "\n".join([*constants, *map(text_of, SCRIPTS)])
+    script = f'// <dyngs-scene src="PAGE">: a scene of dyngs (Apache-2.0).\n(() => {{\n"use strict";\n{parts}}})();\n'
+    return script.encode("ascii", "backslashreplace").decode("ascii")
+
+
+def text_of(name: str) -> str:
+    """Return a file of this folder."""
+    return (Path(__file__).parent / name).read_text(encoding="utf-8")

@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
+from dyngs.data.aim import look_at, with_poses
 from dyngs.export.rigged.texture import SEEN, BakedTexels
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -59,50 +60,29 @@ def fitted_surface(
     """
     cameras = _cameras(vertices)
     shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5
-    plain = best = _agreement(vertices, body, cameras, shown)
+    plain = _agreement(vertices, body, cameras, shown)
     found = FittedSurface(vertices, None, plain, plain)
-    pull = _Pull(body, vertices, samples, baked)
-    for margin in MARGINS if pull.is_known else ():
-        moved = pull.moved(margin)
+    counts = _on_largest_part(body)[samples.faces] & (baked.alpha >= SEEN)
+    rows = torch.nonzero(counts & ~_folded(body, vertices, samples))[:, 0]
+    if not len(rows):
+        return found
+    count = min(_NEAR, len(rows))
+    distance, at = (
+        torch.from_numpy(x.reshape(len(vertices), count))
+        for x in KDTree(samples.points[rows].numpy()).query(vertices.numpy(), k=count)
+    )
+    near = rows[at]
+    weights = (-0.5 * (distance / _SMOOTH) ** 2).exp().float()
+    weights = weights * (samples.size.square() * baked.alpha)[near]
+    total = weights.sum(1, keepdim=True)
+    for margin in MARGINS:
+        height = (baked.top + margin).clamp(*_BOUNDS)
+        along = (weights[..., None] * (height[:, None] * samples.normals)[near]).sum(1)
+        moved = vertices + torch.where(total > 1e-12, along / total.clamp_min(1e-12), 0.0)
         agreement = _agreement(moved, body, cameras, shown)
-        if agreement > best:
-            best = agreement
+        if agreement > found.agreement:
             found = FittedSurface(moved, margin, agreement, plain)
     return found
-
-
-class _Pull:
-    """Displacements of vertices by samples of the surface."""
-
-    def __init__(
-        self, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels
-    ) -> None:
-        self._vertices = vertices
-        counts = (
-            _on_largest_part(body)[samples.faces]
-            & ~_folded(body, vertices, samples)
-            & (baked.alpha >= SEEN)
-        )
-        rows = torch.nonzero(counts)[:, 0]
-        self.is_known = len(rows) > 0
-        if self.is_known:
-            count = min(_NEAR, len(rows))
-            distance, at = KDTree(samples.points[rows].numpy()).query(vertices.numpy(), k=count)
-            self._rows = rows[torch.from_numpy(at.reshape(len(vertices), count))]
-            near = torch.from_numpy(
-                np.exp(-0.5 * (distance.reshape(len(vertices), count) / _SMOOTH) ** 2)
-            ).float()
-            self._weights = near * (samples.size.square() * baked.alpha)[self._rows]
-            self._heights = baked.top
-            self._normals = samples.normals
-
-    def moved(self, margin: float) -> Tensor:
-        """Return the vertices (M, 3) displaced by what is seen plus ``margin``."""
-        height = (self._heights + margin).clamp(*_BOUNDS)
-        along = (height[:, None] * self._normals)[self._rows]
-        total = self._weights.sum(1, keepdim=True)
-        mean = (self._weights[..., None] * along).sum(1) / total.clamp_min(1e-12)
-        return self._vertices + torch.where(total > 1e-12, mean, 0.0)
 
 
 def _on_largest_part(body: BodyTemplate) -> Tensor:
@@ -117,42 +97,36 @@ def _on_largest_part(body: BodyTemplate) -> Tensor:
 
 def _folded(body: BodyTemplate, vertices: Tensor, samples: Texels) -> Tensor:
     """Return whether each of P samples faces the body itself at a small distance."""
-    flat = torch.linalg.cross(
-        *(vertices[body.faces][:, k] - vertices[body.faces][:, 0] for k in (1, 2)), dim=-1
-    )
-    normals = torch.nn.functional.normalize(flat, dim=-1)
-    places = KDTree(vertices[body.faces].mean(1).numpy())
+    corners = vertices[body.faces]
+    a, b, c = corners.unbind(1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a, dim=-1), dim=-1)
+    places = KDTree(corners.mean(1).numpy())
     found = torch.zeros(len(samples), dtype=torch.bool, device="cpu")
     for height in _FOLDS:
-        distance, at = places.query(
-            (samples.points + height * samples.normals).numpy(), k=min(4, places.n)
-        )
+        above = (samples.points + height * samples.normals).numpy()
+        distance, at = places.query(above, k=min(4, places.n))
         near = torch.from_numpy(at.reshape(len(samples), -1))
-        opposite = (normals[near] * samples.normals[:, None]).sum(-1) < -0.2
-        found |= (
-            torch.from_numpy(distance.reshape(len(samples), -1) < 0.7 * height) & opposite
-        ).any(1)
+        is_close = torch.from_numpy(distance.reshape(len(samples), -1) < 0.7 * height)
+        is_opposite = (normals[near] * samples.normals[:, None]).sum(-1) < -0.2
+        found |= (is_close & is_opposite).any(1)
     return found
 
 
 def _cameras(vertices: Tensor) -> Cameras:
     """Return cameras around the body, upright, at eye level of its middle."""
-    lowest = vertices.amin(0)
-    highest = vertices.amax(0)
+    lowest = vertices.amin(0).double().numpy()
+    highest = vertices.amax(0).double().numpy()
     middle = (lowest + highest) / 2
-    reach = float((highest - lowest).norm()) / 2
+    reach = float(np.linalg.norm(highest - lowest)) / 2
     distance = 6 * reach
-    poses = torch.eye(4, device="cpu").repeat(len(_ANGLES), 1, 1)
-    for pose, angle in zip(poses, _ANGLES, strict=True):
-        backward = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], device="cpu")
-        right = torch.tensor([math.cos(angle), 0.0, -math.sin(angle)], device="cpu")
-        pose[:3, :3] = torch.stack([right, torch.tensor([0.0, -1.0, 0.0], device="cpu"), -backward])
-        pose[:3, 3] = -pose[:3, :3] @ (middle + distance * backward)
     focal = 0.47 * _SIZE * distance / reach
-    intrinsics = torch.tensor(
-        [[focal, 0, _SIZE / 2], [0, focal, _SIZE / 2], [0, 0, 1.0]], device="cpu"
+    matrix = [[focal, 0, _SIZE / 2], [0, focal, _SIZE / 2], [0, 0, 1.0]]
+    first = Cameras(
+        torch.eye(4, device="cpu")[None], torch.tensor([matrix], device="cpu"), _SIZE, _SIZE
     )
-    return Cameras(poses, intrinsics.repeat(len(_ANGLES), 1, 1), _SIZE, _SIZE)
+    ways = [np.array([math.sin(angle), 0.0, math.cos(angle)]) for angle in _ANGLES]
+    up = np.array([0.0, 1.0, 0.0])
+    return with_poses(first, np.stack([look_at(middle + distance * w, middle, up) for w in ways]))
 
 
 def _agreement(vertices: Tensor, body: BodyTemplate, cameras: Cameras, shown: np.ndarray) -> float:
@@ -163,13 +137,10 @@ def _agreement(vertices: Tensor, body: BodyTemplate, cameras: Cameras, shown: np
         cameras.cam_from_world, cameras.intrinsics, shown, strict=True
     ):
         pixels = (vertices @ pose[:3, :3].T + pose[:3, 3]) @ intrinsics.T
-        flat = torch.cat(
-            [pixels[:, :2] / pixels[:, 2:] - 0.5, torch.ones_like(pixels[:, :1])], dim=1
-        )
+        flat = torch.nn.functional.pad(pixels[:, :2] / pixels[:, 2:] - 0.5, (0, 1), value=1.0)
+        seen = rasterize(flat[body.faces].double().numpy(), cameras.width, cameras.height)
         own = np.zeros(mask.size, bool)
-        own[rasterize(flat[body.faces].double().numpy(), cameras.width, cameras.height).index] = (
-            True
-        )
+        own[seen.index] = True
         common += int((own & mask.ravel()).sum())
         either += int((own | mask.ravel()).sum())
     return common / max(either, 1)

@@ -152,19 +152,18 @@ def fill_unseen(baked: BakedTexels, texels: Texels) -> Filled:
     if not len(missing) or not len(known):
         return Filled(rgb, 0, 0)
     places = KDTree(_with_normals(texels.points[known], texels.normals[known]))
-    own = _with_normals(texels.points[missing], texels.normals[missing])
+    points = texels.points[missing]
+    normals = texels.normals[missing]
     distance, at = (
-        x.reshape(len(missing), -1) for x in places.query(own, k=min(_AROUND, len(known)))
+        torch.from_numpy(x.reshape(len(missing), -1))
+        for x in places.query(_with_normals(points, normals), k=min(_AROUND, len(known)))
     )
-    weight = torch.from_numpy(1 / np.maximum(distance, 1e-6) ** 2).float()
-    around = baked.rgb[known[torch.from_numpy(at)]]
+    weight = (1 / distance.clamp_min(1e-6).square()).float()
+    around = baked.rgb[known[at]]
     rgb[missing] = (weight[..., None] * around).sum(1) / weight.sum(1, keepdim=True)
-    far = torch.from_numpy(distance[:, 0] > _GAP)
-    flip = texels.points.new_tensor([-1.0, 1.0, 1.0])
-    distance, at = places.query(
-        _with_normals(texels.points[missing] * flip, texels.normals[missing] * flip)
-    )
-    mirrored = far & torch.from_numpy(distance < _MIRROR)
+    flip = points.new_tensor([-1.0, 1.0, 1.0])
+    beyond, at = places.query(_with_normals(points * flip, normals * flip))
+    mirrored = (distance[:, 0] > _GAP) & torch.from_numpy(beyond < _MIRROR)
     rgb[missing[mirrored]] = baked.rgb[known[torch.from_numpy(at)[mirrored]]]
     return Filled(rgb, int(mirrored.sum()), len(missing) - int(mirrored.sum()))
 
@@ -180,13 +179,11 @@ def texture_image(rgb: Tensor, texels: Texels) -> np.ndarray:
     empty = np.ones(size * size, bool)
     image[texels.index.numpy()] = rgb.numpy()
     empty[texels.index.numpy()] = False
-    nearest = np.empty((2, size, size), np.int32)
-    distance_transform_edt(
-        empty.reshape(size, size), return_distances=False, return_indices=True, indices=nearest
+    rows, columns = distance_transform_edt(
+        empty.reshape(size, size), return_distances=False, return_indices=True
     )
-    return np.rint(image.reshape(size, size, 3)[nearest[0], nearest[1]].clip(0, 1) * 255).astype(
-        np.uint8
-    )
+    nearest = image.reshape(size, size, 3)[rows, columns]
+    return np.rint(nearest.clip(0, 1) * 255).astype(np.uint8)
 
 
 def _with_normals(points: Tensor, normals: Tensor) -> np.ndarray:

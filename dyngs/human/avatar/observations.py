@@ -3,14 +3,12 @@ letter: N points."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
@@ -78,34 +76,6 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
     return torch.where(others, own, near).gather(1, order)
 
 
-class _Strains(torch.autograd.Function):
-    """See ``strains``. Numbers of one kind lie side by side: sums over rows of three are slow in
-    torch."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        columns = (x.T.contiguous() for x in (means, moved, means - points))
-        rest, posed, uneven = (x - x.index_select(1, near) for x in columns)
-        before, after = (x.square().sum(0).add_(_SHORTEST**2).sqrt_() for x in (rest, posed))
-        strain = after / scale - before
-        ctx.save_for_backward(
-            rest.mul_(strain / before), posed.mul_(strain / after), uneven, near, scale
-        )
-        return strain.square().mean(), uneven.square().sum() / len(near)
-
-    @staticmethod
-    @once_differentiable  # whose type hides the name of ctx
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        rest, posed, uneven, near, scale = ctx.saved_tensors
-        by_strain, by_uneven = (2 / len(near) * x for x in grads)
-        by_rest = by_uneven * uneven - by_strain * rest
-        by_posed = by_strain / scale * posed
-        by_means, by_moved = (x.index_add(1, near, x, alpha=-1).T for x in (by_rest, by_posed))
-        return by_means, by_moved, None, None, None
-
-
 _SHORTEST = 1e-6  # added to all distances, squared: points that coincide pull each other nowhere
 
 
@@ -113,13 +83,18 @@ def strains(
     means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return mean squares () of changes of the distance to a neighbour, and of unlike offsets;
-    differentiable once.
+    differentiable.
 
     ``means`` (N, 3) at rest, which are offset from ``points`` (N, 3), are ``moved`` (N, 3) to a
     pose, in a world with ``scale`` () units per unit of theirs; ``near`` (N,) are rows of their
     neighbours.
     """
-    return cast(Any, _Strains).apply(means, moved, points, near, scale)
+    # Numbers of one kind lie side by side: sums over rows of three are slow in torch.
+    columns = (x.T.contiguous() for x in (means, moved, means - points))
+    rest, posed, uneven = (x - x.index_select(1, near) for x in columns)
+    before, after = ((x.square().sum(0) + _SHORTEST**2).sqrt() for x in (rest, posed))
+    strain = after / scale - before
+    return strain.square().mean(), uneven.square().sum() / len(near)
 
 
 # sightings (see sightings) at which a Gaussian's own values count as much as what is around it
@@ -224,7 +199,8 @@ def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -
     x_j)^2 over neighbours that follow the same joints, where w falls with their distance; by
     conjugate gradients.
     """
-    from scipy.sparse import csr_array
+    from scipy.sparse import csr_array, diags_array
+    from scipy.sparse.linalg import cg
 
     count = len(values)
     given = values.detach().double().cpu().numpy()
@@ -239,40 +215,15 @@ def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -
     links = links.maximum(links.T)
     sure = trust.detach().double().cpu().numpy()
     own = sure / np.maximum(1 - sure, _SURE) + _OWN
-    diagonal = (np.asarray(links.sum(1)).ravel() + own)[:, None]
-    found = _conjugate_gradients(
-        lambda x: diagonal * x - links @ x, own[:, None] * given, given, 1 / diagonal
-    )
-    return torch.where(trust[:, None] > 1 - _SURE, values, torch.from_numpy(found).to(values))
-
-
-def _conjugate_gradients(
-    applied: Callable[[np.ndarray], np.ndarray],
-    wanted: np.ndarray,
-    first: np.ndarray,
-    scaling: np.ndarray,
-) -> np.ndarray:
-    """Return x (N, C) with ``applied`` (x) = ``wanted``, a positive definite system, column by
-    column, from ``first``.
-
-    ``scaling`` (N, 1) is the inverse of its diagonal (Jacobi's preconditioner).
-    """
-    x = first
-    residual = wanted - applied(first)
-    direction = scaled = scaling * residual
-    size = (residual * scaled).sum(0)
-    for _ in range(_MAX_ROUNDS):
-        if float(np.abs(residual).max(initial=0)) < _RESIDUAL:
-            break
-        image = applied(direction)
-        step = size / np.maximum((direction * image).sum(0), 1e-300)
-        x = x + step * direction
-        residual = residual - step * image
-        scaled = scaling * residual
-        before = size
-        size = (residual * scaled).sum(0)
-        direction = scaled + size / np.maximum(before, 1e-300) * direction
-    return x
+    diagonal = np.asarray(links.sum(1)).ravel() + own
+    system = diags_array(diagonal) - links
+    jacobi = diags_array(1 / diagonal)
+    columns = [
+        cg(system, own * x, x0=x, rtol=0, atol=_RESIDUAL, maxiter=_MAX_ROUNDS, M=jacobi)[0]
+        for x in given.T
+    ]
+    found = torch.from_numpy(np.stack(columns, axis=1)).to(values)
+    return torch.where(trust[:, None] > 1 - _SURE, values, found)
 
 
 FACING_EXPONENT = 4

@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
@@ -308,33 +306,12 @@ def skinning_weights(
     Corrections have no effect where a Gaussian follows a single joint: they act where parts of the
     body meet.
     """
-    if corrections is None:
-        return anchors.weights.new_zeros(len(anchors), num_joints).scatter_add_(
-            1, anchors.joints, anchors.weights
-        )
-    return cast(Any, _CorrectedWeights).apply(
-        corrections, anchors.weights, anchors.joints, num_joints
-    )
-
-
-class _CorrectedWeights(torch.autograd.Function):
-    """See ``skinning_weights``; differentiable once, in the corrections."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, corrections: Tensor, weights: Tensor, joints: Tensor, num_joints: int
-    ) -> Tensor:
-        parts = corrections.exp().mul_(weights)
-        parts /= parts.sum(1, keepdim=True)
-        ctx.save_for_backward(parts, joints)
-        return parts.new_zeros(len(parts), num_joints).scatter_add_(1, joints, parts)
-
-    @staticmethod
-    @once_differentiable  # whose type hides the name of ctx
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        parts, joints = ctx.saved_tensors
-        by_parts = grads[0].gather(1, joints).mul_(parts)
-        return by_parts - parts * by_parts.sum(1, keepdim=True), None, None, None
+    parts = anchors.weights
+    if corrections is not None:
+        parts = corrections.exp() * parts
+        parts = parts / parts.sum(1, keepdim=True)
+    dense = parts.new_zeros(len(anchors), num_joints)
+    return dense.scatter_add(1, anchors.joints, parts)
 
 
 FINER = 2  # texels of the finer atlas along a side of one

@@ -353,42 +353,29 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     f = len(state["clip.times"])
     require_body(n, gaussians.sh.shape[1], state["parents"], j)
     require_moments("clip.times", state["clip.times"])
+    k = state["anchors.weights"].shape[-1]
     shapes = dict.fromkeys(("joints", "learned.joints", "learned.turns"), (j, 3))
     shapes |= dict.fromkeys(("clip.poses", "learned.poses"), (f, j, 3))
     shapes |= dict.fromkeys(("clip.trans", "learned.trans"), (f, 3))
-    shapes |= {"clip.scale": (f,), "learned.log_scale": (1,)}
+    shapes |= dict.fromkeys(("anchors.weights", "learned.weights"), (n, k))
+    shapes |= dict.fromkeys(("anchors.points", "anchors.barycentric"), (n, 3))
+    shapes |= dict.fromkeys(("anchors.size", "anchors.height"), (n,))
+    shapes |= {"clip.scale": (f,), "learned.log_scale": (1,), "anchors.uv": (n, 2)}
+    if "learned.light" in state:
+        shapes |= {"learned.light": (TERMS, 3), "learned.normals": (n, 3)}
+    if "seen" in state:
+        shapes["seen"] = (n,)
     for name, shape in shapes.items():
         require_tensor(name, state[name], shape)
     require_positive("clip.scale", state["clip.scale"])
     if not f:
         raise ValueError("the clip has no frame")
-    k = state["anchors.weights"].shape[-1]
-    shapes = {
-        "points": (n, 3),
-        "size": (n,),
-        "barycentric": (n, 3),
-        "uv": (n, 2),
-        "height": (n,),
-        "weights": (n, k),
-    }
-    for name, shape in shapes.items():
-        require_tensor(f"anchors.{name}", state[f"anchors.{name}"], shape)
-    require_indices("anchors.joints", state["anchors.joints"], (n, k), j)
-    require_indices("anchors.face", state["anchors.face"], (n,), _MOST_FACES)
-    if bool((state["anchors.weights"] < 0).any()) or not bool(
-        (state["anchors.weights"].sum(1) > 0).all()
-    ):
+    weights = state["anchors.weights"]
+    if bool((weights < 0).any()) or not bool((weights.sum(1) > 0).all()):
         raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
-    require_tensor(
-        "learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape)
-    )
-    if "learned.light" in state:
-        require_tensor("learned.light", state["learned.light"], (TERMS, 3))
-        require_tensor("learned.normals", state["learned.normals"], (n, 3))
-    if "shapes.directions" in state:
-        require_indices("anchors.face", state["anchors.face"], (n,), len(state["shapes.faces"]))
-    if "seen" in state:
-        require_tensor("seen", state["seen"], (n,))
+    faces = len(state["shapes.faces"]) if "shapes.directions" in state else _MOST_FACES
+    require_indices("anchors.joints", state["anchors.joints"], (n, k), j)
+    require_indices("anchors.face", state["anchors.face"], (n,), faces)
     if "near" in state:
         require_indices("near", state["near"], (n, None), n)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import RasterizeMode, ReportProgress
+from dyngs.core.conventions import RasterizeMode, ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import numbered
 from dyngs.data.capture import Capture, Split, View
@@ -361,7 +361,6 @@ LR = {
 } | {
     "offset": 3e-3,
     "shift": 3e-3,
-    "log_focal": 3e-2,
 }
 """Learning rates at the first step; those of positions per metre of the person's unit."""
 LR_DECAY = 0.1
@@ -382,8 +381,6 @@ mean."""
 PLACE, PLACE_WEIGHT = 0.03, 0.1
 """Expected error of a joint given in 3D, metres of the person, and the weight of their robust
 mean."""
-FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
-"""Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of
 their mean square."""
@@ -430,34 +427,6 @@ def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
     }
     unit = float(clip.scale.mean())
     return Parameters(zeros, LR | {name: LR[name] * unit for name in ("trans", "shift")}, LR_DECAY)
-
-
-def with_lens(learned: Parameters, distance: float) -> Parameters:
-    """Return the same with a focal length to be learned: of one camera that stands at the origin of
-    the world.
-
-    Adds ``log_focal`` (1,), the natural logarithm of the factor on the given focal length, and
-    ``distance`` (1,), which is never learned: the camera steps back as its focal length grows, so
-    that what is at this distance stays as large.
-    """
-    blank = learned["log_scale"].detach()
-    values = {"log_focal": torch.zeros_like(blank), "distance": torch.full_like(blank, distance)}
-    rates = {"log_focal": LR["log_focal"], "distance": 0.0}
-    return Parameters(learned.values() | values, learned.rates | rates, learned.decay)
-
-
-def refined(cameras: Cameras, learned: Parameters) -> Cameras:
-    """Return the cameras with the focal length that was learned; as they are where none is."""
-    if "log_focal" not in learned:
-        return cameras
-    factor = learned["log_focal"].exp()
-    focal = torch.zeros_like(cameras.intrinsics[0])
-    focal[0, 0] = focal[1, 1] = 1.0
-    intrinsics = cameras.intrinsics + (factor - 1) * focal * cameras.intrinsics
-    along = torch.zeros_like(cameras.cam_from_world[0])
-    along[2, 3] = 1.0
-    poses = cameras.cam_from_world + (factor - 1) * learned["distance"] * along
-    return Cameras(poses, intrinsics, cameras.width, cameras.height)
 
 
 def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
@@ -529,8 +498,6 @@ def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     if len(learned["poses"]) > 1:
         jumps = learned["poses"][1:] - learned["poses"][:-1]
         total = total + STEP_WEIGHT * (jumps / STEP).square().mean()
-    if "log_focal" in learned:
-        total = total + FOCAL_WEIGHT * (learned["log_focal"] / FOCAL).square().mean()
     return total + PADDING_WEIGHT * (learned["padding"] / PADDING).square().mean()
 
 
@@ -589,11 +556,10 @@ def mean_error(
     errors = []
     for row, frame in seen.items():
         pose = frame_pose_of(learned, clip, row)
-        cameras = refined(frame.cameras, learned)
-        error = silhouette_error(drawn_silhouettes(body.in_pose(pose), cameras), frame)
+        error = silhouette_error(drawn_silhouettes(body.in_pose(pose), frame.cameras), frame)
         if frame.joints is not None:
             joints = posed_joints(body.skeleton, pose)
-            error = error + KEYPOINT_WEIGHT * keypoint_error(joints, frame.joints, cameras)
+            error = error + KEYPOINT_WEIGHT * keypoint_error(joints, frame.joints, frame.cameras)
         if frame.positions is not None:
             joints = posed_joints(body.skeleton, pose)
             error = error + PLACE_WEIGHT * place_error(joints, frame.positions, pose.scale.detach())
@@ -611,7 +577,7 @@ def drawn_frame(
 ) -> Tensor:
     """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
     discs = shaped(learned, surface).in_pose(frame_pose_of(learned, clip, row))
-    return drawn_silhouettes(discs, refined(cameras, learned))
+    return drawn_silhouettes(discs, cameras)
 
 
 def spread_order(count: int) -> list[int]:
@@ -660,78 +626,6 @@ def body_fit(learned: Parameters, joints: int) -> BodyFit:
     shared = SharedCorrection(padded(values["turns"]), float(values["log_scale"][0]))
     positions = (values["offset"], values["shift"])
     return BodyFit(values["betas"], shared, *positions, padded(values["poses"]), values["trans"])
-
-
-EVERY = 4  # each so many-th frame is left out: of those only poses are fitted
-# fraction by which the error on frames left out must fall for a refined focal length to be taken
-LENS_GAIN = 0.01
-
-
-@dataclass(frozen=True)
-class LensFit:
-    """A focal length that was tried."""
-
-    factor: float  # on the guessed focal length
-    # from the camera at which the size in the images is kept, in units of the world
-    distance: float
-    # on the frames left out, with the focal length as guessed and as refined
-    error: tuple[float, float]
-    taken: bool  # the refined one is better
-
-    def summary(self) -> str:
-        """Return a line for people."""
-        guessed, refined = self.error
-        return (
-            f"focal length: {self.factor:.2f} times the guess, error on frames left out {guessed:.4f} -> {refined:.4f}"
-            + (", taken" if self.taken else ": the guess stays, as the images do not tell")
-        )
-
-
-def fit_lens(
-    fitting: Fitting,
-    start: Parameters,
-    shape: Sequence[str],
-    observed: Observations,
-    steps: int,
-    tick: Callable[[], None] = lambda: None,
-) -> tuple[Parameters, LensFit]:
-    """Return the fit of shape, poses and focal length to the frames of one camera at the origin;
-    ``start`` if it stays.
-
-    Both lenses are fitted to three of four frames; then poses of the other frames: where these
-    agree better, the refined one is taken. ``start`` was found with the guessed focal length;
-    ``shape`` names what is the same in all frames.
-    """
-    rows = list(range(len(fitting.clip)))
-    apart = rows[EVERY // 2 :: EVERY] or rows
-    rest = [row for row in rows if row not in apart] or rows
-    own = ("poses", "trans")
-
-    def run(start: Parameters, learned: Sequence[str], seen: Sequence[int]) -> Parameters:
-        return fitting.run(
-            start, learned, steps, lambda row: observed(row) if row in seen else None, tick
-        )
-
-    distance = float(-fitting.clip.trans[:, 2].mean())
-    guessed = run(start, (*shape, *own), rest)
-    refined = run(with_lens(start, distance), (*shape, *own, "log_focal"), rest)
-    both = [run(found, own, apart) for found in (guessed, refined)]
-    errors = (
-        _mean_error(fitting, both[0], observed, apart),
-        _mean_error(fitting, both[1], observed, apart),
-    )
-    taken = errors[1] < (1 - LENS_GAIN) * errors[0]
-    found = run(both[1], (*shape, *own, "log_focal"), rows) if taken else start
-    last = found if taken else refined
-    return found, LensFit(float(last["log_focal"].detach().exp()), distance, errors, taken)
-
-
-@torch.no_grad()
-def _mean_error(
-    fitting: Fitting, learned: Parameters, observed: Observations, rows: Sequence[int]
-) -> float:
-    seen = {row: frame for row in rows if (frame := observed(row)) is not None}
-    return float(mean_error(learned, fitting.clip, fitting.surface, seen)) if seen else 0.0
 
 
 NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor
@@ -784,22 +678,14 @@ def angle_between(a: Tensor, b: Tensor) -> float:
     )
 
 
-def heading(index: int) -> float:
-    """Return the angle about the vertical, rad, of the heading ``index``."""
-    return 2 * math.pi * index / NUM_HEADINGS
-
-
 STEPS = 40
 """Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of
 the one before."""
 OFF_COURSE = math.radians(30)
 """Rotation of the root away from the path of headings from which a frame is begun on that path
 instead."""
-ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
-"""Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent
-forward."""
 # headings of the first frame from which clips without key points are followed without the path, too
-_WITHOUT_PATH = 2
+WITHOUT_PATH = 2
 MOMENTUM = 0.8
 """Fraction of the last rotation that is expected again, so that legs which pass each other are not
 exchanged."""
@@ -808,7 +694,10 @@ PELVIS_FRACTION = 0.53  # height of the pelvis, of that of the person
 
 
 def first_poses(
-    times: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None] = lambda: None
+    times: Tensor,
+    surface: Surface,
+    observed: Observations,
+    report: ReportProgress = report_nothing,
 ) -> MotionClip:
     """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row)
     alone.
@@ -823,57 +712,79 @@ def first_poses(
         raise ValueError("nobody is seen in the first frame")
     standing = standing_clip(times, surface, observed)
     up = up_of(seen)
-    shown = {
-        row: frame
-        for row in evenly_spaced(len(times), MOST_ANCHORS)
-        if (frame := observed(row)) is not None
-    }
-    anchors = list(shown)
-    tried = [_all_headings(standing, row, up, surface, shown[row], tick) for row in shown]
+    count = len(times)
+    anchors: list[int] = []
+    tried: list[list[tuple[Tensor, Tensor, float]]] = []
+    rows = evenly_spaced(count, MOST_ANCHORS)
+    for number, row in enumerate(rows, 1):
+        frame = observed(row)
+        if frame is not None:
+            anchors.append(row)
+            tried.append(_all_headings(standing, row, up, surface, frame))
+        report("headings", number, len(rows))
     path = likely_path([[error for _, _, error in own] for own in tried])
-    roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
-    ways: list[tuple[int, Tensor | None]] = [(path[0], roots_between(anchors, roots, len(times)))]
-    if seen.joints is None:
+    along = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
+    roots = roots_between(anchors, along, count)
+    ways: list[tuple[int, Tensor | None]] = [(path[0], roots)]
+    if seen.joints is None:  # outlines from two opposite sides are alike: the path may be wrong
         best = sorted(range(NUM_HEADINGS), key=lambda i: tried[0][i][2])
-        ways += [(index, None) for index in best[:_WITHOUT_PATH]]
+        ways += [(index, None) for index in best[:WITHOUT_PATH]]
     followed = []
-    for index, along in ways:
-        pose, trans, error = tried[0][index]
-        first = _with_better_arms(_with_row(standing, 0, pose, trans), error, surface, seen)
-        followed.append(_followed(first, along, surface, observed, tick))
+    for number, (index, along) in enumerate(ways, 1):
+        followed.append(_followed(standing, tried[0][index], along, surface, observed))
+        report("first poses", number, len(ways))
     return min(followed, key=lambda found: found[1])[0]
 
 
-def num_ticks(frames: int, *, marked: bool) -> int:
-    """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without
-    key points."""
-    headings, ways = (LIKELY, 1) if marked else (NUM_HEADINGS, 1 + _WITHOUT_PATH)
-    return headings * len(evenly_spaced(frames, MOST_ANCHORS)) + (frames - 1) * ways
+def _followed(
+    standing: MotionClip,
+    first: tuple[Tensor, Tensor, float],
+    roots: Tensor | None,
+    surface: Surface,
+    observed: Observations,
+) -> tuple[MotionClip, float]:
+    """Return the clip with the poses after the first frame found one by one, and the mean error of
+    what is seen.
+
+    ``roots`` (F, 3) is a path of headings to stay near; None: there is none.
+    """
+    poses = standing.poses.clone()
+    trans = standing.trans.clone()
+    poses[0], trans[0], _ = first
+    errors = []
+    for row in range(1, len(poses)):
+        seen = observed(row)
+        poses[row] = _extrapolated(poses, row)
+        trans[row] = trans[row - 1] + standing.trans[row] - standing.trans[row - 1]
+        if seen is None:
+            continue
+        starts = [poses[row]]
+        if roots is not None and angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
+            starts = [
+                torch.cat([roots[row : row + 1], others[1:]])
+                for others in (poses[row], standing.poses[row])
+            ]
+        found = [_found_from(standing, start, trans[row], row, surface, seen) for start in starts]
+        poses[row], trans[row], error = min(found, key=lambda x: x[2])
+        errors.append(error)
+    return replace(standing, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
 
 
 def _all_headings(
-    clip: MotionClip,
-    row: int,
-    up: Tensor,
-    surface: Surface,
-    seen: ObservedFrame,
-    tick: Callable[[], None],
+    clip: MotionClip, row: int, up: Tensor, surface: Surface, seen: ObservedFrame
 ) -> list[tuple[Tensor, Tensor, float]]:
     """Return pose, translation and error of a frame as found from each heading; after the first at
     half the size.
 
     With key points only the ``LIKELY`` headings are tried, and the error of others is infinite.
     """
-    starts = [turned(clip, heading(index), up) for index in range(NUM_HEADINGS)]
+    starts = [turned(clip, 2 * math.pi * i / NUM_HEADINGS, up) for i in range(NUM_HEADINGS)]
     errors = [_marked_error(start, row, surface, seen) for start in starts]
-    likely = sorted(range(NUM_HEADINGS), key=errors.__getitem__)[
-        : NUM_HEADINGS if seen.joints is None else LIKELY
-    ]
+    likely = sorted(range(NUM_HEADINGS), key=errors.__getitem__)
     found = [(start.poses[row], start.trans[row], math.inf) for start in starts]
-    for index in likely:
-        levels = (2, 1) if row == 0 else (2,)
+    levels = (2, 1) if row == 0 else (2,)
+    for index in likely[: NUM_HEADINGS if seen.joints is None else LIKELY]:
         found[index] = _found_from(starts[index], *found[index][:2], row, surface, seen, levels)
-        tick()
     return found
 
 
@@ -885,13 +796,6 @@ def _marked_error(clip: MotionClip, row: int, surface: Surface, seen: ObservedFr
     blank = new_fit(clip, surface)
     joints = posed_joints(surface.skeleton(blank["betas"]), frame_pose_of(blank, clip, row))
     return float(keypoint_error(joints, seen.joints, seen.cameras))
-
-
-def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
-    poses = clip.poses.clone()
-    positions = clip.trans.clone()
-    poses[row], positions[row] = pose, trans
-    return replace(clip, poses=poses, trans=positions)
 
 
 def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
@@ -978,60 +882,6 @@ def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None
     )
 
 
-def _followed(
-    clip: MotionClip,
-    roots: Tensor | None,
-    surface: Surface,
-    observed: Observations,
-    tick: Callable[[], None],
-) -> tuple[MotionClip, float]:
-    """Return the clip with the poses after the first frame found one by one, and the mean error of
-    what is seen.
-
-    ``roots`` (F, 3) is a path of headings to stay near; None: there is none.
-    """
-    poses = clip.poses.clone()
-    trans = clip.trans.clone()
-    errors = []
-    for row in range(1, len(poses)):
-        seen = observed(row)
-        poses[row] = _extrapolated(poses, row)
-        trans[row] = trans[row - 1] + clip.trans[row] - clip.trans[row - 1]
-        if seen is not None:
-            starts = [poses[row]]
-            if roots is not None and angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
-                starts = [
-                    torch.cat([roots[row : row + 1], others[1:]])
-                    for others in (poses[row], clip.poses[row])
-                ]
-            found = [_found_from(clip, start, trans[row], row, surface, seen) for start in starts]
-            poses[row], trans[row], error = min(found, key=lambda x: x[2])
-            errors.append(error)
-        tick()
-    return replace(clip, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
-
-
-def _with_better_arms(
-    clip: MotionClip, error: float, surface: Surface, seen: ObservedFrame
-) -> MotionClip:
-    """Return the clip whose first frame has the arms that fit best, of those found from other
-    positions as well.
-
-    A forearm that starts in front of the trunk does not find its way out of it.
-    """
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        for shoulder, elbow in ARMS:
-            pose = clip.poses[0].clone()
-            for name, degrees in (("shoulder", shoulder), ("elbow", elbow)):
-                turn = pose.new_tensor([degrees[0], sign * degrees[1], sign * degrees[2]])
-                pose[JOINT_NAMES.index(f"{side}_{name}")] = torch.deg2rad(turn)
-            pose, trans, found = _found_from(clip, pose, clip.trans[0], 0, surface, seen)
-            if found < error:
-                error = found
-                clip = _with_row(clip, 0, pose, trans)
-    return clip
-
-
 def _found_from(
     clip: MotionClip,
     pose: Tensor,
@@ -1113,24 +963,6 @@ class FitEffort:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What is known next to images and given poses."""
-
-    # in 3D, of frames of the capture, see ``dyngs.human.fit.keypoints``; None without
-    joints: Joints3D | None = None
-    # the capture is one camera that stands at the origin, with a guessed focal length to be refined
-    guessed_lens: bool = False
-    shape: bool = False  # the body has the shape of the person already
-
-    @property
-    def learned(self) -> tuple[str, ...]:
-        """Names of what is learned for all frames; one camera does not tell a small person from a
-        distant one."""
-        fixed = ("log_scale",) * self.guessed_lens + ("betas",) * self.shape
-        return tuple(name for name in SHAPE if name not in fixed)
-
-
-@dataclass(frozen=True)
 class TriedFit:
     """One way to fit."""
 
@@ -1151,19 +983,17 @@ class CaptureFit:
     # views left out of the fit, on which the candidates were measured; 0: measured on those fitted
     # to
     held_out: int
-    # the focal length of one fixed camera that was guessed; None where cameras are known
-    lens: LensFit | None = None
 
 
 @dataclass(frozen=True)
-class Seen:
+class FitViews:
     """What is looked at, by row of the clip: frames to fit to, and frames to judge by."""
 
     used: dict[int, ObservedFrame | None]
     judged: dict[int, ObservedFrame | None]
     held_out: int
 
-    def with_positions(self, positions: Mapping[int, Tensor]) -> Seen:
+    def with_positions(self, positions: Mapping[int, Tensor]) -> FitViews:
         """Return the same with joints given in 3D, by row."""
         used = {
             row: None if frame is None else replace(frame, positions=positions.get(row))
@@ -1184,13 +1014,25 @@ def fit_capture(
     report: ReportProgress,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
-    known: Known = Known(),
+    *,
+    joints: Joints3D | None = None,
+    one_camera: bool = False,
+    shape_known: bool = False,
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
     With given poses: first the shape; then rotations that are the same in all frames, and then
     those of every frame, each where it explains views clearly better that were left out. Without:
-    poses are found first (``first_poses``). Raises DyngsError: no silhouettes, or nobody in them.
+    poses are found first (``first_poses``).
+
+    Args:
+        keypoints: of the images, by view.
+        joints: in 3D, of frames of the capture.
+        one_camera: the size stays as it is, as one camera does not tell a small person from a
+            distant one.
+        shape_known: the body has the shape of the person already.
+
+    Raises DyngsError: no silhouettes, or nobody in them.
     """
     if not capture.has_alpha:
         raise DyngsError(
@@ -1206,37 +1048,27 @@ def fit_capture(
     )
     seen = look_at(capture, motion, options, effort, keypoints or {})
     surface = surface_of(body, RESOLUTION)
-    joints = known.joints
+    shape = [
+        name
+        for name in SHAPE
+        if not (name == "log_scale" and one_camera) and not (name == "betas" and shape_known)
+    ]
     if joints is not None:
         seen = seen.with_positions(
             {row: joints[frame] for frame, row in motion.rows.items() if frame in joints}
         )
     if given:
         fitting = Fitting(motion.clip, surface, near_given(motion.clip))
-        tried = _from_given(fitting, seen, known.learned, report, effort)
+        tried = _from_given(fitting, seen, shape, report, effort)
     else:
-        tick = ticker("first poses", report, num_ticks(len(motion.clip), marked=bool(keypoints)))
-        clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
+        clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, report)
         motion = CapturedMotion(clip, motion.frames)
         fitting = Fitting(clip, surface, usual(clip))
-        tried = _from_silhouettes(fitting, seen, known.learned, report, effort)
-    lens = None
-    if known.guessed_lens:
-        fitting = replace(fitting, expected=usual(motion.clip))
-        steps = effort.steps_for(motion.clip)
-        tick = ticker("focal length", report, 5 * steps)
-        refined, lens = fit_lens(
-            fitting, tried[-1].learned, known.learned, seen.used.__getitem__, steps, tick
-        )
-        if lens.taken:
-            tried = (*tried, measured("the focal length refined", refined, fitting, seen))
-    first_gain = 0.0 if not given else GAIN if known.shape else GAIN_OF_SHAPE
-    chosen = (
-        tried[-1] if lens is not None and lens.taken else simplest_of_the_best(tried, first_gain)
-    )
-    return CaptureFit(
-        body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, lens
-    )
+        tried = _from_silhouettes(fitting, seen, shape, report, effort)
+    first_gain = 0.0 if not given else GAIN if shape_known else GAIN_OF_SHAPE
+    chosen = simplest_of_the_best(tried, first_gain)
+    fit = body_fit(chosen.learned, len(body.joints))
+    return CaptureFit(fit, motion, chosen, tried, seen.held_out)
 
 
 def simplest_of_the_best(tried: Sequence[TriedFit], first_gain: float = GAIN_OF_SHAPE) -> TriedFit:
@@ -1301,7 +1133,7 @@ def look_at(
     options: DataConfig,
     effort: FitEffort,
     keypoints: Keypoints,
-) -> Seen:
+) -> FitViews:
     """Return the squares around the person in all frames. Raises DyngsError: nobody is seen."""
     views = capture.splits["train"]
     images = ImageLoader(
@@ -1330,7 +1162,7 @@ def look_at(
 
     held_out = sum(map(len, left_out.values()))
     seen = frames(used)
-    return Seen(seen, frames(left_out) if held_out else seen, held_out)
+    return FitViews(seen, frames(left_out) if held_out else seen, held_out)
 
 
 def _border_covered(image: Image) -> float:
@@ -1360,7 +1192,11 @@ def _marked(
 
 
 def _from_given(
-    fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
+    fitting: Fitting,
+    seen: FitViews,
+    shared: Sequence[str],
+    report: ReportProgress,
+    effort: FitEffort,
 ) -> tuple[TriedFit, ...]:
     start = new_fit(fitting.clip, fitting.surface)
     tick = ticker("shape", report, 3 * effort.steps)
@@ -1394,7 +1230,11 @@ def _from_given(
 
 
 def _from_silhouettes(
-    fitting: Fitting, seen: Seen, shape: tuple[str, ...], report: ReportProgress, effort: FitEffort
+    fitting: Fitting,
+    seen: FitViews,
+    shape: Sequence[str],
+    report: ReportProgress,
+    effort: FitEffort,
 ) -> tuple[TriedFit, ...]:
     start = new_fit(fitting.clip, fitting.surface)
     steps = LONGER * effort.steps_for(fitting.clip)
@@ -1419,7 +1259,7 @@ def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
 
 
 @torch.no_grad()
-def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> TriedFit:
+def measured(name: str, learned: Parameters, fitting: Fitting, seen: FitViews) -> TriedFit:
     """Return the candidate with its IoU in the frames that judge."""
     found = []
     for row, frame in seen.judged.items():

@@ -20,7 +20,6 @@ from dyngs.capture.fixed_camera import (
     is_plain_clip,
     read_fixed_camera,
     silhouettes_of,
-    zoomed,
 )
 from dyngs.capture.masks import with_background_masks
 from dyngs.capture.sfm.photos import digest_of
@@ -43,8 +42,6 @@ from dyngs.human.body.body_reader import has_same_shapes, load_template, read_bo
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit.capture_fit import (
     CaptureFit,
-    Known,
-    LensFit,
     NewClip,
     Surface,
     drawn_silhouettes,
@@ -173,8 +170,7 @@ def posed_by_avatar(
     """Return the poses of a clip in which the avatar has the silhouettes of its images, where that
     is better.
 
-    The size is that of ``start``, or that of the clip of training where the silhouettes show that
-    the world has the same unit. Frames of ``start`` without an image keep their poses.
+    Frames of ``start`` without an image keep their poses.
     """
     times = start.clip.times.tolist()
     shown = [replace(x, time=times[start.rows[-1 if x.frame is None else x.frame]]) for x in views]
@@ -185,17 +181,13 @@ def posed_by_avatar(
     left_out, others = _left_out(shown)
     tested = ImageLoader(left_out or others, small)
     images = ImageLoader(others, small)
-    scene = avatar.scene
+    scene = avatar.scene.playing(start.clip)
+    before = _overlap(scene, tested)
+    after = _overlap(_fitted(scene, images), tested)
     clip = start.clip
-    size = torch.full_like(start.clip.scale, float(scene.clip.scale.mean()))
-    pelvis = scene.skeleton.joints[0]  # stays where it is
-    in_size = replace(clip, scale=size, trans=clip.trans + (clip.scale - size)[:, None] * pelvis)
-    players = [scene.playing(clip), scene.playing(in_size)]
-    tried = [(_overlap(_fitted(player, images), tested), player) for player in players]
-    before, (after, best) = _overlap(players[0], tested), max(tried, key=lambda x: x[0])
     if after > before:
-        found = _fitted(best, ImageLoader(shown, small)).played
-        clip = clip if found is None else _with_rows(best.played or clip, found)
+        found = _fitted(scene, ImageLoader(shown, small)).played
+        clip = clip if found is None else _with_rows(clip, found)
     return AvatarPoses(replace(start, clip=clip), before, after, len(left_out))
 
 
@@ -207,7 +199,7 @@ def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:
 def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
     """Return one view of each of some time steps, and the others of these time steps to fit to.
 
-    Moments with too few views lose none.
+    Time steps with too few views lose none.
     """
     groups: dict[float | None, list[View]] = {}
     for view in views:
@@ -266,11 +258,6 @@ class FitInputs:
     template: HumanModel = field(default_factory=HumanModel)  # names the body file that is fitted
 
 
-def has_guessed_lens(capture: Capture) -> bool:
-    """Whether the camera of a capture was guessed."""
-    return capture.format == FORMAT
-
-
 def read_person(
     options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = show
 ) -> Capture:
@@ -304,19 +291,8 @@ def read_person(
                 f"{source}: no silhouettes, and the camera moves; add masks of the person"
             )
         capture = with_background_masks(capture, work, given.background, say)
-    found_only = has_guessed_lens(capture) or given.masks is not None
+    found_only = capture.format == FORMAT or given.masks is not None
     return _without_empty_frames(capture, options, say) if found_only else capture
-
-
-def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
-    """Return the capture with the focal length that was found."""
-    if lens is None or not lens.taken:
-        return capture
-    splits = {
-        name: tuple(zoomed(view, lens.factor, lens.distance) for view in views)
-        for name, views in capture.splits.items()
-    }
-    return capture.replace(splits=splits)
 
 
 def _without_empty_frames(
@@ -486,13 +462,12 @@ class FittedCapture:
         )
         worst = int(np.nanargmin(found.chosen.per_frame))
         tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
-        lens = "" if found.lens is None else f"\n{found.lens.summary()}"
         named = "" if self.template == "anny" else f"{self.template}, "
         others = [x.summary() for x in (self.new_poses, *self.by_avatar) if x is not None]
         return (
             f"{named}{counted(frames, 'frame')}; overlap of silhouettes (IoU) on {where}: {tried}\n"
             f"taken: {found.chosen.name}; worst frame {found.motion.frames[worst]} with "
-            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}"
+            f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}"
             + "".join(f"\n{line}" for line in others)
         )
 
@@ -533,12 +508,19 @@ def write_fitted_capture(
             joints = read_joints(
                 given.joints, capture, body if given.body is None else read_body(given.body)
             )
-        known = Known(joints, has_guessed_lens(capture), person is not None)
         first = _given_shape(capture, body) if person is None else person
         shaped = with_shape(body, first)
-        found = fit_capture(capture, options, shaped, report, points, known=known)
+        found = fit_capture(
+            capture,
+            options,
+            shaped,
+            report,
+            points,
+            joints=joints,
+            one_camera=capture.format == FORMAT,
+            shape_known=person is not None,
+        )
         betas = _added(found.fit.betas, None if first is None else shape_of(body, first))
-        capture = with_lens(capture, found.lens)
         new_poses = placed_clip(capture, options, shaped, found, report)
         clips = fitted_clips(capture, shaped, found, new_poses)
         by_avatar: dict[Split, AvatarPoses] = {}
@@ -641,8 +623,7 @@ def _report(
     fit = found.fit
     chosen = found.chosen
     turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
-    lens: dict[str, object] = {} if found.lens is None else {"lens": {**vars(found.lens)}}
-    return lens | {
+    return {
         "frames": len(found.motion.clip),
         "taken": chosen.name,
         "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},

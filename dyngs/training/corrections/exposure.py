@@ -31,7 +31,6 @@ from dyngs.gaussians.colour.affine import SATURATED, recoloured
 from dyngs.gaussians.parameters import AdamState
 from dyngs.models.correction import Correction, RenderedView
 from dyngs.models.model import Look, Loss
-from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
 from dyngs.training.other_views import log_gains
 
@@ -46,13 +45,6 @@ MAX_RATE = 0.01
 MIXING_RATE = 0.05  # Rate of what mixes channels, and of offsets, over that of gains
 GAIN_WEIGHT, MIXING_WEIGHT = 0.3, 1.0
 """Weights of the mean squared deviation from the identity: gains differ, channels hardly mix."""
-CELLS, FEWEST_CELLS = 16, 8
-"""The ratio is a median over so many cells a side; with fewer that say something there is none."""
-# Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing
-DARK, COVERED = 0.02, 0.1
-# Pixels along the longer side from which only every second one is looked at, and so on
-ENOUGH = 100
-MAX_GAIN = 8.0
 # Weight of the mean square of its difference from the images before and after, in a video
 SMOOTH_WEIGHT = 1.0
 
@@ -120,10 +112,11 @@ class ViewExposures(Loss, Correction):
         image = view.image
         background = view.background
         rendering = view.rendering
+        beside = self._beside(index)
+        if not int(self._visits[index]) and beside:  # was not looked at, but those next to it
+            with torch.no_grad():
+                self._values[index] = self._values[beside].mean(0)
         shown = recoloured(self.affine(index), image, rendering, background)
-        if not int(self._visits[index]):
-            self._guess(index, image, rendering, shown.detach(), background)
-            shown = recoloured(self.affine(index), image, rendering, background)
         return replace(view, rendered=up_to_white(shown, image.composite(background)))
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
@@ -170,39 +163,6 @@ class ViewExposures(Loss, Correction):
         values = require_tensor("values", state["values"], self._values.shape, torch.float32)
         self._adam = AdamState.restored(state, {"values": values})
         self._visits, self._values = visits.clone(), values.clone().requires_grad_()
-
-    @torch.no_grad()
-    def _guess(
-        self, index: int, image: Image, rendering: Rendering, shown: Tensor, background: Tensor
-    ) -> None:
-        """Set the gains of an image to the median ratio, over cells, of it to its rendering
-        ``shown``.
-
-        A rendering that is not sharp yet has the right mean in cells, whereas least squares would
-        take it for flat. Where too little is to be seen it takes after those next to it.
-        """
-        every = max(1, max(shown.shape[:2]) // ENOUGH)
-        few = slice(every // 2, None, every), slice(every // 2, None, every)
-        truth = image.composite(background)[few]
-        through = rendering.transmittance[0][few][..., None]
-        shown = shown[few]
-        counts = ((truth < SATURATED).all(-1, keepdim=True) & (through < COVERED)).float()
-        counts = counts if image.mask is None else counts * image.mask[few][..., None]
-        behind = 0 if image.alpha is None else through * background
-        pixels = torch.cat(
-            [(truth - behind) * counts, (shown - behind) * counts, counts], -1
-        ).permute(2, 0, 1)
-        cells = torch.nn.functional.adaptive_avg_pool2d(pixels, (CELLS, CELLS)).flatten(1)
-        known = (cells[6] > 0.5) & (cells[:6] > DARK * cells[6]).all(0)
-        if int(known.sum()) < FEWEST_CELLS:
-            beside = self._beside(index)
-            if beside:
-                self._values[index] = self._values[beside].mean(0)
-            return
-        ratio = (cells[:3, known] / cells[3:6, known]).log().median(1).values
-        self._values[index].reshape(3, 4).diagonal().copy_(
-            ratio.exp().clamp(1 / MAX_GAIN, MAX_GAIN) - 1
-        )
 
 
 def up_to_white(rendered: Tensor, truth: Tensor) -> Tensor:

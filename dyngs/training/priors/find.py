@@ -43,30 +43,27 @@ def used_priors(
     kind: DepthForm | None = None
     flow_to: dict[int, Glance] = {}
     tracks: PointTracks | None = None
+    has_masks = False
+
+    def holds(what: str, agreement: Agreement, substitute: str) -> bool:
+        lines.append(_line(what, agreement, substitute))
+        return agreement.holds
+
     if "depth" in wanted and any(view.depth_path for view in views):
-        kind, agreement = _judged_depth(config, images)
-        lines.append(
-            _line(
-                f"depth maps (aligned in {_NAMES[kind]})", agreement, "one depth for a whole image"
-            )
-        )
-        kind = kind if agreement.holds else None
+        found, agreement = _judged_depth(config, images)
+        name = f"depth maps (aligned in {_NAMES[found]})"
+        kind = found if holds(name, agreement, "one depth for a whole image") else None
     if moves and "flow" in wanted and any(view.flow_path for view in views):
-        flow_to, agreement = _judged_flow(config, capture, images)
-        lines.append(
-            _line("optical flow", agreement, "no motion, its reverse or flow of other places")
-        )
-        flow_to = flow_to if agreement.holds else {}
+        to, agreement = _judged_flow(config, capture, images)
+        others = "no motion, its reverse or flow of other places"
+        flow_to = to if holds("optical flow", agreement, others) else {}
     if moves and "tracks" in wanted and capture.tracks_path is not None:
-        tracks, agreement = _judged_tracks(config, read_tracks(capture.tracks_path), images)
-        lines.append(_line("tracks", agreement, "tracks at random"))
-        tracks = tracks if agreement.holds else None
-    masks = moves and "motion_masks" in wanted and any(view.motion_mask_path for view in views)
-    if masks:
+        points, agreement = _judged_tracks(config, read_tracks(capture.tracks_path), images)
+        tracks = points if holds("tracks", agreement, "tracks at random") else None
+    if moves and "motion_masks" in wanted and any(view.motion_mask_path for view in views):
         agreement = _judged_masks(config, images)
-        lines.append(_line("motion masks", agreement, "the same masks the other way round"))
-        masks = agreement.holds
-    return UsedPriors(kind, flow_to, tracks, masks, tuple(lines))
+        has_masks = holds("motion masks", agreement, "the same masks the other way round")
+    return UsedPriors(kind, flow_to, tracks, has_masks, tuple(lines))
 
 
 _NAMES: dict[DepthForm, str] = {"depth": "depth", "inverse": "inverse depth"}

@@ -25,6 +25,7 @@ from dyngs.config import (
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians.restored import restored_scene
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints
@@ -32,7 +33,7 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.runs.opened import open_run
-from dyngs.training.new_trainer import assemble, restored_scene
+from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.895)

@@ -155,7 +155,6 @@ def test_without_given_poses_every_frame_has_its_own(
     wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(capture_fit, "STEPS", 1)
-    monkeypatch.setattr(capture_fit, "ARMS", ())
     capture = wrong[1].replace(body=None)
     effort = FitEffort(side=32, steps=1, visits=0)
     fit = fit_capture(

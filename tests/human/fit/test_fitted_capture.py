@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from dyngs.capture.fixed_camera import FORMAT
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import moved, read_body_file
@@ -20,7 +21,6 @@ from dyngs.data.readers.transforms import read_frame_file, read_views
 from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.fit.fitted_capture import (
     FitInputs,
-    has_guessed_lens,
     read_person,
     with_fitted_body,
     write_body,
@@ -155,7 +155,7 @@ def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
     capture = read_person(
         DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", said.append
     )
-    assert has_guessed_lens(capture)
+    assert capture.format == FORMAT
     assert capture.has_alpha
     assert [view.name for view in capture.splits["train"]] == [f"f{i:02d}" for i in range(2, 12)]
     assert any(
@@ -196,7 +196,7 @@ def test_masks_of_a_folder_replace_those_of_a_capture(tmp_path: Path) -> None:
     capture = read_person(
         DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w"
     )
-    assert not has_guessed_lens(capture)
+    assert capture.format != FORMAT
     assert all(view.silhouette is not None for view in capture.splits["train"])
     (tmp_path / "m" / f"{given.splits['train'][0].name}.png").unlink()
     with pytest.raises(DyngsError, match="no mask for 1 of 4 images"):

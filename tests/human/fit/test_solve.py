@@ -23,16 +23,13 @@ from dyngs.human.fit.capture_fit import (
     PosePrior,
     Surface,
     drawn_frame,
-    fit_lens,
     frame_pose_of,
     keypoint_error,
     near_given,
     new_fit,
     prior,
-    refined,
     surface_of,
     usual,
-    with_lens,
 )
 from dyngs.human.motion.motion import MotionClip
 
@@ -140,23 +137,6 @@ def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     assert changed == {"betas"}
 
 
-def test_a_longer_lens_from_further_away_shows_the_same_size(surface: Surface) -> None:
-    learned = with_lens(new_fit(clip(), surface), 4.0)
-    with torch.no_grad():
-        learned["log_focal"].add_(0.5)
-    poses = torch.eye(4)[None]
-    shown = refined(
-        Cameras(poses, torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]]), 64, 64), learned
-    )
-    factor = torch.tensor(0.5).exp()
-    assert torch.allclose(shown.intrinsics[0, 0, 0], 100 * factor)
-    assert torch.allclose(
-        100 * factor / (4.0 + shown.cam_from_world[0, 2, 3]), torch.tensor(100 / 4.0)
-    )
-    assert shown.intrinsics[0, :2, 2].tolist() == [32, 32]
-    assert refined(shown, new_fit(clip(), surface)) is shown
-
-
 def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> None:
     clip = MotionClip(
         torch.zeros(1, dtype=torch.float64), torch.zeros(1, 55, 3), torch.zeros(1, 3), torch.ones(1)
@@ -180,42 +160,3 @@ def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> Non
 
 
 SIZE, FRAMES, STEPS, DISTANCE = 32, 4, 12, 2.2
-
-
-def filmed(log_focal: float) -> tuple[Surface, MotionClip, list[ObservedFrame]]:
-    """Who turns before a camera whose focal length is not the guessed one, by that logarithm."""
-    surface = surface_of(default_template(), 16)
-    intrinsics = torch.tensor([[0.9 * SIZE, 0, SIZE / 2], [0, 0.9 * SIZE, SIZE / 2], [0, 0, 1]])
-    camera = Cameras(
-        torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None], intrinsics[None], SIZE, SIZE
-    )
-    poses = torch.zeros(FRAMES, 55, 3)
-    poses[:, 0, 1] = torch.arange(FRAMES) * 0.7
-    poses[:, JOINT_NAMES.index("left_shoulder"), 1] = -1.2
-    trans = torch.tensor([0.0, 0.0, -DISTANCE]).repeat(FRAMES, 1)
-    times = torch.linspace(0, 1, FRAMES, dtype=torch.float64)
-    clip = MotionClip(times, poses, trans, torch.ones(FRAMES))
-    true = with_lens(new_fit(clip, surface), DISTANCE)
-    with torch.no_grad():
-        true["log_focal"].add_(log_focal)
-        known = torch.ones(1, SIZE, SIZE)
-        seen = [
-            ObservedFrame(camera, drawn_frame(true, clip, surface, row, camera), known)
-            for row in range(FRAMES)
-        ]
-    return surface, clip, seen
-
-
-def test_a_wrong_guess_is_corrected() -> None:
-    surface, clip, seen = filmed(-0.3)
-    ticks: list[int] = []
-    start = new_fit(clip, surface)
-    fitting = Fitting(clip, surface, near_given(clip))
-    found, lens = fit_lens(fitting, start, (), seen.__getitem__, STEPS, lambda: ticks.append(1))
-    assert lens.taken
-    assert lens.error[1] < 0.8 * lens.error[0]
-    assert 0.6 < lens.factor < 0.93
-    assert float(found["log_focal"].detach().exp()) == lens.factor
-    assert len(ticks) == 5 * STEPS
-    assert "taken" in lens.summary()
-    assert float(start["poses"].detach().abs().max()) == 0

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from tiny_captures import edit_json
 from tiny_priors import with_priors
@@ -82,19 +81,3 @@ def test_ignored_priors_do_not_change_a_run(tmp_path: Path) -> None:
     assert trained[0].keys() == trained[1].keys()
     for name, x in trained[0].items():
         torch.testing.assert_close(x, trained[1][name], rtol=0, atol=0, equal_nan=True)
-
-
-def test_flow_goes_to_the_next_view_of_its_file_also_in_a_run_on_some_frames(
-    tmp_path: Path,
-) -> None:
-    """The middle one is left out: what leads there is not used."""
-    with_priors(tmp_path, ("a", "b", "c", "d", "e"))
-    edit_json(
-        tmp_path / "transforms_train.json",
-        lambda c: [frame.update(time=i / 4) for i, frame in enumerate(c["frames"])],
-    )
-    for name in "abcde":
-        np.save(tmp_path / f"{name}_flow.npy", np.zeros((8, 12, 2)))
-    views = read_capture(config_of(tmp_path).data).splits["train"]
-    assert [view.flow_to for view in views] == ["b", "c", "d", "e", None]
-    assert "ignored, no two" in "".join(found(tmp_path, "data.frames=::2").lines)

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Literal, cast
 
 import pytest
 import torch
 from moving_scene import MOVING_ROWS, SETUP, Sliding, camera, row_of_balls
 
-from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.rendering import RenderOptions
@@ -17,12 +15,9 @@ from dyngs.training.priors.used import (
     Glance,
     PointTracks,
     UsedPriors,
-    aligned,
     depth_error,
     displacements,
-    flow_error,
     track_error,
-    values_of,
 )
 
 HERE = camera(32, 24)
@@ -81,20 +76,6 @@ def test_flow_of_a_motion_that_is_not_there_costs() -> None:
     assert wrong > 0.001
 
 
-def test_times_outside_the_window_are_not_looked_at() -> None:
-    own = image(flow=torch.zeros(24, 32, 2))
-    assert terms(still_flow(), own, until=0.2) == {}
-    assert terms(still_flow(), own, index=1) == {}
-    assert terms(still_flow(), image()) == {}
-
-
-def test_only_the_field_learns_from_motion() -> None:
-    of = scene(0.5)
-    own = image(flow=torch.zeros(24, 32, 2))
-    loss = still_flow()(look(still_flow(), of, own))["flow"]
-    assert not loss.requires_grad  # this field learns nothing, and the Gaussians have no part
-
-
 def test_depth_is_drawn_only_where_it_is_needed() -> None:
     own = image(depth=torch.ones(24, 32))
     assert not UsedPriors().needs_depth(own)
@@ -112,24 +93,6 @@ def test_tracks_pair_views_of_other_times_that_share_points() -> None:
     assert tracks.pair(0, lambda time: time < 0.4, GENERATOR) is None
 
 
-def test_tracks_in_images_of_another_size() -> None:
-    """Points of the full images, twice as large, on a ball that does not move."""
-    of = row_of_balls().means
-    k = HERE.intrinsics[0]
-    pose = HERE.cam_from_world[0]
-    local = of[list(MOVING_ROWS) * 2] @ pose[:3, :3].T + pose[:3, 3]
-    full = Cameras(
-        HERE.cam_from_world, torch.tensor([2.0, 2.0, 1.0])[:, None] * HERE.intrinsics, 64, 48
-    )
-    xy = 2 * (local[:, :2] / local[:, 2:] * k.diagonal()[:2] + k[:2, 2])
-    glances = [Glance(full, 0.0), Glance(full, 0.5)]
-    priors = UsedPriors(
-        tracks=PointTracks(xy.expand(2, 4, 2), torch.ones(2, 4, dtype=torch.bool), glances)
-    )
-    assert terms(priors, image(), speed=0.0)["tracks"] < 1e-6
-    assert terms(priors, image())["tracks"] > 0.01
-
-
 def true_depth() -> torch.Tensor:
     y, x = torch.meshgrid(torch.linspace(0, 1, 12), torch.linspace(0, 1, 16), indexing="ij")
     return 2 + x + 0.5 * y + (x > 0.5)
@@ -143,17 +106,6 @@ def test_scale_and_shift_do_not_count(kind: DepthForm) -> None:
     error = depth_error(depth, torch.ones_like(depth), given, kind)
     assert error is not None
     assert float(error) < 1e-5
-
-
-def test_outliers_do_not_tilt_the_alignment() -> None:
-    given = torch.linspace(1, 2, 100)
-    wanted = 3 * given - 1
-    spoiled = wanted.clone()
-    spoiled[::8] = 50
-    found = aligned(given, spoiled)
-    assert found is not None
-    torch.testing.assert_close(found, wanted, rtol=0, atol=0.05)
-    assert aligned(given, -wanted) is None
 
 
 def test_a_step_against_the_gradient_brings_a_wrong_depth_nearer() -> None:
@@ -182,10 +134,6 @@ def test_unknown_transparent_and_masked_pixels_do_not_count() -> None:
     assert depth_error(depth, torch.zeros(12, 16), given, "depth") is None
 
 
-def test_inverses_keep_unknown_pixels() -> None:
-    assert values_of(torch.tensor([0.0, 2.0]), "inverse").tolist() == [0, 0.5]
-
-
 OPTIONS = RenderOptions()
 
 
@@ -204,25 +152,6 @@ def test_what_is_drawn_is_the_displacement_of_the_gaussian_that_shows() -> None:
     torch.testing.assert_close(
         drawn[shown][:, :2], wanted.expand(int(shown.sum()), 2), rtol=0, atol=1e-3
     )
-
-
-def test_gradients_move_the_gaussians_to_where_flow_says() -> None:
-    here = camera(32, 24)
-    start = row_of_balls(1)
-    end = (start.means.clone()).requires_grad_()
-    drawn = displacements(start, start.replace(means=end), here, here, OPTIONS)
-    flow = torch.full((24, 32, 2), torch.nan)
-    flow[drawn[..., 2].detach() > 0.5] = torch.tensor([3.0, 0.0])
-    image = Image("a", here, torch.zeros(24, 32, 3), None, None, 0.0, flow=flow)
-    error = flow_error(drawn, image)
-    assert error is not None
-    (slope,) = torch.autograd.grad(error, end)
-    along = here.cam_from_world[0, :3, :3] @ slope[0]
-    assert float(along[0]) < 0  # the loss falls where the point goes to the right in the image
-    assert (
-        flow_error(drawn.detach(), replace(image, flow=torch.full((24, 32, 2), torch.nan))) is None
-    )
-    assert flow_error(drawn.detach(), replace(image, mask=torch.zeros(24, 32))) is None
 
 
 def test_tracks_are_right_where_the_points_go() -> None:

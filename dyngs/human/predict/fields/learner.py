@@ -23,7 +23,6 @@ from dyngs.human.predict.fields.network import FieldNetwork
 from dyngs.human.predict.fields.people import (
     Person,
     metric,
-    moments,
     person_of,
     require_shown,
     sources_of,
@@ -31,7 +30,7 @@ from dyngs.human.predict.fields.people import (
     window,
 )
 from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
-from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle
+from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     Example,

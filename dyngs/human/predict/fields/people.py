@@ -27,7 +27,7 @@ from dyngs.human.body.body_reader import rest_shape
 from dyngs.human.body.mesh import Fragments, rasterize, vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
-from dyngs.human.predict.gps.rectification import around, cropped
+from dyngs.human.predict.gps.rectification import cropped, cut_out
 
 KEY_POINTS = 22
 """Joints that are key points: those of the body, which SMPL, SMPL-H and SMPL-X have in common."""
@@ -209,36 +209,11 @@ def window(image: Image, left: int, top: int, side: int) -> Image:
 
     It is moved into the image, and is smaller only where the image is.
     """
-    camera = image.cameras
-    width = min(side, camera.width)
-    height = min(side, camera.height)
-    left = min(max(left, 0), camera.width - width)
-    top = min(max(top, 0), camera.height - height)
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, 0, 2] -= left
-    intrinsics[:, 1, 2] -= top
-
-    def part(x: Tensor | None) -> Tensor | None:
-        return None if x is None else x[top : top + height, left : left + width].contiguous()
-
-    rgb = image.rgb_premultiplied[top : top + height, left : left + width].contiguous()
-    return replace(
-        image,
-        cameras=Cameras(camera.cam_from_world, intrinsics, width, height),
-        rgb_premultiplied=rgb,
-        **{
-            name: part(getattr(image, name))
-            for name in ("alpha", "mask", "depth", "moves", "labels", "flow")
-        },
-    )
-
-
-def moments(views: Sequence[View]) -> dict[tuple[int | None, float | None], list[int]]:
-    """Return the views of each moment, in their order around the person."""
-    found: dict[tuple[int | None, float | None], list[int]] = {}
-    for i, view in enumerate(views):
-        found.setdefault((view.frame, view.time), []).append(i)
-    return {moment: around(views, own) for moment, own in found.items()}
+    width = min(side, image.cameras.width)
+    height = min(side, image.cameras.height)
+    left = min(max(left, 0), image.cameras.width - width)
+    top = min(max(top, 0), image.cameras.height - height)
+    return cut_out(image, top, left, height, width)
 
 
 def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:

@@ -14,7 +14,7 @@ Local letters: two views, left and right; windows of H x W pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -102,12 +102,18 @@ def around(views: Sequence[View], chosen: Sequence[int]) -> list[int]:
     return [chosen[i] for i in np.argsort(azimuth, kind="stable")]
 
 
+def moments(views: Sequence[View]) -> dict[tuple[int | None, float | None], list[int]]:
+    """Return the views of each moment, in their order around the person."""
+    found: dict[tuple[int | None, float | None], list[int]] = {}
+    for i, view in enumerate(views):
+        found.setdefault((view.frame, view.time), []).append(i)
+    return {moment: around(views, own) for moment, own in found.items()}
+
+
 def well_spread(views: Sequence[View], count: int) -> list[int]:
     """Return ``count`` views of the moment that most views show: two neighbours, or some evenly
     around the ring."""
-    moments = [(view.frame, view.time) for view in views]
-    same = max(dict.fromkeys(moments), key=moments.count)
-    ordered = around(views, [i for i, moment in enumerate(moments) if moment == same])
+    ordered = max(moments(views).values(), key=len)
     if count != 2:
         return sorted(
             {ordered[round(i * len(ordered) / count) % len(ordered)] for i in range(count)}
@@ -123,10 +129,7 @@ def lessons(views: Sequence[View]) -> list[tuple[Pair, list[int]]]:
     """Return the pairs to train on, each with the views that stand between its two, of which there
     is at least one."""
     found: list[tuple[Pair, list[int]]] = []
-    for moment in dict.fromkeys((view.frame, view.time) for view in views):
-        ring = around(
-            views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment]
-        )
+    for ring in moments(views).values():
         for start, first in enumerate(ring):
             for step in range(2, len(ring)):
                 last = ring[(start + step) % len(ring)]
@@ -386,22 +389,28 @@ def cropped(image: Image, margin: int) -> Image:
     rows, columns = ((image.alpha > 0).any(side).nonzero()[:, 0] for side in (1, 0))
     if not len(rows):
         return image
-    (top, bottom), (first, last) = (
+    (top, bottom), (left, right) = (
         (max(0, int(x[0]) - margin), min(size, int(x[-1]) + 1 + margin))
         for x, size in zip((rows, columns), image.alpha.shape, strict=True)
     )
-    intrinsics = image.cameras.intrinsics.clone()
-    intrinsics[:, 0, 2] -= first
+    return cut_out(image, top, left, bottom - top, right - left)
+
+
+def cut_out(image: Image, top: int, left: int, height: int, width: int) -> Image:
+    """Return a part of an image, with its camera and maps, that begins at a row and column."""
+    camera = image.cameras
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[:, 0, 2] -= left
     intrinsics[:, 1, 2] -= top
-    camera = Cameras(image.cameras.cam_from_world, intrinsics, last - first, bottom - top)
-    part = np.s_[top:bottom, first:last]
-    mask = None if image.mask is None else image.mask[part]
-    return Image(
-        name=image.name,
-        cameras=camera,
-        rgb_premultiplied=image.rgb_premultiplied[part],
-        alpha=image.alpha[part],
-        mask=mask,
-        time=image.time,
-        frame=image.frame,
+
+    def part(x: Tensor) -> Tensor:
+        return x[top : top + height, left : left + width].contiguous()
+
+    names = ("alpha", "mask", "depth", "moves", "labels", "flow")
+    maps = {name: part(x) for name in names if (x := getattr(image, name)) is not None}
+    return replace(
+        image,
+        cameras=Cameras(camera.cam_from_world, intrinsics, width, height),
+        rgb_premultiplied=part(image.rgb_premultiplied),
+        **maps,
     )

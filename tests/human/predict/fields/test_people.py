@@ -15,11 +15,11 @@ from dyngs.human.predict.fields.people import (
     KEY_POINTS,
     Person,
     metric,
-    moments,
     require_shown,
     sources_of,
     spread,
 )
+from dyngs.human.predict.gps.rectification import moments
 
 
 def test_key_points_are_the_true_ones(person: Person, folder: Path) -> None:

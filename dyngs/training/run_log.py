@@ -1,4 +1,4 @@
-"""The log of a run: ``log.jsonl``, and TensorBoard if asked for."""
+"""The log of a run: a JSON line per step, and TensorBoard if requested."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from dyngs.io.fields import read_limited
 from dyngs.io.write import write_text
 from dyngs.training.events import Evaluated, Event, StepDone
 
-LOG_NAME = "log.jsonl"
 MOST_LOG_BYTES = 1 << 28
 """A line per step has 150 bytes."""
 
@@ -46,15 +45,15 @@ class RunLog:
     Args:
         after_step: lines beyond this step, left by an interrupted run, are dropped (0: all).
         every: steps between lines; the last step has one, too.
-        tensorboard: also write event files to ``run_dir/tensorboard``.
+        tensorboard: also write event files to ``tensorboard`` next to the log.
     """
 
     def __init__(
-        self, run_dir: Path, after_step: int, *, every: int = 1, tensorboard: bool = False
+        self, path: Path, after_step: int, *, every: int = 1, tensorboard: bool = False
     ) -> None:
-        self.path = run_dir / LOG_NAME
+        self.path = path
         self._every = every
-        self._board = _open_tensorboard(run_dir, after_step) if tensorboard else None
+        self._board = _open_tensorboard(path.parent, after_step) if tensorboard else None
         write_text(self.path, "".join(_lines_up_to(self.path, after_step)))
         self._file: IO[str] = self.path.open("a", encoding="utf-8")
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from dyngs.api.from_scene import settled
 from moving_scene import write_moving_run
 
 from dyngs.api.edit import Edits, edit_scene
 from dyngs.api.first_scene import first_of
+from dyngs.api.stages import continue_scene
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, FixedStrategy
@@ -24,9 +23,9 @@ from dyngs.export.edit.frame import Frame
 from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.densify import Densifier
-from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.runs.opened import open_run
 from dyngs.training.new_trainer import assemble
+from dyngs.training.plan import RunPlan
 
 BOX = (-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)
 
@@ -65,6 +64,10 @@ def config_of(capture: Path, folder: Path, *more: str, steps: int = 8) -> Config
 
 def going_on(capture: Path, run: Path, folder: Path, *more: str, steps: int = 8) -> Config:
     return config_of(capture, folder, "init.kind=scene", f"init.scene={run}", *more, steps=steps)
+
+
+def settled(config: Config) -> Config:
+    return continue_scene(RunPlan(config, config))[0].resolved
 
 
 def rows_of(gaussians: Gaussians) -> set[bytes]:
@@ -106,6 +109,8 @@ def test_it_begins_where_the_scene_was(kind: str, capture: Path, run: Path, tmp_
 
 class Wild(Densifier):
     """Doubles every Gaussian beside itself, makes all fainter, and shakes them, in every step."""
+
+    touches_all = True
 
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         source = torch.arange(len(parameters)).repeat(2)
@@ -169,27 +174,6 @@ def test_an_edited_run_goes_on_with_its_own_cameras(
     moved = open_run(edited).frame.gaussians(open_run(run).scene.gaussians)
     means = again.world_scale * first.gaussians.means
     torch.testing.assert_close(means, moved.means)
-
-
-def test_what_stays_is_not_part_of_a_change() -> None:
-    """A frozen Gaussian that would be split, relocated or made fainter is there as it was, and has
-    no copies."""
-    n = 4
-    means = torch.arange(12.0).reshape(n, 3)
-    sh = torch.ones(n, 1, 3)
-    old = Gaussians(means, torch.ones(n, 4), torch.zeros(n, 3), torch.arange(4.0), sh)
-    still = FrozenMask(torch.tensor([False, True, False, True]))
-    source = torch.tensor([0, 1, 1, 2, 2])
-    edit = TopologyEdit(source, torch.tensor([False, False, True, False, True]))
-    result = EditResult(edit, {"means": -means[source]})
-    found = still.grown(result, old)
-    assert found.edit is not None
-    assert found.edit.source.tolist() == [0, 2, 2, 1, 3]
-    assert found.edit.is_new.tolist() == [False, False, True, False, False]
-    assert found.changes["means"][:, 0].tolist() == [0, -6, -6, 3, 9]
-    reset = still.grown(EditResult(None, {"logit_opacities": torch.full((n,), -9.0)}), old)
-    assert reset.changes["logit_opacities"].tolist() == [-9, 1, -9, 3]
-    assert replace(still, rows=None).grown(result, old) is result
 
 
 def test_what_cannot_be_gone_on_from(capture: Path, run: Path, tmp_path: Path) -> None:

@@ -1,10 +1,10 @@
-"""Pages in a browser: that they play by themselves, show what dyngs draws, and obey."""
+"""Pages in a browser, and scenes in pages of others: that they play by themselves, show what dyngs
+draws, and obey, whatever the server does."""
 
 from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scaled_files import FACTORS, scaled
 from scene_kinds import KINDS, onlooker, scene_of_kind
 from scene_pages import (
+    Server,
     from_afar,
     large,
     levels_of_a_cloud,
@@ -36,8 +37,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr, ssim
 from dyngs.export.html import numbers
-from dyngs.export.html.element import SCRIPTS, SHADERS
-from dyngs.export.html.page import MOST_VIEWS, PAGE, write_folder, write_page
+from dyngs.export.html.page import ELEMENT, MOST_VIEWS, element_script, write_folder, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
@@ -167,58 +167,6 @@ def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
 
 
 @needs_browser
-def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
-    write(still_scene(), tmp_path / "page.html", large(camera(), 6))
-    page = browser.open((tmp_path / "page.html").as_uri(), 320, 240, touch=True)
-    page.wait_for("window.dyngs?.core !== undefined")
-    assert page.evaluate("dyngs.parts.bar.hidden")
-    before = page.evaluate("[dyngs.core.camera.yaw, dyngs.core.camera.distance]")
-    session = page.driven.context.new_cdp_session(page.driven)
-
-    def touch(kind: str, *places: tuple[int, int]) -> None:
-        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
-        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-
-    touch("touchStart", (100, 100))
-    touch("touchMove", (140, 100))
-    touch("touchEnd")
-    yaw, distance = page.evaluate("[dyngs.core.camera.yaw, dyngs.core.camera.distance]")
-    assert yaw < before[0]
-    assert distance == before[1]
-    touch("touchStart", (100, 100), (140, 100))
-    touch("touchMove", (80, 100), (160, 100))
-    touch("touchEnd")
-    assert page.evaluate("dyngs.core.camera.distance") < 0.7 * distance
-    assert page.errors == []
-    page.close()
-
-
-@needs_browser
-def test_nothing_is_upside_down(browser: Browser, tmp_path: Path) -> None:
-    """What lies toward `up` is in the upper half, also where the first camera is rolled."""
-    gaussians = replace(still_scene().gaussians, means=torch.tensor([[0.0, -0.7, 0]]).repeat(5, 1))
-    rolled = camera(120, 84).cam_from_world.clone()
-    rolled[0, :2] *= -1  # upside down
-    view = Cameras(rolled, large(camera(), 6).intrinsics, 120, 84)
-    write(StaticScene(gaussians=gaussians), tmp_path / "page.html", view)
-    page = opened(browser, tmp_path / "page.html")
-    rows = np.argwhere((page.screenshot("#canvas")[:, 90:230] < 200).all(-1))[:, 0]
-    assert len(rows) > 20
-    assert rows.mean() < 110
-    page.close()
-
-
-@needs_browser
-def test_a_browser_without_webgl_is_told(tmp_path: Path, browser: Browser) -> None:
-    write(still_scene(), tmp_path / "page.html", camera())
-    page = browser.open(None)
-    page.driven.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    page.driven.goto((tmp_path / "page.html").as_uri())
-    wait_for_line(page, "WebGL 2")
-    page.close()
-
-
-@needs_browser
 @pytest.mark.parametrize("most", [None, 9000])
 def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_path: Path) -> None:
     scene, view = levels_of_a_cloud(tmp_path / "page", most)
@@ -238,14 +186,6 @@ def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_pa
         assert all(request.startswith(server.address) for request in page.requests)
         assert len(page.requests) == (6 if most is None else 2)
         page.close()
-
-
-@needs_browser
-def test_a_page_of_levels_from_a_disk_says_what_it_needs(browser: Browser, tmp_path: Path) -> None:
-    levels_of_a_cloud(tmp_path / "page")
-    page = browser.open((tmp_path / "page" / PAGE).as_uri(), 320, 240)
-    wait_for_line(page, "http.server")
-    page.close()
 
 
 def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> None:
@@ -271,30 +211,9 @@ def test_a_page_names_no_host_and_allows_none(tmp_path: Path) -> None:
     assert json.loads(text.split('id="header">')[1].split("</script>")[0])["count"] == 5
 
 
-def test_all_parts_of_the_page_are_in_it(tmp_path: Path) -> None:
-    folder = Path(write_page.__code__.co_filename).parent
-    found = {file.name for file in folder.iterdir() if file.suffix in (".js", ".glsl")}
-    assert found == {*SCRIPTS, *SHADERS}
-    for name in found:
-        lines = (folder / name).read_text(encoding="utf-8").splitlines()
-        assert len(lines) <= 500, name
-        assert max(len(line) for line in lines) <= 120, name
-
-
 @pytest.fixture(scope="module")
 def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving")))
-
-
-@pytest.mark.parametrize(("kind", "count"), [("control_nodes", 0), ("hexplane", 1)])
-def test_a_page_says_where_splines_are_fitted(kind: str, count: int, tmp_path: Path) -> None:
-    """Control nodes move along splines already."""
-    notes = [
-        x
-        for x in write(scene_of_kind(kind), tmp_path / "a.html", onlooker()).notes
-        if "splines are fitted" in x
-    ]
-    assert len(notes) == count
 
 
 def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Opened, tmp_path: Path) -> None:
@@ -325,29 +244,6 @@ def test_a_page_begins_with_the_same_view_in_any_unit(factor: float, tmp_path: P
         pose = np.array(a["camFromWorld"]).reshape(4, 4)
         pose[:3, 3] /= factor
         np.testing.assert_allclose(pose, np.array(b["camFromWorld"]).reshape(4, 4), atol=1e-4)
-
-
-def test_the_offset_of_a_far_scene_is_told(tmp_path: Path) -> None:
-    run = write_moving_run(tmp_path, moves=False, offset=(500_000.0, 4_600_000.0, 0.0))
-    (note,) = write_page(open_run(run), tmp_path / "a.html").notes
-    assert (
-        note
-        == "the scene is far from the origin: 500000 4600000 0 is subtracted from its positions"
-    )
-
-
-def test_without_the_capture_a_page_begins_outside(tmp_path: Path) -> None:
-    run = write_moving_run(tmp_path, moves=False)
-    shutil.rmtree(tmp_path / "capture")
-    written = write_page(open_run(run), tmp_path / "a.html", title="<i>")
-    (note,) = written.notes
-    assert "without the capture" in note
-    assert not written.header["moves"]
-    assert written.header["background"] == [1.0, 1.0, 1.0]
-    assert "<title>&lt;i&gt;</title>" in (tmp_path / "a.html").read_text(encoding="utf-8")
-    for view in written.header["views"]:  # the balls, around the origin, are in front of each
-        pose = torch.tensor(view["camFromWorld"]).reshape(4, 4)
-        assert float(pose[2, 3]) > float(camera().cam_from_world[0, 2, 2])
 
 
 def settled(page: Page) -> NDArray[np.uint8]:
@@ -396,4 +292,136 @@ def test_a_long_clip_is_fetched_as_it_is_played(
         assert page.evaluate("dyngs.player.time") == pytest.approx(6.5 / 8)
         page.wait_for("dyngs.player.time !== 6.5 / 8")
         assert "6.bin" in server.asked
+        page.close()
+
+
+POLICY = "default-src 'none'; script-src 'self'; connect-src 'self'; style-src 'self'; "
+POLICY += "require-trusted-types-for 'script'; trusted-types 'none'"
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    (tmp_path / ELEMENT).write_text(element_script(), encoding="utf-8")
+    (tmp_path / "site.css").write_text(
+        "dyngs-scene { width: 200px; height: 100px; } body { margin: 0 }", "utf-8"
+    )
+    return tmp_path
+
+
+def page_with(
+    browser: Browser, server: Server, site: Path, *elements: str, policy: str = POLICY
+) -> Page:
+    """Open a page of a site with these elements."""
+    head = f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
+    head += f'<link rel="stylesheet" href="site.css"><script src="{ELEMENT}"></script><script src="{ELEMENT}"></script>'
+    (site / "site.html").write_text(f"<!DOCTYPE html>{head}{''.join(elements)}", encoding="utf-8")
+    return browser.open(server.address + "site.html", 320, 240)
+
+
+def wait_for_scene(page: Page, which: int = 0) -> None:
+    scene = f"document.querySelectorAll('dyngs-scene')[{which}]"
+    page.wait_for(f"{scene}.renderer && {scene}.parts.message.hidden")
+
+
+@needs_browser
+def test_several_scenes_stand_in_a_page_of_a_strict_site(browser: Browser, site: Path) -> None:
+    view = large(camera())
+    write(still_scene(), site / "still.html", view)
+    write(sliding_scene(), site / "moving.html", view)
+    levels, far = levels_of_a_cloud(site / "town")
+    elements = [f'<dyngs-scene src="{src}" {more}></dyngs-scene>' for src, more in SOURCES]
+    with served(site) as server:
+        page = page_with(browser, server, site, *elements)
+        for which, scene in enumerate((still_scene(), sliding_scene(), levels)):
+            wait_for_scene(page, which)
+            seen = from_afar(far, 30) if which == 2 else view
+            truth = scene.render(seen, 0.4, background=far.intrinsics.new_ones(3)).rgb[0].detach()
+            assert psnr(shown(page, seen, 0.4, which), truth) > 38
+        assert page.errors == []
+        assert (
+            page.evaluate("[...document.querySelectorAll('dyngs-scene')].map((x) => x.clientWidth)")
+            == [200] * 3
+        )
+        moving = "document.querySelectorAll('dyngs-scene')[1]"
+        assert not page.evaluate(f"{moving}.player.playing")
+        page.evaluate(f"{moving}.release(), {moving}.play()")
+        page.wait_for(f"{moving}.player.playing && {moving}.player.time > 0.42")
+        page.evaluate(f"{moving}.remove()")
+        assert (
+            page.evaluate("Object.keys(window).filter((name) => /dyngs|scene/i.test(name))") == []
+        )
+        page.close()
+
+
+SOURCES = (("still.html", ""), ("./moving.html", ""), ("town", ""))
+
+
+@needs_browser
+def test_what_cannot_be_shown_is_one_line_in_its_element(browser: Browser, site: Path) -> None:
+    write(still_scene(), site / "good.html", camera())
+    good = (site / "good.html").read_text(encoding="utf-8")
+    head, rest = good.split('id="numbers">')
+    numbers, tail = rest.split("</script>", 1)
+    broken = {
+        "other.html": ("<h1>Not here</h1>", "is no page that"),
+        "half.html": (head + 'id="numbers">' + numbers[:48], "ends too early"),
+        "short.html": (
+            head + 'id="numbers">' + numbers[:48] + "</script>" + tail,
+            "its numbers are damaged",
+        ),
+        "noise.html": (head + 'id="numbers">' + "%" * 40 + "</script>" + tail, "cannot be shown"),
+        "header.html": (good.replace('id="header">{', 'id="header">{{'), "its header is damaged"),
+        "views.html": (
+            good.replace('"views": [{', '"views": [], "x": [{'),
+            "its header is damaged",
+        ),
+        "huge.html": (good.replace('"rows": 5', '"rows": 5e15'), "cannot be shown"),
+        "long.html": (good.replace('"rows": 5', '"rows": 4'), "its numbers are damaged"),
+        "shader.html": (
+            re.sub(r'"degree": \d', '"degree": "0\\\\n#error no"', good),
+            "cannot be shown",
+        ),
+    }
+    for name, (text, _) in broken.items():
+        assert text != good
+        (site / name).write_text(text, encoding="utf-8")
+    sources = [*broken, "missing.html", "ftp://x/y.html", ""]
+    parts = [*(part for _, part in broken.values()), "answered 404", "web server", 'no src="PAGE"']
+    with served(site) as server:
+        elements = [f'<dyngs-scene src="{src}"></dyngs-scene>' for src in sources]
+        (site / "site.css").write_text("dyngs-scene { width: 80px; height: 8px; }", "utf-8")
+        page = page_with(browser, server, site, *elements)
+        for which, (src, part) in enumerate(zip(sources, parts, strict=True)):
+            line = wait_for_line(page, part, which)
+            assert line.startswith(f"{src or 'This scene'} cannot be shown: ")
+            assert "\n" not in line
+        assert [x for x in page.errors if "404" not in x] == []
+        page.close()
+
+
+@needs_browser
+def test_lost_parts_hold_up_no_others_and_are_asked_for_again(browser: Browser, site: Path) -> None:
+    scene, view = levels_of_a_cloud(site / "town")
+    with served(site) as server:
+        server.failing["town/1-0.bin"] = ["503", "damaged"]
+        server.failing["town/0-2.bin"] = ["404", "cut", "404"]
+        page = page_with(browser, server, site, '<dyngs-scene src="town/"></dyngs-scene>')
+        assert "/town/1-0.bin has not arrived (the server answered 503" in wait_for_line(
+            page, "trying again"
+        )
+        wait_for_line(page, "its numbers are damaged")
+        page.wait_for("document.querySelector('dyngs-scene').renderer")
+        line = wait_for_line(page, "/town/0-2.bin has not arrived")
+        assert "trying again" in line
+        # what is here is drawn, and the other parts arrive meanwhile
+        page.wait_for("document.querySelector('dyngs-scene').renderer.motion.held.size === 4")
+        assert np.ptp(page.screenshot("#canvas")) > 100
+        assert psnr(shown(page, view, 0.0), scene.render(view).rgb[0]) > 38
+        page.evaluate("document.querySelector('dyngs-scene').release()")
+        wait_for_scene(page)
+        assert [server.asked.count(f"town/{name}.bin") for name in ("1-0", "0-0", "0-2")] == [
+            3,
+            1,
+            4,
+        ]
         page.close()

@@ -1,54 +1,25 @@
-"""The numbers of scenes: how many, of what, and how large."""
+"""The numbers of a page: lists as they are read, motion as splines, uniforms of shaders."""
 
 from __future__ import annotations
 
 import base64
+import re
 import zlib
+from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from scene_kinds import KINDS, scene_of_kind
+from scene_kinds import scene_of_kind
 
-from dyngs.export.html.numbers import CHUNK, Lists, add_scene
+from dyngs.deform.field import Offsets
+from dyngs.export import html
+from dyngs.export.html.numbers import CHUNK, Lists, add_scene, fitted_curves
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.quaternions import rotation_matrices
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_has_the_lists_that_it_needs(kind: str) -> None:
-    scene = scene_of_kind(kind)
-    lists = Lists()
-    told = add_scene(scene, lists, 0.01)
-    layout = lists.layout
-    assert (told["count"], told["moves"]) == (len(scene), not scene.is_static)
-    for name, columns in {
-        "means": 3,
-        "quats": 4,
-        "log_scales": 3,
-        "logit_opacities": 1,
-        "base": 3,
-    }.items():
-        assert (layout[name]["rows"], layout[name]["columns"]) == (len(scene), columns)
-    assert ("boned" in layout, "bones" in told) == (kind == "human",) * 2
-    assert ("masks" in layout) == (kind == "masked")
-    assert ("pivots" in layout) == (kind in ("control_nodes", "windowed"))
-    assert ("windows" in layout) == (kind == "windowed")
-    assert ("network" in told) == (scene.colour is not None)
-    assert ("rest" in layout) == (scene.colour is None and scene.gaussians.sh_degree > 0)
-    assert ("curve_means" in layout) == (kind != "static")
-
-
-def test_lists_lie_one_after_the_other() -> None:
-    lists = Lists()
-    add_scene(scene_of_kind("control_nodes"), lists, 0.01)
-    places = sorted(told["at"] for told in lists.layout.values())
-    assert places[0] == 0
-    assert len(set(places)) == len(places)
-    assert places[-1] < lists.size
 
 
 def read(lists: Lists, name: str) -> NDArray[Any]:
@@ -102,12 +73,49 @@ def test_quantised_lists_err_by_half_a_step(bits: Literal[8, 16], rows: int) -> 
         ).all()
 
 
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
-def test_exact_lists_stay_as_they_are(kind: type[np.generic]) -> None:
-    values = np.arange(300).reshape(100, 3).astype(kind)
-    lists = Lists()
-    lists.exact("first", values[:1])
-    lists.exact("values", values)
-    assert np.array_equal(read(lists, "values"), values)
-    with pytest.raises(ValueError, match="int64"):
-        lists.exact("other", np.arange(3)[:, None])
+def test_pieces_are_added_until_places_are_near() -> None:
+    def swinging(time: float) -> Offsets:
+        return Offsets(torch.tensor([[torch.tensor(30 * time).sin(), 0.0, 0.0]]))
+
+    coarse, error = fitted_curves(swinging, 300, 0.5)
+    fine, smaller = fitted_curves(swinging, 300, 0.001)
+    assert coarse["means"].shape[1] < fine["means"].shape[1]
+    assert error <= 0.5
+    assert smaller <= 0.001
+    limited, _ = fitted_curves(swinging, 20, 0.0)
+    assert limited["means"].shape == (1, 2 * 19 + 3, 3)
+    _, between_few_times = fitted_curves(swinging, 3, 0.01)
+    assert between_few_times <= 0.01
+
+
+FOLDER = files(html)
+MAIN = r'(?<!\.)\bat\("(\w+)(?:\[0\])?"\)|list\("(\w+)"'
+COPY = r'copy\.at\("(\w+)"\)'
+SET = [
+    ("renderer.js", "project.", MAIN),
+    ("renderer.js", "splat.", r'splat\.at\("(\w+)"\)'),
+    ("renderer.js", "copy.", COPY),
+    ("triangles.js", "triangles.", MAIN),
+    ("triangles.js", "copy.", COPY),
+]
+HARMONICS = {"uHarmonics"}  # set by drawing.js for both
+
+
+@pytest.mark.parametrize(("program", "shader", "names"), SET)
+def test_the_script_sets_the_uniforms_that_a_shader_has(
+    program: str, shader: str, names: str
+) -> None:
+    script = (FOLDER / program).read_text(encoding="utf-8")
+    paths = [
+        path
+        for path in FOLDER.iterdir()
+        if path.name.startswith(shader) and path.name.endswith(".glsl")
+    ]
+    declared = {
+        name
+        for path in paths
+        for name in re.findall(r"\buniform (?:\w+ )+(\w+)", path.read_text("utf-8"))
+    }
+    given = {name for found in re.finditer(names, script) for name in found.groups() if name}
+    assert declared
+    assert given == declared - HARMONICS

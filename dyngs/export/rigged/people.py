@@ -1,0 +1,431 @@
+"""People with their skeleton in files of other programs: skinned, textured meshes, and Gaussians at
+rest with joints and weights.
+
+Local letters: M vertices and T triangles of the template, V vertices of the mesh, J joints, N
+Gaussians, F frames, K joints that one Gaussian follows.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dyngs.core.conventions import SH_C0
+from dyngs.core.errors import DyngsError
+from dyngs.export.rigged.surface import fitted_surface
+from dyngs.export.rigged.texture import bake_texels, fill_unseen, frontal_colours, texture_image
+from dyngs.human.avatar.posing import Anchors, Skeleton, heaviest_joints
+from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.body.atlas import atlas_texels
+from dyngs.human.body.body import BodyTemplate, apply_shape
+from dyngs.human.body.body_reader import load_template
+from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.skinning import (
+    apply_transforms,
+    axis_angle_to_matrix,
+    blend_transforms,
+    joint_transforms,
+)
+from dyngs.human.keys import HumanModel
+from dyngs.human.motion.placement import upright
+from dyngs.io.formats.gltf import EXTENSION, add_gaussians
+from dyngs.io.formats.ply import write_ply
+from dyngs.io.formats.splat_file import SplatFile, require_writable
+from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
+from dyngs.io.write import atomic_file
+from dyngs.ops.quaternions import shorter_ways
+from dyngs.runs.checkpoint import LoadedRun
+from dyngs.runs.inputs import inputs_of
+
+_MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
+
+
+@dataclass(frozen=True)
+class BodyMesh:
+    """A mesh whose vertices are those of a template, doubled at the seams of its atlas."""
+
+    uv: Tensor  # (V, 2) texture coordinates, row of the image = (1 - v) * H
+    faces: Tensor  # (T, 3) int64, counter-clockwise from outside
+    source: Tensor  # (V,) int64 vertex of the template that each is a copy of
+
+
+def body_mesh(body: BodyTemplate) -> BodyMesh:
+    """Return the mesh of a template. Raises DyngsError: it has no texture coordinates."""
+    if body.uv is None or body.uv_faces is None:
+        raise DyngsError(
+            f"the body template '{body.name}' has no texture coordinates; train with model.uv=FILE.obj for a mesh"
+        )
+    pairs = body.faces.flatten() * len(body.uv) + body.uv_faces.flatten()
+    corners, inverse = torch.unique(pairs, return_inverse=True)
+    count = len(body.uv)
+    return BodyMesh(body.uv[corners % count], inverse.reshape(-1, 3), corners // count)
+
+
+def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
+    """Return the template's vertices (M, 3) at rest in the shape of a trained person.
+
+    Runs hold no shape parameters, but joints and points of the surface, which are linear in these:
+    they follow by least squares, exactly. Raises DyngsError: the template is not the one that the
+    person was trained on.
+    """
+    anchors = scene.anchors
+    joints = scene.skeleton.joints
+    if joints.shape != body.joints.shape or int(anchors.face.max()) >= len(body.faces):
+        raise DyngsError(
+            f"the template '{body.name}' is not the one that this person was trained on"
+        )
+    if body.shape_dirs is None or body.joint_shape_dirs is None:
+        return body.vertices
+    rows = torch.nonzero(anchors.height == 0)[:, 0]  # on the skin
+    rows = rows[:: max(len(rows) // _MOST_ROWS, 1)]
+    around = body.faces[anchors.face[rows]]
+    corners = anchors.barycentric[rows].double()
+    mean = (corners[..., None] * body.vertices[around].double()).sum(1)
+    directions = torch.einsum("nk,nkdb->ndb", corners, body.shape_dirs[around].double())
+    left = torch.cat([directions.flatten(0, 1), body.joint_shape_dirs.double().flatten(0, 1)])
+    offsets = (anchors.points[rows].double() - mean, (joints - body.joints).double())
+    right = torch.cat([x.flatten() for x in offsets])
+    betas = torch.linalg.lstsq(left, right[:, None], driver="gelsd").solution[:, 0]
+    return apply_shape(body, betas.to(body.vertices))[0]
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return outward unit normals (M, 3) at vertices, of the triangles around each, weighted by
+    area."""
+    a, b, c = vertices[faces].unbind(1)
+    flat = torch.linalg.cross(b - a, c - a, dim=-1)
+    total = torch.zeros_like(vertices)
+    for k in range(3):
+        total.index_add_(0, faces[:, k], flat)
+    return torch.nn.functional.normalize(total, dim=-1)
+
+
+def anchor_normals(anchors: Anchors, body: BodyTemplate, vertices: Tensor) -> Tensor:
+    """Return unit normals (N, 3) of the surface ``vertices`` (M, 3) below the Gaussians at rest."""
+    around = vertex_normals(vertices, body.faces)[body.faces[anchors.face]]
+    return torch.nn.functional.normalize((anchors.barycentric[..., None] * around).sum(1), dim=-1)
+
+
+_FLOOR_FRAMES = 64  # frames, evenly spread, in which the lowest vertex is looked for
+_STILL = 1e-6
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A skeleton at rest in the axes of the file: y up, facing +z, soles at y = 0."""
+
+    skeleton: Skeleton  # in m, as the person was trained
+    scale: float  # world units of the capture per metre of the template
+    rise: float  # what is added to y after scaling
+
+    @property
+    def joints(self) -> Tensor:
+        """Joints (J, 3) in the file."""
+        return self.placed(self.skeleton.joints)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints: those of SMPL-X, and hands for SMPL's last two."""
+        count = len(self.skeleton.joints)
+        known = [JOINT_NAMES[row] for row in SMPLX_ROWS[count]]
+        return (*known, *("left_hand", "right_hand")[: count - len(known)])
+
+    def placed(self, points: Tensor) -> Tensor:
+        """Return points (..., 3) at rest, m, in the file."""
+        moved = self.scale * points
+        moved[..., 1] += self.rise
+        return moved
+
+
+def rig_of(scene: HumanScene, vertices: Tensor) -> Rig:
+    """Return the rig of a person whose surface at rest has ``vertices`` (V, 3), m."""
+    scale = float(scene.clip.scale.mean()) * float(np.exp(scene.fit.log_scale))
+    return Rig(scene.learned_skeleton, scale, -scale * float(vertices[:, 1].amin()))
+
+
+@dataclass(frozen=True)
+class Played:
+    """The motion that a file shows: its name and frame rate; the run plays it."""
+
+    name: str
+    fps: float
+
+
+def add_animation(
+    document: GlbDocument,
+    scene: HumanScene,
+    rig: Rig,
+    vertices: Tensor,
+    weights: Tensor,
+    played: Played,
+) -> None:
+    """Add the motion that a person plays, y up, on the floor y = 0, around the origin, as an
+    animation of the joints, which are the first nodes; joints that never turn have no channel.
+
+    ``vertices``: (V, 3) at rest, m, of which the lowest one stands on the floor. ``weights``: (V,
+    J).
+    """
+    joints = rig.skeleton.joints
+    parents = rig.skeleton.parents
+    clip = upright(scene.moves_as, scene.clip, joints)
+    frames = torch.linspace(0, len(clip) - 1, min(len(clip), _FLOOR_FRAMES), device="cpu").long()
+    lowest = []
+    for row in frames.tolist():
+        posed = joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses[row]))
+        heights = apply_transforms(blend_transforms(weights, posed), vertices)[:, 1].amin()
+        lowest.append(float(clip.scale[row] * heights + clip.trans[row, 1]))
+    root = (clip.scale[:, None] * joints[0] + clip.trans).double().numpy()
+    middle = root.mean(axis=0)
+    root = root - np.array([middle[0], min(lowest), middle[2]])
+    poses = clip.poses.double().numpy()
+    quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
+    quats = shorter_ways(quats)
+    scale = clip.scale.double().numpy() / rig.scale
+    channels = [(0, "translation", root)]
+    if np.abs(scale - 1).max() > _STILL:  # not of a person who keeps the size
+        channels.append((0, "scale", np.repeat(scale[:, None], 3, axis=1)))
+    for joint in range(quats.shape[1]):
+        if np.abs(quats[:, joint, :3]).max() > _STILL:
+            channels.append((joint, "rotation", quats[:, joint]))
+    document.add_animation(played.name, np.arange(len(root)) / played.fps, channels)
+
+
+def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any], extension: str) -> None:
+    """Add a node with a mesh of one ``primitive``, a skin, and the nodes of the joints, which are
+    the first ones, below one called Armature."""
+    joints = rig.joints.double()
+    parents = rig.skeleton.parents
+    nodes: list[dict[str, Any]] = []
+    for i, (name, parent) in enumerate(zip(rig.names, parents, strict=True)):
+        place = joints[i] - joints[parent] if parent >= 0 else joints[i]
+        children = [child for child, above in enumerate(parents) if above == i]
+        node: dict[str, Any] = {"name": name, "translation": place.tolist()}
+        nodes.append(node | {"children": children} if children else node)
+    roots = [i for i, parent in enumerate(parents) if parent < 0]
+    nodes.append({"name": "Armature", "children": roots})
+    nodes.append({"name": "person", "mesh": 0, "skin": 0})
+    bind = np.tile(np.eye(4, dtype=np.float32), (len(joints), 1, 1))
+    bind[:, 3, :3] = -joints.numpy()  # columns first
+    skin = {
+        "joints": list(range(len(joints))),
+        "inverseBindMatrices": document.add_numbers(bind.reshape(-1, 16)),
+        "skeleton": roots[0],
+    }
+    document.json |= {
+        "skins": [skin],
+        "scene": 0,
+        "scenes": [{"nodes": [len(joints), len(joints) + 1]}],
+        "nodes": nodes,
+        "meshes": [{"name": "person", "primitives": [primitive]}],
+        "extensionsUsed": [extension],
+    }
+
+
+def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
+    """Add the joints and weights (V, J) of vertices; return the accessors by attribute, the
+    heaviest four first."""
+    joints, fractions = heaviest_joints(weights)
+    missing = -fractions.shape[1] % 4
+    joints, fractions = (torch.nn.functional.pad(x, (0, missing)) for x in (joints, fractions))
+    joints = torch.where(fractions > 0, joints, 0).to(torch.uint8)
+    found: dict[str, int] = {}
+    for k in range(0, fractions.shape[1], 4):
+        own = fractions[:, k : k + 4]
+        if k and not bool(own.any()):
+            break
+        found[f"JOINTS_{k // 4}"] = document.add_numbers(joints[:, k : k + 4].numpy(), VERTICES)
+        found[f"WEIGHTS_{k // 4}"] = document.add_numbers(own.float().numpy(), VERTICES)
+    return found
+
+
+SUFFIX = ".glb"
+_FINER = 4  # texels of the texture per texel of the model's atlas, along a side
+_LARGEST = 2048  # texels along a side of the largest texture
+_MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
+
+
+def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tuple[str, ...]:
+    """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up,
+    facing +z; return a line about each thing that was chosen, or that glTF cannot hold.
+
+    The size is that of the capture; the soles stand at y = 0. Colours have the light of the capture
+    in them, hence a material without light. ``played`` becomes an animation. Raises DyngsError: not
+    the run of a person, or its template is missing or without texture coordinates.
+    """
+    scene, body = person_and_template(run, "--format mesh")
+    if path.suffix.lower() != SUFFIX:
+        raise DyngsError(
+            f"{path}: a mesh is written as {SUFFIX}; give --out {path.with_suffix(SUFFIX).name}"
+        )
+    inputs_of(run).require_output(path)
+    with torch.no_grad():
+        vertices = rest_vertices(scene, body)
+        normals = anchor_normals(scene.anchors, body, vertices)
+        size = texture_size(scene)
+        texels = atlas_texels(body, size, vertices)
+        filled = fill_unseen(bake_texels(scene, texels, normals), texels)
+        image = texture_image(filled.rgb, texels)
+        samples = atlas_texels(body, min(size // 2, _MOST_SAMPLES), vertices)
+        surface = fitted_surface(
+            scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals)
+        )
+        rig = rig_of(scene, surface.vertices)
+        document = mesh_document(body, rig, surface.vertices, image)
+        if played is not None:
+            add_animation(document, scene, rig, surface.vertices, body.weights, played)
+    with atomic_file(path) as temporary:
+        document.write(temporary)
+    count = max(len(texels), 1)
+    unseen = 100 * (filled.mirrored + filled.spread) / count
+    notes = [
+        f"texture of {len(image)} x {len(image)}; {unseen:.1f} % of the body is not seen in the Gaussians and "
+        f"has colours from around it, {100 * filled.mirrored / count:.1f} % from its mirror side"
+    ]
+    if surface.margin is None:
+        notes.append(
+            f"the surface is that of the template, whose silhouettes agree best ({surface.plain:.3f})"
+        )
+    else:
+        notes.append(
+            f"the surface is moved to the Gaussians: silhouettes agree at {surface.agreement:.3f} (intersection over "
+            f"union), those of the template at {surface.plain:.3f}"
+        )
+    if scene.shapes is not None:
+        notes.append("offsets that depend on the pose are left out: glTF's skins have none")
+    return (*notes, *scene.left_out)
+
+
+def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTemplate]:
+    """Return the person of a run and its template.
+
+    Raises DyngsError: the run is not that of a person, or the template cannot be read.
+    """
+    scene = avatar_of(run.scene)
+    model = run.config.model
+    if scene is None or not isinstance(model, HumanModel):
+        raise DyngsError(
+            f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
+        )
+    return scene, load_template(model)
+
+
+def texture_size(scene: HumanScene) -> int:
+    """Return the texels along a side of the texture, by the distance of most anchors in the
+    atlas."""
+    columns, counts = scene.anchors.uv[:, 0].unique(return_counts=True)
+    columns = columns[2 * counts >= counts.double().quantile(0.75)]  # without those of finer texels
+    finest = float(columns.diff().min()) if len(columns) > 1 else 1.0
+    return min(_FINER * max(round(1 / finest), 1), _LARGEST)
+
+
+def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndarray) -> GlbDocument:
+    """Return a mesh over ``vertices`` (M, 3) at rest with its skeleton and texture as a glTF
+    document."""
+    from PIL import Image
+
+    document = GlbDocument()
+    mesh = body_mesh(body)
+    normals = vertex_normals(vertices, body.faces)[mesh.source]
+    uv = torch.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], dim=1)
+    places = rig.placed(vertices[mesh.source]).float().numpy()
+    kind = np.uint16 if len(mesh.source) < 2**16 - 1 else np.uint32
+    primitive = {
+        "attributes": {
+            "POSITION": document.add_numbers(places, VERTICES, limits=True),
+            "NORMAL": document.add_numbers(normals.float().numpy(), VERTICES),
+            "TEXCOORD_0": document.add_numbers(uv.float().numpy(), VERTICES),
+        }
+        | add_weights(document, body.weights[mesh.source]),
+        "indices": document.add_numbers(mesh.faces.flatten().numpy().astype(kind), INDICES),
+        "material": 0,
+    }
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "PNG")
+    view = document.add_bytes(stream.getvalue())
+    unlit = "KHR_materials_unlit"
+    texture = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
+    material = {"name": "person", "pbrMetallicRoughness": texture, "extensions": {unlit: {}}}
+    document.json |= {
+        "materials": [material],
+        "textures": [{"source": 0, "sampler": 0}],
+        "images": [{"name": "albedo", "bufferView": view, "mimeType": "image/png"}],
+        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+    }
+    add_person(document, rig, primitive, unlit)
+    return document
+
+
+SUFFIXES = (".ply", ".glb")
+
+
+@torch.no_grad()
+def write_rigged_splats(
+    run: LoadedRun, path: Path, played: Played | None = None
+) -> tuple[str, ...]:
+    """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing
+    +z, soles at y = 0; return a line about each thing that the file cannot hold.
+
+    ``.ply``: columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7``
+    after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
+    KHR_gaussian_splatting with a skin, and ``played`` as an animation. Raises DyngsError: not the
+    run of a person, or its template is missing.
+    """
+    scene, body = person_and_template(run, "--joints")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise DyngsError(
+            f"{path}: joints are written as {' or '.join(SUFFIXES)}; give --out with one of these"
+        )
+    if suffix == ".ply" and played is not None:
+        raise DyngsError(
+            "--motion does not go with --joints in a .ply, which shows the rest pose; write a .glb"
+        )
+    inputs_of(run).require_output(path)
+    vertices = rest_vertices(scene, body)
+    rig = rig_of(scene, vertices)
+    gaussians = scene.gaussians
+    notes = ()
+    if scene.colour is not None:
+        colours = frontal_colours(scene, anchor_normals(scene.anchors, body, vertices))
+        gaussians = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None])
+        notes = (
+            "the colours of the run are a network; the file has those seen from straight above the skin",
+        )
+    if scene.shapes is not None:
+        notes = (*notes, "offsets that depend on the pose are left out: skinning weights hold none")
+    notes = (*notes, *scene.left_out)
+    gaussians = gaussians.replace(
+        means=rig.placed(gaussians.means),
+        log_scales=gaussians.log_scales + float(np.log(rig.scale)),
+    )
+    require_writable(path, gaussians)
+    if suffix == ".glb":
+        document = GlbDocument()
+        primitive = add_gaussians(document, gaussians)
+        primitive["attributes"] |= add_weights(document, scene.weights)
+        add_person(document, rig, primitive, EXTENSION)
+        if played is not None:
+            add_animation(document, scene, rig, vertices, body.weights, played)
+        with atomic_file(path) as temporary:
+            document.write(temporary)
+        unsure = "KHR_gaussian_splatting does not say whether skins turn Gaussians: viewers may show the rest pose"
+        return (*notes, unsure)
+    joints, weights = heaviest_joints(scene.weights)
+    columns = {f"joint_{k}": joints[:, k].numpy() for k in range(joints.shape[1])}
+    columns |= {f"weight_{k}": weights[:, k].numpy() for k in range(weights.shape[1])}
+    lines = []
+    for i, place in enumerate(rig.joints.tolist()):
+        x, y, z = (f"{number:.6f}" for number in place)
+        lines.append(f"joint {i} {rig.names[i]} {rig.skeleton.parents[i]} {x} {y} {z}")
+    model = run.config.model
+    splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, comments=tuple(lines), up="y")
+    with atomic_file(path) as temporary:
+        write_ply(temporary, splat, columns)
+    return notes
