@@ -239,7 +239,7 @@ class Opened(LoadedRun):
         if self.edited is None or self.person is None:
             return self
         rotation = torch.from_numpy(how.rotation)
-        scene = self.person.placed(rotation, how.scale, torch.tensor(how.shift))
+        scene = self.person.placed(rotation, how.scale, torch.tensor(how.shift, device="cpu"))
         info = replace(self.info, world_offset=self.edited.offset, world_scale=1.0)
         return replace(self, renderable=scene, info=info, edited=None, stated_up=None)
 

@@ -188,7 +188,7 @@ def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
     network = new_network(NET, torch.Generator().manual_seed(0))
     mean = torch.full((3, 32, 32), 0.5)
     config = Config.model_validate({"data": {"root": root}, "model": NET})
-    predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root), config.data)
+    predictor: Predictor = PersonPredictor(config, network, mean, person(root), config.data)
     one = predictor.predict([0])
     three = predictor.predict([0, 3, 6])
     for scene in (one, three):
