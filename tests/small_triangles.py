@@ -15,7 +15,6 @@ from dyngs.core.camera import Cameras
 KEYS = [
     "model.kind=bg_triangle",
     "model.max_triangles=300",
-    "model.num_first=150",
     "model.gaussian_steps=60",
 ]
 

@@ -33,8 +33,8 @@ SCENES = {
     "blender": SHORT,
     "dynamic": [*SHORT, "model.choose=false", "strategy.max_gaussians=300"],
     "human": ["train.steps=8", "run.threads=1", "model.resolution=32", "data.train_cameras=[0]"],
-    "ngp": ["train.steps=4", "run.threads=1", "model.levels=4"],
-    "nerf": ["train.steps=3", "run.threads=1", "model.width=16", "model.coarse=4", "model.fine=4"],
+    "ngp": ["train.steps=4", "run.threads=1", "model.sizes=tiny"],
+    "nerf": ["train.steps=3", "run.threads=1", "model.sizes=tiny"],
     "bg_triangle": [
         "train.steps=6",
         "run.threads=1",

@@ -34,10 +34,9 @@ from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.io.write import write_text
-from dyngs.models.kind import HasGaussians, capability, kind_of
+from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
-from dyngs.models.static_section import StaticModel
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
 from dyngs.training.corrections.camera_refinement import fitted_to_image
@@ -299,10 +298,10 @@ def _open_settings(config: Config, *, moving: bool) -> list[_OpenSetting]:
         ("camera", "refine"): after_pose_fit,
         ("train", "exposure"): after_colour_fit,
     }
-    if isinstance(config.model, StaticModel):
+    uses = kind_of(config.model).uses
+    if capability(config.model, Moves) is None:
         scores["train", "robust"] = explained
-    elif not isinstance(config.model, DynamicModel):
-        return []
+    scores = {key: score for key, score in scores.items() if ".".join(key) in uses}
 
     def always(key: str) -> Callable[[Any], Section]:
         return lambda section: section.model_copy(update={key: "always"})

@@ -43,11 +43,31 @@ from dyngs.io.wrong_place import command_for
 RESOLVED_NAME = "config.yaml"
 """Name of the resolved configuration inside a run folder."""
 
-REMOVED_KEYS: dict[tuple[str, ...], object] = {
-    ("model", "loose"): False,
-    ("budget", "min_fps"): None,
-    ("optim", "sparse"): False,
-    ("model", "deform", "time_resolution"): 0,
+REMOVED_KEYS: dict[str, object] = {
+    "budget.min_fps": None,
+    "colour.lr": 0.01,
+    "model.cells": None,
+    "model.coarse": 64,
+    "model.features": None,
+    "model.fine": 128,
+    "model.finest": None,
+    "model.levels": None,
+    "model.log2_rows": None,
+    "model.log2_samples": None,
+    "model.loose": False,
+    "model.lr_colour": 0.01,
+    "model.lr_position": 4e-3,
+    "model.lr_position_final": 2e-4,
+    "model.near": 0.05,
+    "model.num_first": 2000,
+    "model.rays": 1024,
+    "model.texture_from": 0.7,
+    "model.weight_decay": 1e-6,
+    "model.width": 256,
+    "strategy.opacity_reg": 0.01,
+    "strategy.scale_reg": 0.01,
+    "optim.sparse": False,
+    "model.deform.time_resolution": 0,
 }
 """Keys of earlier versions that configurations of runs may still have, with the value at which they
 had no effect."""
@@ -149,12 +169,7 @@ def load_resolved(
     if file == path and command_for(path):
         raise DyngsError(f"{path}: not a run folder; {command_for(path)}")
     layers = _Layers()
-    leaves = read_file(file)
-    layers.add(
-        x
-        for x in leaves
-        if x.keys not in REMOVED_KEYS or not _is_same(x.value, REMOVED_KEYS[x.keys])
-    )
+    layers.add(read_file(file))
     if not layers.tree.get("data"):
         raise DyngsError(
             f"{file}: does not say which capture the run was trained on (data.root); restore the file"
@@ -340,9 +355,22 @@ class _Layers:
         return f"{origin}: " if origin else ""
 
 
-def _is_same(written: object, value: object) -> bool:
-    """Return whether a text is how a value is written."""
-    return str(written).lower() == as_written(value) or written == value
+def _is_removed(keys: tuple[str, ...], section: type[BaseModel], written: object) -> bool:
+    """Return whether a section has a key no longer, and its value had no effect."""
+    name = ".".join(keys)
+    if keys[-1] in section.model_fields or name not in REMOVED_KEYS:
+        return False
+    return (
+        as_written(written) == as_written(REMOVED_KEYS[name])
+        or _number(written) == REMOVED_KEYS[name]
+    )
+
+
+def _number(written: object) -> float | None:
+    try:
+        return float(str(written))
+    except ValueError:
+        return None
 
 
 def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
@@ -381,8 +409,8 @@ def _section(
     section: type[BaseModel], given: dict[str, Any], above: tuple[str, ...], layers: _Layers
 ) -> BaseModel:
     """Return the section of the texts in ``given``. Raises DyngsError: the first fault."""
-    values = dict(given)
-    for key in given:
+    values = {key: x for key, x in given.items() if not _is_removed((*above, key), section, x)}
+    for key in values:
         was_flag = key.startswith("move_") and "moves" in section.model_fields  # see FieldSection
         if key not in section.model_fields and not was_flag:
             raise DyngsError(

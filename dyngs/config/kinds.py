@@ -20,7 +20,7 @@ GROUP = "dyngs.models"
 OWN = {
     "static": "dyngs.static.kind:STATIC",
     "dynamic": "dyngs.deform.kind:DYNAMIC",
-    "human": "dyngs.human.avatar.kind:HUMAN",
+    "human": "dyngs.human.kind:HUMAN",
     "human_predictor": "dyngs.human.predict.ghg.kind:HUMAN_PREDICTOR",
     "gps": "dyngs.human.predict.gps.kind:GPS",
     "keypoint_nerf": "dyngs.human.predict.fields.kind:KEYPOINT_NERF",

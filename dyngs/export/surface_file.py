@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.baselines.fields import mesh as fields
 from dyngs.baselines.fields.keys import NgpModel
-from dyngs.baselines.fields.scene import FieldScene
-from dyngs.baselines.fields.space import space_of
+from dyngs.baselines.fields.scene import FieldScene, space_of
+from dyngs.baselines.fields.scene import surface_of as surface_of_field
 from dyngs.baselines.triangles import mesh as triangles
 from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.errors import DyngsError
@@ -138,7 +137,7 @@ def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: n
 def _surface(opened: Opened, time: float, cut: Cut) -> Surface:
     match opened.renderable:
         case FieldScene() as scene:
-            return fields.surface_of(scene, time, cut.level, cut.cells)
+            return surface_of_field(scene, time, cut.level, cut.cells)
         case TriangleScene() as scene:
             return triangles.surface_of(scene, cut.segments)
         case GaussianScene() as scene if opened.person is None:

@@ -9,6 +9,8 @@ from pydantic import Field
 
 from dyngs.core.section import Positive, SceneModel
 
+NO_BODY = "has no body parameters, which model.kind=human needs; see docs/human.md"
+
 
 class _OnTemplate(SceneModel):
     """Keys that models of people share: a body template."""

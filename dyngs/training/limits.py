@@ -85,13 +85,12 @@ def most_gaussians(config: Config, num_times: int) -> int | None:
     one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     megabytes = config.budget.max_mb
-    by_size = capability(config.model, LimitsSize)
-    if megabytes is not None and by_size is not None:
-        limits.append(room(config, by_size, num_times, megabytes))
+    if megabytes is not None and capability(config.model, LimitsSize) is not None:
+        limits.append(room(config, num_times, megabytes))
     return min(limits, default=None)
 
 
-def room(config: Config, kind: LimitsSize, num_times: int, megabytes: float) -> int:
+def room(config: Config, num_times: int, megabytes: float) -> int:
     """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual
     precision.
 
@@ -99,6 +98,8 @@ def room(config: Config, kind: LimitsSize, num_times: int, megabytes: float) -> 
         DyngsError: fewer than ``FEWEST``; says which size has room for them.
     """
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
+    kind = capability(config.model, LimitsSize)
+    assert kind is not None
     fixed, whole = (
         FIELD_BYTES * kind.num_shared(config.model, num_times, moving) for moving in (0, 1)
     )

@@ -39,14 +39,11 @@ TRAINED = {
         ],
     ),
     "human": ("person", ["model.resolution=16", "model.fit=false", "model.sh_degree=0"]),
-    "ngp": (
-        "still",
-        ["model.levels=4", "model.log2_rows=10", "model.log2_samples=10", "model.cells=16"],
-    ),
-    "nerf": ("still", ["model.width=16", "model.coarse=8", "model.fine=8", "model.rays=32"]),
+    "ngp": ("still", ["model.sizes=tiny"]),
+    "nerf": ("still", ["model.sizes=tiny"]),
     "bg_triangle": (
         "still",
-        ["init.num_random=40", "model.gaussian_steps=20", "model.num_first=40"],
+        ["init.num_random=40", "model.gaussian_steps=20", "model.max_triangles=40"],
     ),
     "toy": ("still", []),
 }
@@ -191,7 +188,7 @@ def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
     network = new_network(NET, torch.Generator().manual_seed(0))
     mean = torch.full((3, 32, 32), 0.5)
     config = Config.model_validate({"data": {"root": root}, "model": NET})
-    predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root), config.data)
+    predictor: Predictor = PersonPredictor(config, network, mean, person(root), config.data)
     one = predictor.predict([0])
     three = predictor.predict([0, 3, 6])
     for scene in (one, three):

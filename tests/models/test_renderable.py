@@ -39,11 +39,9 @@ ALL = (*WITH_CAMERA_GRADIENTS, "levels", *WITHOUT_CAMERA_GRADIENTS)
 def scene_of(kind: str) -> Renderable:
     generator = torch.Generator().manual_seed(0)
     if kind == "ngp":
-        return FieldScene(
-            NgpField.new(NgpModel(levels=3, log2_rows=8, finest=32, cells=8), SPACE, generator)
-        )
+        return FieldScene(NgpField.new(NgpModel(sizes="tiny"), SPACE, generator))
     if kind == "nerf":
-        return FieldScene(NerfField.new(NerfModel(width=8, coarse=4, fine=4), SPACE, generator))
+        return FieldScene(NerfField.new(NerfModel(sizes="tiny"), SPACE, generator))
     if kind == "triangles":
         return TriangleScene(bent(), 1.0)
     if kind == "levels":

@@ -6,14 +6,12 @@ from __future__ import annotations
 import shutil
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 from tiny_fields import busy_config, write_tiny_capture
 from tiny_people import TINY
 
 from dyngs.api.train import train
-from dyngs.baselines.triangles.keys import BgTriangleModel
 from dyngs.config import (
     Config,
     DataConfig,
@@ -173,15 +171,6 @@ def test_what_has_begun_keeps_its_step() -> None:
             if done >= old.opens and steps < 9000:
                 assert (now.opens, now.full) == (old.opens, min(old.full, steps))
             assert told(config, new, done).count("\n") == 0
-
-
-def test_textures_that_are_learned_stay_so() -> None:
-    begun: Any = BgTriangleModel()
-    config = Config(data=DataConfig(root=Path("x")), model=begun, train=TrainConfig(steps=1000))
-    for done, begins in ((700, 700), (1000, 700), (690, 1400)):
-        model = with_length(config, done, 2000).model
-        assert isinstance(model, BgTriangleModel)
-        assert round(2000 * model.texture_from) == begins
 
 
 def test_exposures_that_are_learned_stay_so() -> None:

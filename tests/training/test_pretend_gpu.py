@@ -94,7 +94,7 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     config = config_of(kind, request.getfixturevalue(capture), *more)
     for name, steps in (("EVERY", 2), ("WARM_UP", 4)):
         # the second time, at step 6, only some cells are looked at
-        monkeypatch.setattr(f"dyngs.baselines.fields.occupancy.{name}", steps)
+        monkeypatch.setattr(f"dyngs.baselines.fields.ngp.{name}", steps)
     expected = trained(config, monkeypatch, torch.device("cpu")).checkpoint().tensors
     with pretend_gpu():
         trainer = trained(config, monkeypatch, GPU)

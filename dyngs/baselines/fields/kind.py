@@ -15,7 +15,7 @@ class FieldKind(ModelKind):
     """See the module."""
 
     def functions(self) -> tuple[Start, Restore]:
-        from dyngs.baselines.fields.start import restore, start
+        from dyngs.baselines.fields.training import restore, start
 
         return start, restore
 

@@ -15,18 +15,37 @@ from torch import Tensor
 
 from dyngs.baselines.fields.field import PUBLISHED_HALF, TIME, Field, Seen, encoded, with_time
 from dyngs.baselines.fields.keys import NerfModel
-from dyngs.baselines.fields.sampling import along, by_weights, evenly
 from dyngs.core.initialisation import glorot
 from dyngs.core.state import Role, State, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.perceptron import Layer, perceptron
-from dyngs.ops.rays import Composited, Rays, Space, composite
+from dyngs.ops.rays import Composited, Rays, Samples, Space, composite
 
+LAST = 1e10  # Length of the last sample of a ray: whatever is dense there hides the background
+_LEAST = 1e-5  # Weight of an interval that nothing was seen in
 DEPTH, SKIP = 8, 5  # Hidden layers of the trunk; the layer that sees the position again
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
 POSITION = 3 * (1 + 2 * POSITION_OCTAVES)
 DIRECTION = 3 * (1 + 2 * DIRECTION_OCTAVES)
+
+
+@dataclass(frozen=True)
+class NerfSizes:
+    """Sizes of the networks, and of a step of their training."""
+
+    width: int  # features of the hidden layers
+    coarse: int  # samples of a ray for the coarse network
+    fine: int  # more of them for the fine network
+    rays: int  # of a step
+    lr: float  # learning rate of Adam at first
+
+
+SIZES = {
+    "tiny": NerfSizes(32, 12, 12, 64, 2e-3),
+    "cpu": NerfSizes(128, 32, 32, 256, 1e-3),
+    "published": NerfSizes(256, 64, 128, 1024, 5e-4),
+}
 
 
 @dataclass(frozen=True)
@@ -40,7 +59,7 @@ class NerfNetwork:
     @staticmethod
     def shapes(model: NerfModel) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Return (in, out) of the layers of trunk and head."""
-        width = model.width
+        width = SIZES[model.sizes].width
         first = POSITION + (TIME if model.time else 0)
         trunk = [first, *[width] * DEPTH, width + 1]
         pairs = [(i + (first if n == SKIP else 0), o) for n, (i, o) in enumerate(pairwise(trunk))]
@@ -110,7 +129,8 @@ class NerfField(Field):
     @staticmethod
     def new(model: NerfModel, space: Space, generator: torch.Generator) -> NerfField:
         coarse, fine = (NerfNetwork.new(model, generator) for _ in range(2))
-        return NerfField(space, coarse, fine, model.coarse, model.fine, model.time)
+        sizes = SIZES[model.sizes]
+        return NerfField(space, coarse, fine, sizes.coarse, sizes.fine, model.time)
 
     @staticmethod
     def restored(model: NerfModel, space: Space, checkpoint: Checkpoint) -> NerfField:
@@ -118,7 +138,8 @@ class NerfField(Field):
         fit."""
         stored = checkpoint.part("field")
         coarse, fine = (NerfNetwork.restored(model, stored, name) for name in ("coarse", "fine"))
-        return NerfField(space, coarse, fine, model.coarse, model.fine, model.time)
+        sizes = SIZES[model.sizes]
+        return NerfField(space, coarse, fine, sizes.coarse, sizes.fine, model.time)
 
     @property
     def num_shifts(self) -> int:
@@ -174,3 +195,68 @@ class NerfField(Field):
 
     def _densities(self, outputs: Tensor) -> Tensor:
         return outputs[:, 0].relu() * (PUBLISHED_HALF / self.space.half)
+
+
+@torch.no_grad()
+def crossed(rays: Rays, space: Space, near: float) -> tuple[Tensor, Tensor]:
+    """Return distances (R,) at which rays enter and leave the outermost cube, from ``near`` on;
+    equal if they miss."""
+    offsets = rays.origins - rays.origins.new_tensor(space.centre)
+    walls = torch.stack([-space.outermost - offsets, space.outermost - offsets]) / rays.directions
+    walls = walls.nan_to_num(0.0)  # along a wall, within it
+    begin = walls.amin(0).amax(1).clamp_min(near)
+    return begin, torch.maximum(walls.amax(0).amin(1), begin)
+
+
+@torch.no_grad()
+def evenly(rays: Rays, space: Space, near: float, shifts: Tensor) -> Tensor:
+    """Return distances (R, K) of samples, one in each of K equal parts of the way through the
+    space, ascending.
+
+    ``shifts`` (R, K) in [0, 1): where in its part each lies. Parts are equal in the distance; with
+    surroundings in its inverse, so that what is far away gets few.
+    """
+    begin, end = (x[:, None] for x in crossed(rays, space, near))
+    at = (torch.arange(shifts.shape[1], device=shifts.device) + shifts) / shifts.shape[1]
+    if space.cascades == 1:
+        return begin + (end - begin) * at
+    return 1 / ((1 - at) / begin + at / end)
+
+
+@torch.no_grad()
+def by_weights(distances: Tensor, weights: Tensor, shifts: Tensor) -> Tensor:
+    """Return (R, K + N) distances, ascending: those given (R, K), and N more where their weights
+    (R, K) are.
+
+    The inverse of the distribution that is even between the middles of samples and has the weights
+    of the inner ones. ``shifts`` (R, N) in [0, 1): where in its N-th of the distribution each lies.
+    """
+    edges = (distances[:, 1:] + distances[:, :-1]) / 2
+    mass = weights[:, 1:-1] + _LEAST
+    below = torch.cat([torch.zeros_like(mass[:, :1]), mass.cumsum(1)], 1)
+    below = below / below[:, -1:]
+    wanted = (torch.arange(shifts.shape[1], device=shifts.device) + shifts) / shifts.shape[1]
+    right = torch.searchsorted(below, wanted.contiguous(), right=True).clamp(1, below.shape[1] - 1)
+    low = below.gather(1, right - 1)
+    high = below.gather(1, right)
+    first = edges.gather(1, right - 1)
+    last = edges.gather(1, right)
+    fraction = (wanted - low) / (high - low).clamp_min(_LEAST * _LEAST)
+    return torch.cat([distances, first + (last - first) * fraction], 1).sort(1).values
+
+
+@torch.no_grad()
+def along(rays: Rays, space: Space, distances: Tensor) -> Samples:
+    """Return samples from each of the distances (R, K) to the next; coordinates are of their
+    starts."""
+    count, each = distances.shape
+    points = rays.origins[:, None] + rays.directions[:, None] * distances[..., None]
+    ends = torch.cat([distances[:, 1:], distances[:, -1:] + LAST], 1)
+    which = torch.arange(count, device=distances.device)
+    return Samples(
+        offsets=torch.arange(count + 1, device=distances.device) * each,
+        rays=which.repeat_interleave(each),
+        starts=distances.flatten(),
+        ends=ends.flatten(),
+        coords=space.unit(points).view(-1, 3),
+    )

@@ -7,11 +7,12 @@ Trained by the protocol of nerfacc's occupancy grid (Li et al. 2023).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,11 +26,13 @@ from dyngs.baselines.fields.field import (
     with_time,
 )
 from dyngs.baselines.fields.keys import NgpModel
-from dyngs.baselines.fields.thinning import reached_samples, thinned_samples
 from dyngs.core.initialisation import glorot
 from dyngs.core.state import Role, State, with_role
 from dyngs.core.tensor_checks import require_tensor
+from dyngs.data.capture import View
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.volume import reached_samples, thinned_samples
+from dyngs.ops.device import sent
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
 from dyngs.ops.rays import Rays, Space, Steps, composite, march
@@ -41,7 +44,6 @@ DIRECTION_DEGREE, DIRECTION_TERMS = 3, 16
 # Least length of a sample where there are several cubes, in its distance over `across`: 1/256 as
 # published
 CONE = 4.0
-LOG2_SAMPLES = 14  # Samples of a step, for a CPU
 PUBLISHED_PIXELS = 800  # Along a side of the images of published figures
 ACROSS = 1024 / PUBLISHED_PIXELS
 FINEST = 2.56
@@ -49,33 +51,49 @@ FINEST = 2.56
 cube, as published, and cells of the finest level along an axis, half as published; twice as many
 where the innermost cube is half of all."""
 FIRST = 1e-4  # Rows of the grid begin within this of 0
+# Steps between updates; up to which step all cells are looked at where it is a power of two
+EVERY, WARM_UP = 16, 256
+DECAY = 0.95
+THRESHOLD = 1e-2
+"""Opacity above which a cell counts as occupied, or the mean of its cube if that is less: of a
+sample as long as published, a 1,024th of the cube's diagonal."""
+CHUNK = 1 << 17  # Cells looked at together
 
 
 @dataclass(frozen=True)
 class NgpSizes:
     """Sizes of a field and of a step of its training."""
 
-    levels: HashLevels
+    num_levels: int
     features: int
-    num_samples: int  # of a step
-    across: int  # samples along the diagonal of the innermost cube
+    log2_rows: int  # most rows of a level
+    log2_samples: int  # of a step
+    # cells of the occupancy grid along an axis; None: as suits the number of cubes
+    cells: int | None
+    # cells of the finest level along an axis; None: by the images, see ``FINEST``
+    finest: int | None
 
     @staticmethod
-    def of(model: NgpModel, pixels: int = PUBLISHED_PIXELS, cascades: int = 1) -> NgpSizes:
-        """Return what ``model`` asks for; the rest is for a CPU and images of ``pixels``, or as
-        published."""
-        published = model.sizes == "published"
-        levels = model.levels or (16 if published else 8)
-        features = model.features or (2 if published else 4)
-        log2_rows = model.log2_rows or (19 if published else 16)
-        finest = model.finest or (
-            4096 if published else min(max(64, round(FINEST * pixels * min(cascades, 2))), 4096)
-        )
-        across = 1024 if published else min(max(128, round(ACROSS * pixels)), 1024)
-        grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows)
-        return NgpSizes(
-            grid, features, 1 << (model.log2_samples or (18 if published else LOG2_SAMPLES)), across
-        )
+    def of(model: NgpModel) -> NgpSizes:
+        return SIZES[model.sizes]
+
+    def levels(self, pixels: int, cascades: int) -> HashLevels:
+        """Return the levels of the grid for images whose longest side has so many ``pixels``."""
+        finest = self.finest or min(max(64, round(FINEST * pixels * min(cascades, 2))), 4096)
+        return HashLevels.geometric(self.num_levels, 16, finest, 1 << self.log2_rows)
+
+    def across(self, pixels: int) -> int:
+        """Return the number of samples along the diagonal of the innermost cube."""
+        if self.finest == 4096:
+            return 1024
+        return min(max(128, round(ACROSS * pixels)), 1024)
+
+
+SIZES = {
+    "tiny": NgpSizes(6, 4, 12, 12, 32, 128),
+    "cpu": NgpSizes(8, 4, 16, 14, None, None),
+    "published": NgpSizes(16, 2, 19, 18, None, 4096),
+}
 
 
 @dataclass(frozen=True)
@@ -108,10 +126,9 @@ class NgpField(Field):
 
         ``pixels``: of the longest side of the images.
         """
-        sizes = NgpSizes.of(model, pixels, space.cascades)
-        rows = torch.rand(
-            (sizes.levels.num_rows, sizes.features), generator=generator, device="cpu"
-        )
+        sizes = NgpSizes.of(model)
+        levels = sizes.levels(pixels, space.cascades)
+        rows = torch.rand((levels.num_rows, sizes.features), generator=generator, device="cpu")
         weights = [
             tuple(glorot(i, o, generator).requires_grad_() for i, o in pairwise(widths))
             for widths in _widths(sizes, model.time).values()
@@ -121,12 +138,12 @@ class NgpField(Field):
         return NgpField(
             space,
             pixels,
-            sizes.levels,
+            levels,
             table,
             weights[0],
             weights[1],
             occupied,
-            sizes.across,
+            sizes.across(pixels),
             model.time,
         )
 
@@ -136,10 +153,9 @@ class NgpField(Field):
         fit."""
         stored = checkpoint.part("field")
         pixels = int(require_tensor("pixels", stored["pixels"], (1,), torch.int64))
-        sizes = NgpSizes.of(model, pixels, space.cascades)
-        table = require_tensor(
-            "table", stored["table"], (sizes.levels.num_rows, sizes.features)
-        ).clone()
+        sizes = NgpSizes.of(model)
+        levels = sizes.levels(pixels, space.cascades)
+        table = require_tensor("table", stored["table"], (levels.num_rows, sizes.features)).clone()
         networks = {
             name: tuple(
                 require_tensor(f"{name}.{i}", stored[f"{name}.{i}"], (out, before)).clone()
@@ -153,12 +169,12 @@ class NgpField(Field):
         return NgpField(
             space,
             pixels,
-            sizes.levels,
+            levels,
             table,
             networks["density"],
             networks["colour"],
             occupied,
-            sizes.across,
+            sizes.across(pixels),
             model.time,
         )
 
@@ -251,7 +267,7 @@ class NgpField(Field):
 
 def _widths(sizes: NgpSizes, sees_time: bool) -> dict[str, tuple[int, ...]]:
     """Return how many features go into each layer of the networks, and come out of the last."""
-    inputs = len(sizes.levels.rows) * sizes.features + (TIME if sees_time else 0)
+    inputs = sizes.num_levels * sizes.features + (TIME if sees_time else 0)
     return {
         "density": (inputs, WIDTH, GEOMETRY),
         "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3),
@@ -270,3 +286,133 @@ def _packed(occupied: Tensor) -> Tensor:
 def _unpacked(bits: Tensor, space: Space) -> Tensor:
     flat = bits[:, None] >> torch.arange(8, dtype=torch.uint8, device=bits.device) & 1
     return flat.bool().flatten()[: math.prod(space.shape)].reshape(space.shape)
+
+
+class Occupancy:
+    """The largest opacity of a sample found in each cell, which fades until it is found again.
+
+    Args:
+        seen: bool of ``space.shape``: cells that may be occupied at all, see ``seen_cells``.
+        num_random: random cells of each look after the warm-up; a quarter of all at most.
+    """
+
+    def __init__(self, space: Space, seen: Tensor, num_random: int) -> None:
+        self._space = space
+        self.seen = seen
+        self._cells = seen.flatten().nonzero()[:, 0]
+        self._count = seen.flatten(1).sum(1).clamp_min(1)
+        self._num_random = min(num_random, -(-len(self._cells) // 4))
+        self._values = torch.zeros(math.prod(space.shape), device="cpu")
+
+    def place(self, device: torch.device) -> None:
+        """Go on on ``device``; random numbers stay those of the CPU."""
+        self.seen, self._cells, self._count, self._values = (
+            x.to(device) for x in (self.seen, self._cells, self._count, self._values)
+        )
+
+    def is_due(self, step: int) -> bool:
+        return step > EVERY and step % EVERY == 0
+
+    @torch.no_grad()
+    def updated(
+        self, field: NgpField, step: int, times: tuple[float, ...], generator: torch.Generator
+    ) -> Tensor:
+        """Look at densities at random places of cells, at one of ``times``; return bool of
+        ``space.shape``."""
+        cells = self._chosen(field.occupied, step, generator)
+        found = torch.cat([self._opacities(field, x, times, generator) for x in cells.split(CHUNK)])
+        self._values[cells] = torch.maximum(self._values[cells] * DECAY, found)
+        cubes = self._values.view(len(self._count), -1)
+        levels = (cubes.double().sum(1) / self._count).clamp(max=THRESHOLD)
+        return (cubes > levels[:, None]).view(self._space.shape)
+
+    def state(self) -> dict[str, Tensor]:
+        return {"values": self._values}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self._values = require_tensor("values", state["values"], tuple(self._values.shape)).clone()
+
+    def _chosen(self, occupied: Tensor, step: int, generator: torch.Generator) -> Tensor:
+        """Return indices of cells: of all ever less often as it warms up, else random and occupied
+        ones.
+
+        At most a quarter of all each.
+        """
+        if step <= WARM_UP and step & (step - 1) == 0:
+            return self._cells
+        drawn = self._cells[self._drawn(len(self._cells), self._num_random, generator)]
+        full = occupied.flatten().nonzero()[:, 0]
+        most = -(-len(self._cells) // 4)
+        if len(full) > most:
+            full = full[self._drawn(len(full), most, generator)]
+        return torch.cat([drawn, full]).unique()
+
+    def _drawn(self, below: int, count: int, generator: torch.Generator) -> Tensor:
+        return sent(
+            torch.randint(below, (count,), generator=generator, device="cpu"), self._values.device
+        )
+
+    def _opacities(
+        self, field: NgpField, cells: Tensor, times: tuple[float, ...], generator: torch.Generator
+    ) -> Tensor:
+        space = self._space
+        n = self._space.cells
+        x = cells % n
+        y = torch.div(cells, n, rounding_mode="floor") % n
+        z = torch.div(cells, n * n, rounding_mode="floor")
+        cascade = torch.div(z, n, rounding_mode="floor")
+        z = z % n
+        half = space.half * 2.0**cascade
+        within = sent(torch.rand((len(cells), 3), generator=generator, device="cpu"), cells.device)
+        places = torch.stack([x, y, z], 1) + within
+        points = (places * (2 / n) - 1) * half[:, None] + within.new_tensor(space.centre)
+        time = (
+            times[int(torch.randint(len(times), (1,), generator=generator, device="cpu"))]
+            if times
+            else 0.0
+        )
+        return field.densities(points, time) * (half * (2 * math.sqrt(3) / 1024))
+
+
+def seen_cells(space: Space, views: Sequence[View]) -> Tensor:
+    """Return bool of ``space.shape``: cells of which a view sees a part, outside of the next
+    smaller cube."""
+    seen = np.zeros(space.shape, dtype=bool)
+    axis = (np.arange(space.cells) + 0.5) * (2 / space.cells) - 1
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    middles = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32)
+    for cascade in range(space.cascades):
+        half = space.half * 2.0**cascade
+        radius = half * 3**0.5 / space.cells
+        outside = (
+            np.abs(middles).max(1) > 0.5 - 1 / space.cells + 1e-6
+            if cascade
+            else np.ones(len(middles), bool)
+        )
+        unseen = np.flatnonzero(outside)
+        for view in views:  # those seen once are not looked at again
+            hidden = ~_sees(
+                view,
+                middles[unseen] * np.float32(half) + np.array(space.centre, np.float32),
+                radius,
+            )
+            seen[cascade].reshape(-1)[unseen[~hidden]] = True
+            unseen = unseen[hidden]
+    return torch.from_numpy(seen)
+
+
+def _sees(view: View, points: np.ndarray, radius: float) -> np.ndarray:
+    """Return (P,) bool: whether the view sees anything of the balls of a radius around points (P,
+    3); errs on yes."""
+    pose = view.cam_from_world.astype(np.float32)
+    k = view.intrinsics
+    x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
+    found = z > -radius
+    for across, middle, focal, size in (
+        (x, k[0, 2], k[0, 0], view.width),
+        (y, k[1, 2], k[1, 1], view.height),
+    ):
+        for side, edge in ((1, (size - middle) / focal), (-1, middle / focal)):
+            # the side of the frustum, a plane
+            found &= side * across - edge * z < radius * (1 + edge * edge) ** 0.5
+    return found

@@ -1,20 +1,26 @@
-"""A radiance field as something to draw."""
+"""A radiance field as something to draw: where it lies in a capture, its images, its surface."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.baselines.fields.field import Field
-from dyngs.baselines.fields.space import rays_of
+from dyngs.baselines.fields.field import PUBLISHED_HALF, Field
+from dyngs.baselines.fields.keys import FieldModel
 from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, StateTensor, prefixed
 from dyngs.core.tensor_checks import require_moments, require_tensor
+from dyngs.data.capture import Capture, View
+from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
+from dyngs.data.scene_space import extent_of
 from dyngs.models.renderable import (
     DrawOptions,
     Renderable,
@@ -23,9 +29,23 @@ from dyngs.models.renderable import (
     composited,
     fixed_cameras,
 )
+from dyngs.models.surface import Surface
+from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Space
 
 CHUNK = 1 << 13  # Rays drawn together
+MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
+# Along an axis of a single cube, and of each of several: looking at all takes a while
+GRID, FAR_GRID = 128, 64
+BESIDE = 1.25
+"""Half the side of an innermost cube that holds the cameras, in the farthest distances of one from
+its middle."""
+SEEN_FAR = 0.02  # Fraction of the sparse points that may lie outside of the outermost cube
+CELLS = 192  # Along an axis of the innermost cube, unless asked otherwise
+LEVEL = 25.0
+"""Density at the surface, unless asked otherwise, per unit of a world whose innermost cube has half
+side 1.5: half of the light is lost in a 36th of a unit."""
+POINTS = 1 << 17  # Points looked at together
 
 
 @dataclass(frozen=True)
@@ -114,3 +134,133 @@ def stored_space(stored: Mapping[str, Tensor]) -> Space:
 def stored_times(stored: Mapping[str, Tensor]) -> tuple[float, ...]:
     """Return the training times in a state; none where there are none. Raises ValueError."""
     return tuple(require_moments("times", stored["times"]).tolist()) if "times" in stored else ()
+
+
+def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
+    """Return the space of the field of ``capture``.
+
+    An object before a background lies in a cube around the point that the cameras look at, as large
+    as what all of them frame. So does the innermost cube of other captures, with others around it
+    for what is far away; where the cameras do not look at one point it holds the cameras.
+
+    Args:
+        cells: of each cube along an axis; None: as suits their number.
+
+    Raises:
+        DyngsError: nothing tells depth, or much lies too far away.
+    """
+    views = capture.splits["train"]
+    requested = None if model.half_extent is None else model.half_extent / capture.world_scale
+    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    centres = poses[:, :3, 3]
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    if not extent_of(centres):
+        raise DyngsError(
+            "the capture has a single camera position, from which a field cannot tell depth: give more images, or a "
+            "capture whose camera moves"
+        )
+    focus = focus_point(poses)
+    looked_at = focus if focus is not None and fraction_in_front(poses, focus) > 0.5 else None
+    far = model.surroundings == "always" or (model.surroundings == "auto" and not capture.has_alpha)
+    if not far:
+        middle = centres.mean(axis=0) if looked_at is None else looked_at
+        return _space(middle, requested or _framed(views, middle), 1, cells)
+    middle = centres.mean(axis=0)
+    if looked_at is not None and np.linalg.norm(looked_at - middle) < 2 * spread:
+        middle = looked_at
+    beside = BESIDE * float(np.abs(centres - middle).max())
+    framed = beside if middle is not looked_at else min(beside, _framed(views, middle))
+    half = requested or framed
+    return _space(middle, half, _cascades(capture, middle, half), cells)
+
+
+def _space(middle: np.ndarray, half: float, cascades: int, cells: int | None) -> Space:
+    if not (math.isfinite(half) and half > 0 and np.isfinite(middle).all()):
+        raise DyngsError("the cameras of the capture frame no common space: give model.half_extent")
+    x, y, z = (float(value) for value in middle)
+    return Space((x, y, z), float(half), cascades, cells or (GRID if cascades == 1 else FAR_GRID))
+
+
+def _framed(views: Sequence[View], middle: np.ndarray) -> float:
+    """Return half the side of the cube around ``middle`` that images frame, the median over
+    views."""
+    halves = []
+    for view in views:
+        x, y, z = view.cam_from_world[:3, :3] @ middle + view.cam_from_world[:3, 3]
+        focal = min(view.intrinsics[0, 0] / view.width, view.intrinsics[1, 1] / view.height)
+        halves.append(float(np.linalg.norm([x, y, z])) * 0.5 / float(focal))
+    return float(np.median(halves))
+
+
+def _cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
+    """Return the number of cubes that hold the sparse points; all where there are none."""
+    if capture.points is None or not len(capture.points.xyz):
+        return MOST_CASCADES
+    norms = np.abs(capture.points.xyz - middle).max(axis=1) / half
+    needed = 1 + math.ceil(math.log2(max(float(np.quantile(norms, 1 - SEEN_FAR)), 1.0)))
+    if needed > MOST_CASCADES + 3:
+        raise DyngsError(
+            f"the points of the capture lie up to {2.0 ** (needed - 1):.0f} times as far away as its cameras are apart "
+            f"and a field holds {2 ** (MOST_CASCADES - 1)} times: give model.half_extent"
+        )
+    return min(max(needed + 1, 2), MOST_CASCADES)  # what is behind the points, too
+
+
+@torch.no_grad()
+def surface_of(
+    scene: FieldScene, time: float = 0.0, level: float | None = None, cells: int | None = None
+) -> Surface:
+    """Return the surface in the innermost cube at ``time``.
+
+    Args:
+        level: density there, per unit of a world whose innermost cube has half side 1.5; None:
+            ``LEVEL``.
+        cells: along an axis of the cube; None: ``CELLS``.
+
+    Raises:
+        DyngsError: the density is nowhere, or everywhere, of that level.
+    """
+    from skimage.measure import marching_cubes
+
+    level = LEVEL if level is None else level
+    cells = CELLS if cells is None else cells
+    space = scene.field.space
+    grid = _densities(scene, time, cells) * (space.half / PUBLISHED_HALF)
+    if not float(grid.min()) < level < float(grid.max()):
+        raise DyngsError(
+            f"no surface: densities are from {float(grid.min()):.3g} to {float(grid.max()):.3g}, none of them "
+            f"{level:g}; give another --level"
+        )
+    # x is the first axis of the grid; a logarithm, because density rises by orders of magnitude
+    # within a cell
+    found = marching_cubes(
+        np.log(np.maximum(grid.numpy(), 1e-6)), np.log(level), gradient_direction="ascent"
+    )
+    places = found[0]
+    faces = found[1]
+    normals = found[2]
+    vertices = torch.from_numpy(places.copy()) * (2 * space.half / cells) + (
+        torch.tensor(space.centre, device="cpu") - space.half
+    )
+    inwards = torch.nn.functional.normalize(torch.from_numpy(-normals.copy()), dim=1)
+    colours = [
+        scene.field.colours(x, d, time)
+        for x, d in zip(vertices.split(POINTS), inwards.split(POINTS), strict=True)
+    ]
+    return Surface(vertices.numpy(), faces, torch.cat(colours).numpy())
+
+
+def _densities(scene: FieldScene, time: float, cells: int) -> Tensor:
+    """Return densities, per world unit, at (cells + 1)^3 places, x the first axis; 0 on the sides
+    of the cube."""
+    space = scene.field.space
+    axis = torch.linspace(-space.half, space.half, cells + 1, device="cpu")
+    x, y, z = torch.meshgrid(*(axis + middle for middle in space.centre), indexing="ij")
+    points = torch.stack([x, y, z], -1).view(-1, 3)
+    found = torch.zeros(len(points), device="cpu")
+    for which in scene.field.may_hold(points).nonzero()[:, 0].split(POINTS):
+        found[which] = scene.field.densities(points[which], time)
+    found = found.view(x.shape)
+    inner = torch.zeros_like(found)
+    inner[1:-1, 1:-1, 1:-1] = found[1:-1, 1:-1, 1:-1]
+    return inner

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import DefaultStrategy, ShColour
+from dyngs.config.kinds import section_of_kind
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
@@ -29,7 +30,6 @@ from dyngs.gaussians.surface import (
     simplified,
 )
 from dyngs.models.kind import RunStart
-from dyngs.models.static_section import StaticModel
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
 
@@ -77,7 +77,7 @@ def _trained(run: RunStart, steps: int) -> GaussianModel:
     strategy = DefaultStrategy(max_gaussians=MOST_GAUSSIANS)
     train = config.train.model_copy(update={"steps": steps, "initial_downscale": 1})
     changed = {
-        "model": StaticModel(sh_degree=0),
+        "model": section_of_kind("static").model_validate({"sh_degree": 0}),
         "strategy": strategy,
         "train": train,
         "colour": ShColour(),

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.core.section import Fraction, ModelSection, Positive
+from dyngs.core.section import ModelSection
 
 
 class BgTriangleModel(ModelSection):
@@ -18,9 +18,6 @@ class BgTriangleModel(ModelSection):
     )
     max_triangles: int = Field(
         default=4000, ge=4, le=1_000_000, description="most triangles that a run ends with"
-    )
-    num_first: int = Field(
-        default=2000, ge=1, le=1_000_000, description="most triangles that it begins with"
     )
     gaussian_steps: int = Field(
         default=800,
@@ -40,22 +37,6 @@ class BgTriangleModel(ModelSection):
         le=16,
         description="segments of an edge of a triangle's texture, which is linear between them",
     )
-    texture_from: Fraction = Field(
-        default=0.7,
-        description="fraction of the run after which textures are learned in place of colours",
-    )
     supersampling: int = Field(
         default=2, ge=1, le=4, description="pixels are drawn as the mean of its square"
-    )
-    lr_position: Positive = Field(
-        default=4e-3,
-        le=1,
-        description="learning rate of control points at first, in half sides of the scene",
-    )
-    lr_position_final: Positive = Field(default=2e-4, le=1, description="the same at the end")
-    lr_colour: Positive = Field(
-        default=0.01, le=1, description="learning rate of colours; of harmonics a twentieth"
-    )
-    near: Positive = Field(
-        default=0.05, le=1e9, description="near plane, in half sides of the scene"
     )

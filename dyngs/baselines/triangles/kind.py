@@ -5,17 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.models.kind import ExtendsTo
+from dyngs.models.kind import ModelKind
 
 if TYPE_CHECKING:
     from dyngs.models.kind import Restore, Start
-    from dyngs.models.schedule import Length
 
 
-class BgTriangleKind(ExtendsTo):
+class BgTriangleKind(ModelKind):
     """See the module."""
 
-    uses = ExtendsTo.uses | {
+    uses = ModelKind.uses | {
         "init",
         "train.exposure",
         "train.robust",
@@ -24,12 +23,9 @@ class BgTriangleKind(ExtendsTo):
     }
 
     def functions(self) -> tuple[Start, Restore]:
-        from dyngs.baselines.triangles.start import restore, start
+        from dyngs.baselines.triangles.training import restore, start
 
         return start, restore
-
-    def extended(self, section: BgTriangleModel, length: Length) -> BgTriangleModel:
-        return section.model_copy(update={"texture_from": length.share(section.texture_from)})
 
 
 BG_TRIANGLE = BgTriangleKind(BgTriangleModel)

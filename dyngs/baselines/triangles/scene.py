@@ -39,6 +39,9 @@ from dyngs.ops.patches import (
 _ABOVE = 2.0  # Added to harmonics so that the kernel's clamp at 0 does not cut them
 
 
+NEAR = 0.05  # Near plane, in half sides of the scene
+
+
 @dataclass(frozen=True)
 class TriangleOptions(DrawOptions):
     """How triangles are drawn."""
@@ -156,7 +159,7 @@ def rendering_of(
 
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     """Return how triangles of a scene of half side ``unit`` are drawn."""
-    return TriangleOptions(near=model.near * unit, supersampling=model.supersampling)
+    return TriangleOptions(near=NEAR * unit, supersampling=model.supersampling)
 
 
 def stored_triangles(checkpoint: Checkpoint) -> tuple[Patches, float]:

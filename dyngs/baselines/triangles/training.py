@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from dyngs.baselines.triangles.densify import Change, change
+from dyngs.baselines.triangles.first import first_surface
 from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.baselines.triangles.patches import Patches
+from dyngs.baselines.triangles.patches import Patches, flat_triangles
 from dyngs.baselines.triangles.scene import (
     TriangleOptions,
     TriangleScene,
@@ -19,21 +20,33 @@ from dyngs.baselines.triangles.scene import (
     stored_triangles,
 )
 from dyngs.baselines.triangles.tallies import Tallies, most_pixels, slopes_of
+from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError, counted
 from dyngs.core.state import State, prefixed
 from dyngs.data.loader import Image
 from dyngs.gaussians.parameters import AdamState
+from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.schedule import scaled
 from dyngs.models.views import evaluation_background
+from dyngs.ops.patches import NUM_POINTS, lattice_size
 
 EVERY, LEAST_EVERY, UNTIL = 300, 50, 18_000
 """Steps between changes of a 30,000-step run, the fewest in any run, and after how many of 30,000
 none is changed."""
+# Learning rate of control points at first and at the end, in half sides of the scene
+POSITION_RATE, LAST_POSITION_RATE = 4e-3, 2e-4
+COLOUR_RATE = 0.01
+TEXTURE_FROM = 0.7  # Fraction of the run after which textures are learned in place of colours
 HARMONICS_SLOWER = 20.0  # than colours
 LAST_COLOUR = 0.1  # Of their learning rate, at the end of each stage
+VALUE_BYTES = 1.3  # In a file, per value of a triangle
+FEWEST = 100  # Fewest triangles that a limit on the file must have room for
+RADIUS = 1.5  # Of the first triangles, in mean distances of their points' three nearest neighbours
+INNER = 0.02  # Fraction of the points on either side that does not count for the scene's size
+NUM_FIRST = 2000  # Triangles that a run begins with, at most
 LEAST_SHOWN = 1.0  # px of some training view, of each triangle that stays
 
 
@@ -139,12 +152,11 @@ class TriangleTraining(Model[TriangleScene]):
     def _rates(self, step: int) -> dict[str, float]:
         """Return the learning rate of each tensor in ``step``."""
         steps = self._run.config.train.steps
-        model = self._model
         moved = step / steps
-        position = self._unit * model.lr_position ** (1 - moved) * model.lr_position_final**moved
+        position = self._unit * POSITION_RATE ** (1 - moved) * LAST_POSITION_RATE**moved
         begun = self._first_texture if self.is_textured else 0
         end = steps if self.is_textured else self._first_texture
-        colour = model.lr_colour * LAST_COLOUR ** min(1.0, (step - begun) / max(1, end - begun))
+        colour = COLOUR_RATE * LAST_COLOUR ** min(1.0, max(0, step - begun) / max(1, end - begun))
         return {"points": position, "colours": colour, "harmonics": colour / HARMONICS_SLOWER}
 
     def _texture(self) -> None:
@@ -168,7 +180,7 @@ class TriangleTraining(Model[TriangleScene]):
 
     @property
     def _first_texture(self) -> int:
-        return round(self._model.texture_from * self._run.config.train.steps)
+        return round(TEXTURE_FROM * self._run.config.train.steps)
 
     def _changed(self, step: int, bad: Tensor | int) -> Updated:
         rounds = 1 + (self._last_change - step) // self._interval
@@ -219,3 +231,80 @@ class TriangleTraining(Model[TriangleScene]):
     def place(self, device: torch.device) -> None:
         if device.type != "cpu":
             raise DyngsError("model.kind=bg_triangle is trained on the CPU: give run.device=cpu")
+
+
+def start(run: RunStart) -> TriangleTraining:
+    """Return triangles turned at random at the first points of a capture, in whose place those of a
+    surface come.
+
+    Raises DyngsError: the points are no scene, or ``budget.max_mb`` has no room.
+    """
+    model = run.config.model
+    assert isinstance(model, BgTriangleModel)
+    megabytes = run.config.budget.max_mb
+    model = model if megabytes is None else _within(model, megabytes)
+    return TriangleTraining(
+        run, *_at_points(run, model), model, first=_on_surface if model.gaussian_steps else None
+    )
+
+
+def _within(model: BgTriangleModel, megabytes: float) -> BgTriangleModel:
+    """Return ``model`` with as many triangles as a file of so many 1e6 bytes holds at the usual
+    precision."""
+    values = 3 * (NUM_POINTS + lattice_size(model.texture) + num_sh_terms(model.sh_degree) - 1)
+    most = int(1e6 * megabytes / (VALUE_BYTES * values))
+    if most < FEWEST:
+        raise DyngsError(
+            f"budget.max_mb={megabytes:g}: has no room for {FEWEST} triangles; "
+            f"{1e-6 * FEWEST * VALUE_BYTES * values * 1.05:.2g} would do"
+        )
+    return model.model_copy(update={"max_triangles": min(most, model.max_triangles)})
+
+
+def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
+    """Return triangles turned at random, and half the side of the scene."""
+    values = StartValues(max_gaussians=min(NUM_FIRST, model.max_triangles))
+    first = initial_gaussians(surroundings(run.capture), run.config.init, values, 0, run.generator)
+    ends = first.means.quantile(torch.tensor([INNER, 1 - INNER], device="cpu"), dim=0)
+    unit = float((ends[1] - ends[0]).max()) / 2
+    if not unit > 0:
+        raise DyngsError(
+            f"{run.config.data.root}: the {len(first.means)} first points are all in one place, where there are no "
+            "triangles: give init.kind=random"
+        )
+    radius = first.log_scales.exp().amax(1).clamp(max=unit / 2) * RADIUS
+    corners = first.means[:, None] + radius[:, None, None] * _random_triangles(
+        len(first.means), run.generator
+    )
+    colours = 0.5 + SH_C0 * first.sh[:, 0]
+    return _flat(corners, colours[:, None].repeat(1, 3, 1), model), unit
+
+
+def _on_surface(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
+    """Return triangles on the surface of Gaussians, and half the side of the scene."""
+    found = first_surface(run, model.gaussian_steps, min(NUM_FIRST, model.max_triangles))
+    corners = found.corners.flatten(0, 1)
+    unit = float((corners.amax(0) - corners.amin(0)).max()) / 2
+    return _flat(found.corners, found.colours, model), unit
+
+
+def _flat(corners: torch.Tensor, colours: torch.Tensor, model: BgTriangleModel) -> Patches:
+    harmonics = torch.zeros((len(corners), num_sh_terms(model.sh_degree) - 1, 3), device="cpu")
+    return Patches(flat_triangles(corners), flat_triangles(colours), harmonics)
+
+
+def _random_triangles(count: int, generator: torch.Generator) -> torch.Tensor:
+    """Return (count, 3, 3) corners of equilateral triangles in circles of radius 1, turned at
+    random."""
+    axes = torch.randn((count, 2, 3), generator=generator, device="cpu")
+    one = torch.nn.functional.normalize(axes[:, 0], dim=1)
+    other = torch.nn.functional.normalize(torch.linalg.cross(one, axes[:, 1]), dim=1)
+    angles = torch.arange(3, device="cpu") * (2 * torch.pi / 3)
+    return angles.cos()[:, None] * one[:, None] + angles.sin()[:, None] * other[:, None]
+
+
+def restore(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
+    """Return the scene of a checkpoint."""
+    patches, unit = stored_triangles(checkpoint)
+    behind = evaluation_background(checkpoint.info.background, False)[1]
+    return TriangleScene(patches, unit, scene_options(model, unit), behind)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.core.section import Positive, Section
+from dyngs.core.section import Section
 
 MEASURED_AT = 0.6  # Fraction of a run after which it is measured whose harmonics pay
 
@@ -49,10 +49,8 @@ class NetworkColour(ColourSection):
     )
     width: int = Field(default=32, ge=1, description="neurons per hidden layer; MEGA: 64")
     depth: int = Field(default=2, ge=1, le=8, description="hidden layers")
-    lr: Positive = Field(
-        default=0.01,
-        description="learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run",
-    )
+    lr: ClassVar[float] = 0.01
+    """Learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run."""
 
     def stored_degree(self, sh_degree: int) -> int:
         """Return 0: the network gives what depends on the view."""

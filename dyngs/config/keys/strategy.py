@@ -3,7 +3,7 @@ they learn."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -93,10 +93,8 @@ class McmcStrategy(Section):
         ge=0,
         description="strength of the noise on positions, times their learning rate; 0: none",
     )
-    opacity_reg: float = Field(default=0.01, ge=0, description="weight of the mean opacity")
-    scale_reg: float = Field(
-        default=0.01, ge=0, description="weight of the mean scale, scene units"
-    )
+    opacity_reg: ClassVar[float] = 0.01  # weight of the mean opacity
+    scale_reg: ClassVar[float] = 0.01  # weight of the mean scale, scene units
 
     @property
     def growth_limit(self) -> int:

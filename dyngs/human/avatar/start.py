@@ -12,7 +12,6 @@ from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of
-from dyngs.human.avatar.kind import HUMAN
 from dyngs.human.avatar.observations import Subject, in_colours_of
 from dyngs.human.avatar.pose_fit import PoseRefit
 from dyngs.human.avatar.posing import (
@@ -26,7 +25,7 @@ from dyngs.human.avatar.posing import (
 from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.avatar.training import HumanTraining, outline_loss
 from dyngs.human.body.body_reader import load_template, rest_shape
-from dyngs.human.keys import HumanModel
+from dyngs.human.keys import NO_BODY, HumanModel
 from dyngs.human.motion.motion import captured_motion
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
@@ -78,9 +77,8 @@ def human_start(
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     sh_degree = config.stored_sh_degree
-    problem = HUMAN.refusal(capture)
-    if problem is not None or capture.body is None:
-        raise DyngsError(f"{capture.root}: {problem}")
+    if capture.body is None:
+        raise DyngsError(f"{capture.root}: {NO_BODY}")
     if sh_degree > 1:
         raise DyngsError(
             f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1"

@@ -9,10 +9,8 @@ import pytest
 import torch
 
 from dyngs.baselines.fields.keys import NgpModel
-from dyngs.baselines.fields.mesh import surface_of
 from dyngs.baselines.fields.ngp import NgpField
-from dyngs.baselines.fields.scene import FieldScene
-from dyngs.core.errors import DyngsError
+from dyngs.baselines.fields.scene import FieldScene, surface_of
 from dyngs.ops.rays import Space
 
 MIDDLE = torch.tensor([0.3, -0.1, 0.2])
@@ -33,9 +31,7 @@ class Ball(NgpField):
 @pytest.fixture(scope="module")
 def scene() -> FieldScene:
     space = Space((0.1, 0.0, 0.0), 1.0, 2, 8)
-    plain = NgpField.new(
-        NgpModel(levels=2, log2_rows=6, finest=16), space, torch.Generator().manual_seed(0)
-    )
+    plain = NgpField.new(NgpModel(sizes="tiny"), space, torch.Generator().manual_seed(0))
     field = Ball(
         space,
         plain.pixels,
@@ -58,12 +54,3 @@ def test_a_ball_is_found_with_faces_outwards_and_colours(scene: FieldScene) -> N
     assert volume == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.01), "a negative one is inside out"
     straight = 0.5 - offsets  # seen from straight ahead: against the normal, of length 1/2
     assert np.abs(found.colours - straight).max() < 0.05
-
-
-def test_another_level_is_another_surface(scene: FieldScene) -> None:
-    found = surface_of(scene, level=25 * np.e, cells=40)
-    assert np.linalg.norm(found.vertices - MIDDLE.numpy(), axis=1).mean() == pytest.approx(
-        0.4, abs=2e-3
-    )
-    with pytest.raises(DyngsError, match="no surface"):
-        surface_of(scene, level=1e6, cells=10)

@@ -7,38 +7,17 @@ from itertools import pairwise
 import pytest
 import torch
 
-from dyngs.baselines.fields.field import encoded
 from dyngs.baselines.fields.keys import NerfModel
-from dyngs.baselines.fields.nerf import DIRECTION, POSITION, NerfField, NerfNetwork
+from dyngs.baselines.fields.nerf import NerfField
 from dyngs.ops.rays import Rays, Space
 
 SPACE = Space((0.0, 0.0, 0.0), 1.5, 1, 1)
 
 
-def test_the_encoding_has_no_pi() -> None:
-    x = torch.tensor([[0.3, -1.2]], dtype=torch.float64)
-    expected = [x, x.sin(), x.cos(), (2 * x).sin(), (2 * x).cos()]
-    assert torch.equal(encoded(x, 2), torch.cat(expected, 1))
-    assert (POSITION, DIRECTION) == (63, 27)
-
-
-def test_networks_have_the_published_size() -> None:
-    """0.6 M weights each; the position comes again into the sixth layer."""
-    network = NerfNetwork.new(NerfModel(), torch.Generator().manual_seed(0))
-    assert [tuple(x.weight.shape) for x in network.trunk[4:7]] == [
-        (256, 256),
-        (256, 319),
-        (256, 256),
-    ]
-    assert network.trunk[8].weight.shape == (257, 256)
-    assert [tuple(x.weight.shape) for x in network.head] == [(128, 283), (3, 128)]
-    assert sum(x.numel() for x in network.parameters.values()) == 595_844
-
-
 def test_rays_see_a_slab_of_even_density() -> None:
     """Networks of biases alone: density 2 everywhere, one colour; the last sample hides all that is
     left."""
-    model = NerfModel(width=8, coarse=16, fine=16)
+    model = NerfModel(sizes="tiny")
     field = NerfField.new(model, SPACE, torch.Generator().manual_seed(0))
     with torch.no_grad():
         for x in field.parameters.values():
@@ -62,19 +41,17 @@ def test_rays_see_a_slab_of_even_density() -> None:
 
 def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
     """The last sample is 1e10 long: what is left of sums must not be multiplied by that."""
-    field = NerfField.new(
-        NerfModel(width=8, coarse=8, fine=8), SPACE, torch.Generator().manual_seed(3)
-    )
+    field = NerfField.new(NerfModel(sizes="tiny"), SPACE, torch.Generator().manual_seed(3))
     origins = (
         torch.nn.functional.normalize(
             torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
         )
         * 4
     )
-    shifts = torch.rand(50, 16, generator=torch.Generator().manual_seed(2))
+    shifts = torch.rand(50, 24, generator=torch.Generator().manual_seed(2))
     seen = field.seen(Rays(origins, -origins / 4), 0.0, near=0.1, shifts=shifts)
     assert seen.coarse is not None
     (seen.colour + seen.coarse.colour).mean().backward()
     grads = [x.grad for name, x in field.parameters.items() if "weight" in name]
     assert all(grad is not None and 0 < float(grad.abs().max()) < 10 for grad in grads)
-    assert [n.weight.shape[0] for n, _ in pairwise(field.coarse.trunk)] == [8] * 8
+    assert [n.weight.shape[0] for n, _ in pairwise(field.coarse.trunk)] == [32] * 8

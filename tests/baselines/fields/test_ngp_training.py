@@ -10,14 +10,13 @@ import pytest
 import torch
 from small_fields import NGP, config_of
 
-from dyngs.baselines.fields.frusta import seen_cells
-from dyngs.baselines.fields.ngp import NgpField
-from dyngs.baselines.fields.ngp_training import NgpTraining
-from dyngs.baselines.fields.space import rays_of
+from dyngs.baselines.fields.ngp import NgpField, seen_cells
+from dyngs.baselines.fields.training import NgpTraining
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.models.volume import rays_of
 from dyngs.ops.native import kernel_threads
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
@@ -58,12 +57,6 @@ def test_views_that_were_held_out_are_learned(capture: Path) -> None:
     assert 0.4 < samples / 2**12 < 2.5, "rays fill a step, about"
 
 
-def test_the_rate_rises_and_falls(capture: Path) -> None:
-    trainer = assemble(config_of(capture, *NGP, "train.steps=1000"))
-    rates = [trainer.model.rate(step) for step in (1, 51, 101, 500, 501, 751, 901)]
-    assert rates == pytest.approx([1e-4, 5.05e-3, 1e-2, 1e-2, 3.3e-3, 1.089e-3, 3.5937e-4])
-
-
 def test_untouched_rows_stay_as_they_are(capture: Path) -> None:
     trainer = assemble(config_of(capture, *NGP))
     table = trainer.model.scene.field.parameters["table"]
@@ -95,11 +88,6 @@ def test_a_cube_that_no_camera_sees_is_refused(capture: Path) -> None:
     ]
     with pytest.raises(DyngsError, match="no training camera sees anything of the cube"):
         assemble(config, replace(read, splits={**read.splits, "train": views}))
-
-
-def test_several_views_share_a_step(capture: Path) -> None:
-    one, four = (assemble(config_of(capture, *NGP, f"train.batch_size={n}")) for n in (1, 4))
-    assert one.model.num_rays == 4 * four.model.num_rays
 
 
 def test_the_same_bytes_on_any_number_of_threads(capture: Path) -> None:

@@ -7,21 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.baselines.fields.sampling import along, by_weights, crossed, evenly
+from dyngs.baselines.fields.nerf import by_weights, crossed, evenly
 from dyngs.ops.rays import Rays, Space
 
 SPACE = Space((0.0, 0.0, 0.0), 1.0, 1, 1)
 ACROSS = Rays(torch.tensor([[-3.0, 0.2, 0.1]]), torch.tensor([[1.0, 0.0, 0.0]]))
-
-
-def test_rays_are_clipped_to_the_space() -> None:
-    rays = Rays(
-        torch.tensor([[-3.0, 0, 0], [-3, 5, 0], [0.5, 0, 0]]), torch.tensor([[1.0, 0, 0]] * 3)
-    )
-    begin, end = crossed(rays, SPACE, 0.1)
-    assert begin.tolist() == pytest.approx([2.0, begin[1].item(), 0.1])
-    assert end[[0, 2]].tolist() == pytest.approx([4.0, 0.5])
-    assert begin[1] == end[1]
 
 
 @given(count=st.integers(1, 40), seed=st.integers(0, 100), cascades=st.sampled_from([1, 4]))
@@ -50,11 +40,3 @@ def test_more_samples_go_where_the_weights_are() -> None:
     assert torch.equal(found, found.sort().values)
     near = [int(((found - float(distances[0, i])).abs() < 0.0501).sum()) for i in (10, 5)]
     assert near == pytest.approx([301, 101], abs=3)
-
-
-def test_samples_reach_from_each_distance_to_the_next() -> None:
-    found = along(ACROSS, SPACE, torch.tensor([[2.0, 2.5, 3.0]]))
-    assert found.starts.tolist() == [2.0, 2.5, 3.0]
-    assert found.ends[:2].tolist() == [2.5, 3.0]
-    assert found.ends[2] > 1e9
-    assert found.coords[:, 0].tolist() == pytest.approx([0.0, 0.25, 0.5])

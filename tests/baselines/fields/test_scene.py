@@ -11,8 +11,7 @@ from small_fields import NERF, NGP, config_of
 
 from dyngs.baselines.fields.keys import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
-from dyngs.baselines.fields.scene import FieldScene, stored_space
-from dyngs.core.errors import DyngsError
+from dyngs.baselines.fields.scene import FieldScene
 from dyngs.gaussians.restored import restored_model
 from dyngs.models.renderable import DrawOptions
 from dyngs.ops.rays import Space
@@ -20,7 +19,7 @@ from dyngs.training.new_trainer import assemble
 
 
 def scene_of(space: Space) -> FieldScene:
-    model = NgpModel(levels=3, log2_rows=8, finest=32, cells=8)
+    model = NgpModel(sizes="tiny")
     return FieldScene(
         NgpField.new(model, space, torch.Generator().manual_seed(0)), background=torch.ones(3)
     )
@@ -45,16 +44,6 @@ def test_depth_is_along_the_axis_of_the_camera_and_expected_is_divided_by_alpha(
     )
 
 
-def test_an_image_does_not_depend_on_how_it_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = scene_of(Space((0.0, 0.0, 0.0), 1.0, 3, 8))
-    view = camera(12, 9)
-    with torch.no_grad():
-        whole = scene.render(view).rgb
-        monkeypatch.setattr("dyngs.baselines.fields.scene.CHUNK", 7)
-        # torch's own functions round the last few numbers of an array otherwise
-        assert torch.allclose(scene.render(view).rgb, whole, atol=1e-6)
-
-
 @pytest.mark.parametrize("keys", [NGP, NERF], ids=["ngp", "nerf"])
 def test_with_time_it_moves(moving: Path, keys: list[str]) -> None:
     """It learns the times of the capture, and its scene is drawn at any."""
@@ -69,16 +58,3 @@ def test_with_time_it_moves(moving: Path, keys: list[str]) -> None:
     with torch.no_grad():
         first, last = (scene.render(image.cameras, time).rgb for time in (0.0, 1.0))
     assert not torch.equal(first, last)
-
-
-@pytest.mark.parametrize(
-    "bad", [[0.0, 0, 0, -1, 1, 8], [0.0, 0, 0, 1, 99, 8], [0.0, 0, 0, 1, 1, 0.5]]
-)
-def test_a_space_that_is_none_is_refused(bad: list[float]) -> None:
-    with pytest.raises(ValueError, match="space"):
-        stored_space({"space": torch.tensor(bad, dtype=torch.float64)})
-
-
-def test_a_time_that_is_no_number_is_refused() -> None:
-    with pytest.raises(DyngsError, match="not a number"):
-        scene_of(Space((0.0, 0.0, 0.0), 1.0, 1, 8)).render(camera(4, 4), float("nan"))

@@ -11,12 +11,12 @@ import torch
 from small_fields import config_of
 
 from dyngs.baselines.fields.keys import NgpModel
-from dyngs.baselines.fields.space import MOST_CASCADES, part_of, rays_of, space_of
+from dyngs.baselines.fields.scene import MOST_CASCADES, space_of
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud
-from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.models.volume import rays_of
 
 
 @pytest.fixture
@@ -56,14 +56,6 @@ def test_a_real_capture_has_cubes_up_to_its_points(still: Capture) -> None:
         space_of(NgpModel(), 16, real(still, 1e6 * directions))
 
 
-def test_cameras_that_look_outwards_lie_in_the_innermost_cube(still: Capture) -> None:
-    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
-    views = [replace(v, cam_from_world=turned @ v.cam_from_world) for v in still.splits["train"]]
-    space = space_of(NgpModel(), 16, replace(real(still, None), splits={"train": views}))
-    centres = np.stack([-v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3] for v in views])
-    assert (np.abs(centres - space.centre) < space.half).all()
-
-
 def test_one_camera_position_tells_no_depth(still: Capture) -> None:
     one = replace(still, splits={"train": still.splits["train"][:1] * 3})
     with pytest.raises(DyngsError, match="single camera position"):
@@ -91,13 +83,3 @@ def test_rays_go_through_pixel_centres() -> None:
     assert torch.allclose(rays.directions.norm(dim=1), torch.ones(300, dtype=torch.float64))
     some, _ = rays_of(camera, torch.tensor([21, 299]))
     assert torch.equal(some.directions, rays.directions[[21, 299]])
-
-
-def test_a_part_of_an_image_is_its_pixels(capture: Path, still: Capture) -> None:
-    image = ImageLoader(still.splits["train"], config_of(capture).data)[0]
-    pixels = torch.tensor([5, 24 * 11 + 7, 5])
-    part = part_of(image, pixels)
-    white = torch.ones(3)
-    assert torch.equal(part.composite(white)[0], image.composite(white).view(-1, 3)[pixels])
-    assert part.alpha is not None
-    assert part.alpha.shape == (1, 3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.baselines.fields.thinning import EVERY, LIGHT, reached_samples, thinned_samples
+from dyngs.models.volume import EVERY, LIGHT, reached_samples, thinned_samples
 from dyngs.ops.rays import Samples, composite
 
 
@@ -23,15 +23,6 @@ def samples_of(
         torch.rand(num_rays * each, 3, generator=generator, dtype=torch.float64),
     )
     return densities.flatten(), samples
-
-
-def test_all_that_light_gets_to_are_reached() -> None:
-    densities, samples = samples_of(4, 40, torch.Generator().manual_seed(0))
-    found, which = reached_samples(densities, samples)
-    assert found.offsets.diff().tolist() == [23, 40, 23, 40], (
-        "three samples of the wall leave less than 1e-4"
-    )
-    assert torch.equal(found.coords, samples.coords[which])
 
 
 def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:

@@ -54,20 +54,3 @@ def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
     moments = found.of_moments("points", torch.ones_like(patches.points))
     assert moments[:4].min() == 1
     assert moments[4:].abs().max() == 0
-
-
-def test_it_leads_evenly_to_the_limit() -> None:
-    assert len(change(bent(6), seen(6), 1.0, 36, 5).of("points", bent(6).points)) == 6 + 2 * 3
-
-
-def test_what_is_useless_goes_without_a_split_where_none_may_come() -> None:
-    tallies = seen(6)
-    tallies.seen[2] = 0
-    found = change(bent(6), tallies, 1.0, 0, 1)
-    assert found.kept.tolist() == [0, 1, 3, 4, 5]
-    assert len(found.added["points"]) == 0
-
-
-def test_something_stays() -> None:
-    found = change(bent(3), Tallies(3), 1.0, 3, 1)
-    assert len(found.kept) == 3

@@ -19,8 +19,8 @@ def test_the_first_step_begins_on_the_surface(capture: Path) -> None:
     before = len(model.scene.patches)
     trainer.step()
     patches = model.scene.patches
-    assert before == 150
-    assert 50 < len(patches) <= 150
+    assert before <= 300
+    assert 50 < len(patches) <= 300
     assert model.scene.unit == pytest.approx(0.8, abs=0.4)
     assert patches.colours.std() > 0.05
     corners = patches.points.detach()[:, [0, 3, 5]]

@@ -6,9 +6,9 @@ import math
 
 import pytest
 import torch
-from small_triangles import bent, triangle
+from small_triangles import bent
 
-from dyngs.baselines.triangles.patches import Patches, evaluated, flat_triangles, quarters
+from dyngs.baselines.triangles.patches import Patches, evaluated, quarters
 from dyngs.core.state import tensors_of
 from dyngs.ops.patches import lattice, patch_values
 
@@ -27,17 +27,6 @@ def test_quarters_are_the_same_surface() -> None:
         torch.testing.assert_close(evaluated(parts[n::4], inner), evaluated(points, at))
 
 
-def test_sizes_of_a_right_triangle() -> None:
-    points = torch.cat(
-        [triangle((0, 0, 0), (3, 0, 0), (0, 4, 0)), triangle((0, 0, 0), (1, 0, 0), (40, 1, 0))]
-    )
-    patches = Patches(points, torch.zeros(2, 6, 3), torch.zeros(2, 0, 3))
-    torch.testing.assert_close(patches.areas, torch.tensor([6.0, 0.5]))
-    torch.testing.assert_close(patches.elongations, torch.tensor([4 / 3, 40.0]))
-    assert patches.num_values == 2 * 36
-    assert patches.sh_degree == 0
-
-
 def test_a_texture_begins_with_the_colours_that_were_there() -> None:
     patches = bent(3)
     textured = patches.textured(4)
@@ -46,14 +35,6 @@ def test_a_texture_begins_with_the_colours_that_were_there() -> None:
     uv = places.float().repeat(3, 1)
     torch.testing.assert_close(textured.colours_at(ids, uv), patch_values(patches.colours, ids, uv))
     assert textured.texture == 4
-
-
-@pytest.mark.parametrize("texture", [0, 3])
-def test_it_is_restored(texture: int) -> None:
-    patches = bent(4) if texture == 0 else bent(4).textured(texture)
-    again = Patches.restored(tensors_of(patches.state()))
-    assert again.texture == texture
-    assert all(torch.equal(x, again.tensors[name]) for name, x in patches.tensors.items())
 
 
 @pytest.mark.parametrize(
@@ -71,10 +52,3 @@ def test_what_does_not_fit_is_refused(name: str, value: torch.Tensor) -> None:
     stored = tensors_of(bent(4).textured(3).state())
     with pytest.raises(ValueError, match=r"'\w+'"):
         Patches.restored(stored | {name: value})
-
-
-def test_flat_triangles_are_linear() -> None:
-    corners = torch.randn(2, 3, 3, dtype=torch.float64)
-    places, _ = lattice(3)
-    weights = torch.cat([places, 1 - places.sum(1, keepdim=True)], 1)
-    torch.testing.assert_close(evaluated(flat_triangles(corners), places), weights @ corners)

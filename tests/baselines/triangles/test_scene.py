@@ -47,13 +47,6 @@ def test_edges_are_as_sharp_when_enlarged() -> None:
     assert soft[1] == soft[0]
 
 
-def test_area_is_what_is_covered() -> None:
-    """Half of what the outlines' softness takes inside it gives outside."""
-    for times in (1, 2):
-        drawn = scene_of(*SQUARE).render(camera(64), options=replace(PLAIN, supersampling=times))
-        assert abs(float(drawn.alpha.sum()) ** 0.5 - 38.4) < 0.7
-
-
 def test_harmonics_tell_directions_apart() -> None:
     patches = bent(1)
     there = camera()
@@ -103,16 +96,3 @@ def test_what_has_no_area_is_not_drawn_and_spoils_no_gradient() -> None:
     assert points.grad is not None
     assert points.grad[0].abs().sum() > 0
     assert points.grad[1:].abs().max() == 0
-
-
-def test_one_that_is_larger_than_the_scene_fills_the_image() -> None:
-    drawn = scene_of(triangle((-1e6, -1e6, 0), (1e6, -1e6, 0), (0, 2e6, 0))).render(camera())
-    torch.testing.assert_close(drawn.rgb[0], RED.expand(32, 32, 3))
-
-
-def test_nothing_in_view_is_the_background() -> None:
-    drawn = scene_of(triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))).render(
-        camera(), background=torch.ones(3)
-    )
-    assert drawn.rgb.min() == 1
-    assert drawn.transmittance.min() == 1

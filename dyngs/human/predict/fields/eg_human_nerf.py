@@ -21,7 +21,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from dyngs.baselines.fields.space import rays_of
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.network import (
@@ -41,6 +40,7 @@ from dyngs.human.predict.fields.network import (
     mean_and_variance,
 )
 from dyngs.human.predict.fields.people import OUTWARDS, Boundaries, PosedBody
+from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Rays
 
 

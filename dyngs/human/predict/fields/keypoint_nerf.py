@@ -18,8 +18,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, softplus
 
-from dyngs.baselines.fields.space import rays_of
-from dyngs.baselines.fields.thinning import kept_samples, reached_samples, thinned_samples
 from dyngs.core.camera import Cameras
 from dyngs.human.body.joints import JOINT_PARENTS
 from dyngs.human.predict.fields.network import (
@@ -37,6 +35,7 @@ from dyngs.human.predict.fields.network import (
     mean_and_variance,
 )
 from dyngs.human.predict.fields.people import KEY_POINTS, PosedBody, Sources
+from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
 from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
 
 

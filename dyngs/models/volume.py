@@ -1,6 +1,6 @@
-"""Fewer samples for the networks: of those that hardly show, one in four, which stands for the
-others, too.
+"""Volume rendering of radiance fields: the rays of cameras, and fewer samples for the networks.
 
+Of samples that hardly show one in four is taken, which stands for the others, too.
 R rays, M samples. A sample within an occupied cell but before or behind the surface costs as much
 as one that is seen, and says as little as its neighbours.
 """
@@ -12,10 +12,40 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dyngs.ops.rays import Samples, composite, offsets_of, reached
+from dyngs.core.camera import Cameras
+from dyngs.ops.rays import Rays, Samples, composite, offsets_of, reached
 
 LIGHT = 5e-3  # Weight below which a sample hardly shows
 EVERY = 4  # So many of those are one
+
+
+def rays_of(cameras: Cameras, pixels: Tensor | None = None) -> tuple[Rays, Tensor]:
+    """Return the rays of one camera through the centres of ``pixels`` (R,), row by row; None: of
+    all.
+
+    Also (R,) the view-space z of what lies a unit along each.
+    """
+    if pixels is None:
+        pixels = torch.arange(cameras.width * cameras.height, device=cameras.intrinsics.device)
+    intrinsics = cameras.intrinsics[0]
+    pose = cameras.cam_from_world[0]
+    x = pixels % cameras.width + 0.5
+    y = torch.div(pixels, cameras.width, rounding_mode="floor") + 0.5
+    local = torch.stack(
+        [
+            (x - intrinsics[0, 2]) / intrinsics[0, 0],
+            (y - intrinsics[1, 2]) / intrinsics[1, 1],
+            torch.ones_like(x),
+        ],
+        -1,
+    ).to(pose.dtype)
+    z = 1 / local.square().sum(-1).sqrt()
+    local = local * z[:, None]
+    rotation = pose[:3, :3]
+    directions = (
+        local[:, :1] * rotation[0] + local[:, 1:2] * rotation[1] + local[:, 2:] * rotation[2]
+    )
+    return Rays(cameras.centers.expand(len(x), 3), directions), z
 
 
 @torch.no_grad()

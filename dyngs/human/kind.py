@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dyngs.core.conventions import ReportProgress
-from dyngs.human.keys import HumanModel
+from dyngs.human.keys import NO_BODY, HumanModel
 from dyngs.models.kind import HasBody, HasGaussians, InMotion
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class HumanKind(HasGaussians, HasBody):
     def refusal(self, capture: Capture) -> str | None:
         if capture.body is not None:
             return None
-        return "has no body parameters, which model.kind=human needs; see docs/human.md"
+        return NO_BODY
 
     def find_body(
         self,
