@@ -255,10 +255,10 @@ def read_a_run(root: Path) -> object:
 
 def read_a_person(root: Path) -> object:
     """Read an avatar and render it."""
-    from dyngs.runs.avatar import read_avatar
+    from dyngs.human.avatar.avatar_file import read_avatar
 
-    run = read_avatar(only(root))
-    return run.info, played(run.scene, run.scene.options)
+    _, scene, info = read_avatar(only(root))
+    return info, played(scene, scene.options)
 
 
 def read_a_preset(root: Path) -> object:

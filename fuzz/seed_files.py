@@ -24,13 +24,13 @@ from dyngs.deform.keys import DynamicModel
 from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.gaussians.restored import restored_scene
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.avatar_file import _KIND as AVATAR_KIND
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass
 from dyngs.io.formats import formats
 from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.io.tensor_file import write_tensors
 from dyngs.models.static_section import StaticModel
-from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.runs.stored_file import encoded
 

@@ -433,11 +433,14 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
 
 
 def _export_avatar(arguments: argparse.Namespace) -> int:
-    from dyngs.runs.avatar import write_avatar
+    from dyngs.human.avatar.avatar_file import write_avatar
+    from dyngs.runs.inputs import inputs_of
     from dyngs.runs.opened import open_run
 
     path = arguments.out or arguments.run_dir / "avatar.safetensors"
-    print_written(write_avatar(open_run(arguments.run_dir).in_own_frame(), path))
+    run = open_run(arguments.run_dir).in_own_frame()
+    inputs_of(run).require_output(path)
+    print_written(write_avatar(run.renderable, run.config.model, run.info, path))
     return 0
 
 

@@ -61,6 +61,11 @@ class HumanKind(HasGaussians, HasBody):
 
         return in_motion(section, scene, info, path, keep_feet=keep_feet)
 
+    def read_person(self, path: Path) -> tuple[HumanModel, Posable, CheckpointInfo]:
+        from dyngs.human.avatar.avatar_file import read_avatar
+
+        return read_avatar(path)
+
     def functions(self) -> tuple[Start, Restore]:
         from dyngs.human.avatar.start import restore, start
 

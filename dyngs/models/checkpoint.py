@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig
+from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import part_of
 from dyngs.data.capture import Capture
@@ -17,6 +20,9 @@ from dyngs.data.scene_space import change_coordinates
 
 OTHER_CONFIG = "was its config changed? Otherwise train anew"
 """Advice where a checkpoint and its run do not fit together."""
+
+_MAX_STEP = 2**53
+_BACKGROUNDS = ("white", "black", "random")
 
 _SETTINGS = ("model.kind", "model.sh_degree", "model.deform.kind", "colour.kind", "strategy.kind")
 _SETTINGS += ("camera.refine", "train.robust", "train.exposure")
@@ -45,6 +51,28 @@ class CheckpointInfo:
     background: str  # resolved choice: "white", "black" or "random"
     rasterize_mode: str  # how the Gaussians want to be drawn
     world_scale: float = 1.0  # as ``Capture.world_scale``
+
+
+def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
+    """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or
+    OverflowError."""
+    step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
+    extent = float(header["extent"])
+    background = header["background"]
+    mode = header["rasterize_mode"]
+    # earlier versions trained in the unit of the files
+    scale = float(header.get("world_scale", 1.0))
+    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= _MAX_STEP:
+        raise ValueError(f"its step is {step!r:.60}")
+    if (
+        not all(math.isfinite(value) for value in (extent, x, y, z, scale))
+        or extent < 0
+        or scale <= 0
+    ):
+        raise ValueError("its extent, world_offset or world_scale is not valid")
+    if background not in _BACKGROUNDS or mode not in {mode.value for mode in RasterizeMode}:
+        raise ValueError(f"its background is {background!r:.60}, its rasterize_mode {mode!r:.60}")
+    return CheckpointInfo(step, extent, (x, y, z), background, mode, scale)
 
 
 def read_capture_of(data: DataConfig, info: CheckpointInfo) -> Capture:

@@ -190,6 +190,11 @@ class HasBody(ModelKind):
         before and after. Raises DyngsError: the file cannot be read.
         """
 
+    @abstractmethod
+    def read_person(self, path: Path) -> tuple[ModelSection, Posable, CheckpointInfo]:
+        """Return the person of an avatar file, with its section and its metadata. Raises
+        DyngsError."""
+
 
 @dataclass(frozen=True)
 class InMotion:

@@ -11,23 +11,20 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, as_word, reading
 from dyngs.gaussians.restored import restored_model
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.io.fields import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, info_of
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.runs.stored_file import read_scene
@@ -38,8 +35,6 @@ _MOST_TIMING_BYTES = 1 << 20
 SCENE_FILE = "scene.dyngs"
 """Name of the .dyngs file that holds a finished run, see ``dyngs.runs.stored_file``."""
 _KIND = FileKind("dyngs", "a checkpoint", 1)
-MAX_STEP = 2**53
-BACKGROUNDS = ("white", "black", "random")
 
 
 @dataclass(frozen=True)
@@ -106,28 +101,6 @@ def load_checkpoint(path: Path) -> Checkpoint:
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
     with reading(path, _instead_of(path).removeprefix("; ")):
         return Checkpoint(info_of(header), tensors, path, dict(header.get("settings", {})))
-
-
-def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
-    """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or
-    OverflowError."""
-    step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
-    extent = float(header["extent"])
-    background = header["background"]
-    mode = header["rasterize_mode"]
-    # earlier versions trained in the unit of the files
-    scale = float(header.get("world_scale", 1.0))
-    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= MAX_STEP:
-        raise ValueError(f"its step is {step!r:.60}")
-    if (
-        not all(math.isfinite(value) for value in (extent, x, y, z, scale))
-        or extent < 0
-        or scale <= 0
-    ):
-        raise ValueError("its extent, world_offset or world_scale is not valid")
-    if background not in BACKGROUNDS or mode not in {mode.value for mode in RasterizeMode}:
-        raise ValueError(f"its background is {background!r:.60}, its rasterize_mode {mode!r:.60}")
-    return CheckpointInfo(step, extent, (x, y, z), background, mode, scale)
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig
+from dyngs.config.kinds import installed_kind
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.aim import up_direction
@@ -29,8 +30,6 @@ from dyngs.models.kind import HasBody, capability
 from dyngs.models.renderable import Posable, Renderable
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import background_colour, training_cameras
-from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
-from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.runs.frame import RunFrame, read_frame
 
@@ -62,6 +61,9 @@ class Captured:
     def once(self, name: str, compute: Callable[[], T]) -> T:
         """Return what ``compute`` returned when first asked for ``name``."""
         return _once(self._kept, name, compute)
+
+
+AVATAR_SUFFIX = ".safetensors"
 
 
 @dataclass(frozen=True)
@@ -292,7 +294,7 @@ def open_scene(
     if data_root is not None:
         raise DyngsError(f"{path}: a file, not a run, so it has no capture; leave out data.root")
     if path.suffix.lower() == AVATAR_SUFFIX:
-        return Opened(**vars(read_avatar(path)), name=path.name, path=path)
+        return _open_avatar(path)
     if format_to_read(path) is None:
         known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()}, .ckpt, .pt)"
         other = command_for(path)
@@ -323,6 +325,14 @@ def open_run(folder: Path, data_root: Path | None = None, *, with_capture: bool 
     if edited is None:
         return opened
     return replace(opened, edited=edited, stated_up=edited.up, scaled=edited.similarity.scale != 1)
+
+
+def _open_avatar(path: Path) -> Opened:
+    kind = installed_kind("human")
+    assert isinstance(kind, HasBody)
+    model, person, info = kind.read_person(path)
+    config = Config(data=DataConfig(root=path), model=model)
+    return Opened(config, person, info.step, 0.0, info, name=path.name, path=path)
 
 
 def opened_scene(scene: GaussianScene, file: Path = Path("scene")) -> Opened:

@@ -11,7 +11,7 @@ import dyngs
 from dyngs.api.load import load
 from dyngs.api.scene_file import write_scene_file
 from dyngs.export.splat_files import write_run_splats
-from dyngs.runs.avatar import write_avatar
+from dyngs.human.avatar.avatar_file import write_avatar
 from dyngs.runs.checkpoint import load_run
 from dyngs.runs.opened import open_run
 
@@ -73,7 +73,9 @@ def test_an_avatar_is_a_scene(person: Path, tmp_path: Path) -> None:
         "run.threads=1",
     ]
     run = dyngs.train(dyngs.load_config("human", [*words, f"run.dir={tmp_path / 'run'}"]))
-    scene = load(write_avatar(load_run(run), tmp_path / "a.safetensors"))
+    loaded = load_run(run)
+    file = tmp_path / "a.safetensors"
+    scene = load(write_avatar(loaded.renderable, loaded.config.model, loaded.info, file))
     assert len(scene) == len(load(run))
     assert scene.is_static
 

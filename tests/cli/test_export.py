@@ -21,10 +21,10 @@ from dyngs.cli import export, main
 from dyngs.config import DataConfig
 from dyngs.data.geometry import camera_center
 from dyngs.data.read import read_capture
+from dyngs.human.avatar.avatar_file import write_avatar
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.io.formats.formats import read_splats
-from dyngs.runs.avatar import write_avatar
 
 
 def run_of(still: Path, folder: Path, refine: str) -> Path:
@@ -189,9 +189,9 @@ def test_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 @pytest.fixture(scope="module")
 def avatar(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_avatar(
-        bare_run(bare_scene(resolution=24)), tmp_path_factory.mktemp("person") / "ann.safetensors"
-    )
+    run = bare_run(bare_scene(resolution=24))
+    path = tmp_path_factory.mktemp("person") / "ann.safetensors"
+    return write_avatar(run.renderable, run.config.model, run.info, path)
 
 
 @pytest.fixture(scope="module")

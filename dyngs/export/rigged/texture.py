@@ -179,8 +179,10 @@ def texture_image(rgb: Tensor, texels: Texels) -> np.ndarray:
     empty = np.ones(size * size, bool)
     image[texels.index.numpy()] = rgb.numpy()
     empty[texels.index.numpy()] = False
-    rows, columns = distance_transform_edt(
-        empty.reshape(size, size), return_distances=False, return_indices=True
+    rows, columns = np.asarray(
+        distance_transform_edt(
+            empty.reshape(size, size), return_distances=False, return_indices=True
+        )
     )
     nearest = image.reshape(size, size, 3)[rows, columns]
     return np.rint(nearest.clip(0, 1) * 255).astype(np.uint8)

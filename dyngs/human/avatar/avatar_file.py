@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, printable
+from dyngs.core.section import ModelSection
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
@@ -27,9 +27,9 @@ from dyngs.human.body.body_reader import template_path
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
+from dyngs.models.checkpoint import CheckpointInfo, info_of
+from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.runs.checkpoint import LoadedRun, info_of
-from dyngs.runs.inputs import inputs_of
 
 SUFFIX = ".safetensors"
 
@@ -54,25 +54,23 @@ class TemplateRef:
     packaged: bool
 
 
-def write_avatar(run: LoadedRun, path: Path) -> Path:
-    """Write the person of a run, upright and at rest at the place of the capture (docs/formats.md);
-    return ``path``.
+def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, path: Path) -> Path:
+    """Write a person, upright and at rest at the place of the capture (docs/formats.md); return
+    ``path``.
 
-    Raises DyngsError: the run is not that of a person, its template is missing, or the file cannot
+    Raises DyngsError: the scene is not that of a person, its template is missing, or the file cannot
     be written.
     """
     # late: scipy, which reading an avatar does without
     from dyngs.human.motion.placement import rest_clip
 
-    scene = avatar_of(run.scene)
-    model = run.config.model
+    scene = avatar_of(person)
     if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
-            f"--format avatar needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
+            f"--format avatar needs the run of a person (model.kind=human), this one is {model.kind}"
         )
     if path.suffix.lower() != SUFFIX:
         raise DyngsError(f"{path}: an avatar is written as {SUFFIX}")
-    inputs_of(run).require_output(path)
     if scene.colour is not None:
         raise DyngsError(
             "an avatar file holds harmonics, this run's colours are a network; train with colour.kind=sh"
@@ -104,7 +102,7 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
     file = template_path(model)
     template = TemplateRef(file.name, _sha256(file), model.body is None)
     header = {
-        **asdict(run.info),
+        **asdict(info),
         "near": model.near,
         "eps2d": model.eps2d,
         "template": asdict(template),
@@ -115,9 +113,8 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
     return path
 
 
-def read_avatar(path: Path) -> LoadedRun:
-    """Read the person of a file, upright and at rest; ``dyngs.runs.opened`` moves it as it does one
-    of a run.
+def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
+    """Read the person of a file, upright and at rest, with its section and its metadata.
 
     A template other than the free one is looked for next to the file when a motion needs it.
 
@@ -146,7 +143,7 @@ def read_avatar(path: Path) -> LoadedRun:
         raise DyngsError(f"{path}: not a valid avatar ({why}){_ADVICE}") from None
     options = render_options(model, info.extent, info.world_scale)
     scene = replace(scene, options=options, background=background_colour(info.background))
-    return LoadedRun(Config(data=DataConfig(root=path), model=model), scene, info.step, 0.0, info)
+    return model, scene, info
 
 
 def _template_beside(path: Path, ref: TemplateRef) -> Path | None:

@@ -17,6 +17,8 @@ from torch import Tensor
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig, DefaultStrategy, RunConfig, TrainConfig
 from dyngs.core.errors import DyngsError
+from dyngs.human.avatar import avatar_file as avatar
+from dyngs.human.avatar.avatar_file import read_avatar, write_avatar
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.amass import write_amass
@@ -24,9 +26,7 @@ from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.tensor_file import read_tensors, write_tensors
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.runs import avatar
-from dyngs.runs.avatar import read_avatar, write_avatar
-from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.checkpoint import LoadedRun, checkpoint_paths, load_run
 from dyngs.runs.opened import open_run, open_scene
 
 
@@ -36,6 +36,10 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_human_capture(
         folder, HumanOptions(size=24, num_frames=2, num_new=0, num_cameras=2, num_test=0)
     )
+
+
+def written(run: LoadedRun, path: Path) -> Path:
+    return write_avatar(run.renderable, run.config.model, run.info, path)
 
 
 def trained(capture: Path, folder: Path, **model: object) -> Path:
@@ -57,7 +61,7 @@ def run_dir(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def file(run_dir: Path, tmp_path: Path) -> Path:
-    return write_avatar(load_run(run_dir), tmp_path / "ann.safetensors")
+    return written(load_run(run_dir), tmp_path / "ann.safetensors")
 
 
 @pytest.fixture
@@ -93,7 +97,7 @@ def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> N
     assert read.scene.light.factors.any()
     assert asdict(read.info) == asdict(run.info)
     assert torch.equal(read.scene.anchors.uv, run.scene.anchors.uv)
-    assert write_avatar(run, file.with_name("again.safetensors")).read_bytes() == file.read_bytes()
+    assert written(run, file.with_name("again.safetensors")).read_bytes() == file.read_bytes()
 
 
 def test_blend_shapes_go_along_and_the_template_is_looked_for_beside_the_file(
@@ -101,7 +105,7 @@ def test_blend_shapes_go_along_and_the_template_is_looked_for_beside_the_file(
 ) -> None:
     body = write_npz(tmp_path / "bodies.npz", model("smplx"))
     run = open_run(trained(capture, tmp_path / "run", body=body))
-    file = write_avatar(run, tmp_path / "elsewhere" / "ann.safetensors")
+    file = written(run, tmp_path / "elsewhere" / "ann.safetensors")
     with pytest.raises(DyngsError, match=r"elsewhere/bodies\.npz: cannot be read"):
         open_scene(file).in_motion(motion)
     (tmp_path / "elsewhere" / "bodies.npz").write_bytes(body.read_bytes())
@@ -176,6 +180,6 @@ def test_a_proper_checksum_over_improper_contents(file: Path, change: Change, wo
 def test_only_people_are_exported(tmp_path: Path, run_dir: Path) -> None:
     run = load_run(write_moving_run(tmp_path / "run"))
     with pytest.raises(DyngsError, match=r"--format avatar needs the run of a person"):
-        write_avatar(run, tmp_path / "a.safetensors")
+        written(run, tmp_path / "a.safetensors")
     with pytest.raises(DyngsError, match=r"a\.npz: an avatar is written as \.safetensors"):
-        write_avatar(load_run(run_dir), tmp_path / "a.npz")
+        written(load_run(run_dir), tmp_path / "a.npz")
