@@ -60,7 +60,7 @@ MUTATIONS = (
     ("gaussians/densify.py", "DENSE_FRACTION = 0.01", "DENSE_FRACTION = 0.02", "gaussians/test_densify.py"),
     ("gaussians/densify.py", "PRUNE_SCALE = 0.1", "PRUNE_SCALE = 0.2", "gaussians/test_densify.py"),
     ("gaussians/densify.py", "distance > FAR * self.extent", "distance >= FAR * self.extent", "gaussians/test_densify.py"),
-    ("gaussians/densify.py", "opacities > self.options.min_opacity", "opacities < self.options.min_opacity", "gaussians/test_mcmc.py"),
+    ("gaussians/densify.py", "opacities > self.options.prune_opacity", "opacities < self.options.prune_opacity", "gaussians/test_mcmc.py"),
     ("gaussians/densify.py", "(1 + self.growth) * n", "(2 + self.growth) * n", "gaussians/test_mcmc.py"),
     ("gaussians/densify.py", "NOISE_STEEPNESS = 100.0", "NOISE_STEEPNESS = -100.0", "gaussians/test_mcmc.py"),
     ("data/scene_space.py", "EXTENT_MARGIN = 1.1", "EXTENT_MARGIN = 1.3", "gaussians/test_init.py"),

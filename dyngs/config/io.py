@@ -64,6 +64,7 @@ REMOVED_KEYS: dict[str, object] = {
     "model.texture_from": 0.7,
     "model.weight_decay": 1e-6,
     "model.width": 256,
+    "strategy.min_opacity": 0.005,
     "strategy.opacity_reg": 0.01,
     "strategy.scale_reg": 0.01,
     "optim.sparse": False,

@@ -307,7 +307,7 @@ class McmcDensifier(Densifier):
         parameters = parameters.detach()
         opacities = parameters.opacities.double()
         log_scales = parameters.log_scales
-        alive = opacities > self.options.min_opacity
+        alive = opacities > self.options.prune_opacity
         if not bool(alive.any()):
             return None
         n = len(opacities)
@@ -382,7 +382,7 @@ class McmcDensifier(Densifier):
         shared = copies > 1
         opacities = opacities.clone()
         log_scales = log_scales.clone()
-        thinner, factor = relocated(opacities[shared], copies[shared], self.options.min_opacity)
+        thinner, factor = relocated(opacities[shared], copies[shared], self.options.prune_opacity)
         opacities[shared] = thinner
         log_scales[shared] += factor.log().float()[:, None]
         return opacities, log_scales, shared

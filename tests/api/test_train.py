@@ -44,7 +44,7 @@ from dyngs.training.trainer import StepReport, Trainer
 BUSY = DefaultStrategy(
     start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150
 )
-BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90, min_opacity=0.45)
+BUSY_MCMC = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90, prune_opacity=0.45)
 
 IN_TERMINAL = """
 import fcntl, signal, sys, termios

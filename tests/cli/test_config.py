@@ -34,8 +34,8 @@ def test_overrides_count_and_every_key_has_its_default_and_meaning(
     assert "  steps: 123  # default 7000" in text
     assert "  # optimisation steps; all schedules follow this number (an integer >= 1)" in text
     assert "kind is one of default, mcmc, fixed" in text
-    assert "  min_opacity: " in text
-    assert "prune_opacity" not in text
+    assert "  noise: " in text
+    assert "reset_every" not in text
     values = [
         line for line in text.splitlines() if ": " in line and not line.lstrip().startswith("#")
     ]

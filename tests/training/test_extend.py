@@ -56,7 +56,7 @@ def _config(captures: Path, folder: Path, kind: str, **changes: object) -> Confi
         "default": DefaultStrategy(
             start=1, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150
         ),
-        "mcmc": McmcStrategy(start=1, stop=15_000, every=3, max_gaussians=90, min_opacity=0.45),
+        "mcmc": McmcStrategy(start=1, stop=15_000, every=3, max_gaussians=90, prune_opacity=0.45),
         "human": DefaultStrategy(grow=False),
     }
     config = Config(

@@ -55,7 +55,7 @@ CASES = {
     "mcmc": (
         "static_mcmc",
         "still",
-        (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.min_opacity=0.09"),
+        (*STATIC, "strategy.every=5", "strategy.start=1", "strategy.prune_opacity=0.09"),
     ),
     "mip": (
         "mip",

@@ -10,6 +10,7 @@ from pydantic import Field
 from dyngs.core.section import Fraction, Positive, Section
 
 _OF_30000 = "of a 30,000-step run, scaled with train.steps"
+_PRUNE_OPACITY = "Gaussians with a lower opacity are removed; relocated with kind=mcmc"
 _EVERY = "steps between these changes; null: a twentieth of the run, 100 at most"
 
 
@@ -36,9 +37,7 @@ class DefaultStrategy(Section):
         default=15_000, description=f"step {_OF_30000}, from which their number is fixed"
     )
     every: int | None = Field(default=None, ge=1, description=_EVERY)
-    prune_opacity: Fraction = Field(
-        default=0.005, description="Gaussians with a lower opacity are removed"
-    )
+    prune_opacity: Fraction = Field(default=0.005, description=_PRUNE_OPACITY)
     reset_every: int | None = Field(
         default=3000,
         ge=1,
@@ -85,9 +84,7 @@ class McmcStrategy(Section):
         default=25_000, description=f"step {_OF_30000}, from which their number is fixed"
     )
     every: int | None = Field(default=None, ge=1, description=_EVERY)
-    min_opacity: Fraction = Field(
-        default=0.005, description="Gaussians with a lower opacity are relocated"
-    )
+    prune_opacity: Fraction = Field(default=0.005, description=_PRUNE_OPACITY)
     noise: float = Field(
         default=5e5,
         ge=0,
