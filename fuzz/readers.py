@@ -317,10 +317,11 @@ def read_option_values(root: Path) -> object:
 def read_a_log(root: Path) -> object:
     """Read log and timing of an interrupted run, as resuming does."""
     from dyngs.runs.checkpoint import seconds_at
+    from dyngs.runs.folder import LOG_NAME
     from dyngs.training.run_log import RunLog
 
     seconds = seconds_at(root, 7)
-    with RunLog(root, 2):
+    with RunLog(root / LOG_NAME, 2):
         return seconds
 
 

@@ -339,11 +339,8 @@ class VariantRuns:
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
         if isinstance(run.model, BgTriangleModel):
-            sizes = {name: getattr(run.model, name) for name in ("max_triangles", "num_first")}
-            changes += [
-                f"model.{name}={max(4, round(wanted.triangles * size))}"
-                for name, size in sizes.items()
-            ]
+            most = max(4, round(wanted.triangles * run.model.max_triangles))
+            changes.append(f"model.max_triangles={most}")
         changes += [*self._where, f"run.dir={out}"]
         return finished(load_resolved(self.run_dir, changes), out)
 
@@ -460,7 +457,7 @@ def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
         }
         field = section(**moves)
         yield f"model.deform.kind={kind}"
-        yield from (f"model.deform.{name}={str(value).lower()}" for name, value in moves.items())
+        yield from (f"model.deform.{name}=[{','.join(value)}]" for name, value in moves.items())
     if kind in FIELD_SIZE:
         size = round(wanted.field_size * getattr(field, FIELD_SIZE[kind]))
         yield f"model.deform.{FIELD_SIZE[kind]}={max(1, size)}"

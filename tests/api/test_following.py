@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, load_checkpoint
+from dyngs.runs.folder import LOG_NAME
 from dyngs.training.processes import Processes
 
 BUSY = DefaultStrategy(
@@ -78,15 +80,13 @@ def test_two_processes_end_with_the_bytes_of_one(
     codes, said = run_in(2, do.trained, tmp_path, configs("two"))
     assert codes == [0, 0], said
     assert said[1] == ""
+    counts = set[int]()
     for config in configs("one"):
         train(config)
         assert config.run.dir is not None
         _require_same_bytes(config.run.dir, tmp_path / "two" / config.run.dir.name)
-    counts = {
-        line.split(" Gaussians")[0].split()[-1]
-        for line in said[0].splitlines()
-        if line.startswith("step ")
-    }
+        log = (config.run.dir / LOG_NAME).read_text(encoding="utf-8").splitlines()
+        counts |= {json.loads(line).get("num_gaussians") for line in log}
     assert len(counts) > 3, "the set of Gaussians changes"
 
 

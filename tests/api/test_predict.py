@@ -83,9 +83,7 @@ def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
     run = made.prediction.run_dir
     with pytest.raises(DyngsError, match="exists already"):
         predict(made.network, made.capture, run, 3)
-    with pytest.raises(
-        DyngsError, match="kind=human; a prediction needs one of human_predictor or gps or "
-    ):
+    with pytest.raises(DyngsError, match="kind=human; a prediction needs the run of a network"):
         network_config(run)
     with pytest.raises(DyngsError, match="not a run folder"):
         predict(tmp_path, made.capture, tmp_path / "out", 3)

@@ -46,7 +46,7 @@ def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:
             gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets
         )
         near = nearest_neighbours(found.means)
-        network = AtlasNetwork(2, 1, (8,), generator)
+        network = AtlasNetwork(2, 1, generator)
     for tensor in (
         *found.tensors().values(),
         *anchors.tensors().values(),

@@ -82,7 +82,7 @@ def test_its_surface_is_a_mesh_with_colours(
         ),
         (
             ["export", "RUN", "--format", "mesh", "--motion", "OUT/a.bvh", "--out", "OUT/mesh.ply"],
-            "at its time",
+            "--motion",
         ),
         (["export", "RUN", "--format", "mesh", "--out", "OUT/mesh.stl"], ".ply"),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),

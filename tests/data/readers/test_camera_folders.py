@@ -187,7 +187,6 @@ def test_other_rates_and_lengths_of_videos(tmp_path: Path) -> None:
     write_video(tmp_path / "cam01.mp4", 3, fps=25)
     warnings = " ".join(read(tmp_path).warnings)
     assert "cam00 has 30 frames per second, cam01 25" in warnings
-    assert "cam01 has 3 frames" in warnings or "cam00 has 4 frames" in warnings
 
 
 def test_a_folder_is_preferred_to_its_video(tmp_path: Path) -> None:

@@ -137,9 +137,9 @@ def clip(folder: Path, empty: int = 2, count: int = 12) -> Path:
     """A block that crosses the image; nobody in the first frames."""
     ground = (
         np.random.default_rng(0)
-        .uniform(80, 180, (5, 9, 3))
-        .repeat(10, 0)
-        .repeat(10, 1)
+        .uniform(80, 180, (10, 18, 3))
+        .repeat(5, 0)
+        .repeat(5, 1)
         .astype(np.uint8)
     )
     for i in range(count):
