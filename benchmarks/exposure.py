@@ -29,7 +29,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import split_views
 from dyngs.evaluate.view_scores import right_half_scores
-from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.colour.network import fitted_affine, recoloured
 from dyngs.io.write import write_image
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import load_run

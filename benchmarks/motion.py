@@ -57,7 +57,7 @@ from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import Regions, score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings

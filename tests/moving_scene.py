@@ -21,7 +21,7 @@ from dyngs.deform.fields import field_state
 from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint

@@ -13,7 +13,6 @@ from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.adam import adam_step_, seen_rows
-from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.nodes import HEAD_SIZES, node_penalties, spline_motion
@@ -30,6 +29,7 @@ from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.rasterization import Tally, tally
 from dyngs.ops.rays import Rays, Space, Steps, composite, march, reached
+from dyngs.ops.registration import count_nonfinite_op
 from dyngs.ops.shading import Sight, shading_inputs
 from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
 

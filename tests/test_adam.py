@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.state import tensors_of
-from dyngs.gaussians.parameters import AdamState
+from dyngs.gaussians.optimizer import AdamState
 from dyngs.ops.adam import Count
 
 SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}

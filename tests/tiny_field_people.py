@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.config import Config, DataConfig
-from dyngs.data.people_set import captures_in
+from dyngs.data.read import captures_in
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.predict.fields.people import Person, person_of
 from dyngs.human.synthetic.capture import PeopleOptions, write_people

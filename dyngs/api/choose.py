@@ -28,11 +28,11 @@ from dyngs.core.metrics import psnr
 from dyngs.core.section import Section
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.smaller_images import view_size
+from dyngs.data.read import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
-from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.colour.network import fitted_affine, recoloured
 from dyngs.io.write import write_text
 from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
 from dyngs.models.renderable import Rendering

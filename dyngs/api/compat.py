@@ -16,13 +16,6 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import MAX_SH_DEGREE
 from dyngs.core.errors import DyngsError
 from dyngs.models.renderable import check_focal_lengths, check_poses
-from dyngs.ops.checks import (
-    LARGEST_COUNT,
-    check_choice,
-    check_count,
-    check_finite,
-    check_tensors,
-)
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import (
@@ -32,6 +25,13 @@ from dyngs.ops.rasterization import (
     TileEntries,
     bin_tiles,
     rasterize,
+)
+from dyngs.ops.registration import (
+    LARGEST_COUNT,
+    check_choice,
+    check_count,
+    check_finite,
+    check_tensors,
 )
 
 GSPLAT_ALPHA_MAX = 0.999

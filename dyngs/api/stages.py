@@ -20,9 +20,8 @@ from dyngs.models.views import training_times
 from dyngs.runs.capture_record import changed_files, named
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
-from dyngs.training.extend import told, with_length
 from dyngs.training.limits import most_gaussians, within_cap
-from dyngs.training.plan import Limits, RunPlan, Stage, with_steps
+from dyngs.training.plan import Limits, RunPlan, Stage, told, with_length, with_steps
 from dyngs.training.processes import Processes
 
 

@@ -26,7 +26,7 @@ from dyngs.api.stages import (
     set_limits,
     share_views,
 )
-from dyngs.compress.floaters import remove_floaters
+from dyngs.compress.clean import remove_floaters
 from dyngs.compress.stage import prune_stage
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
@@ -112,7 +112,7 @@ def train(
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose
             ``train.steps`` may be changed: the run then goes on to so many, on their schedules
-                (``dyngs.training.extend``).
+                (``dyngs.training.plan``).
         resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning
             where it was stopped before its first: the result has the same bytes as if the run had
                 never stopped.

@@ -16,7 +16,7 @@ from dyngs.data.images.video import colour_notes
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
 from dyngs.io.containment import check_size, images_up_to, inside, staying_within
-from dyngs.io.wrong_place import VIDEO_SUFFIXES
+from dyngs.io.outputs import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
 """``Capture.format`` of what is read here."""

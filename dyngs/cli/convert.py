@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Convert the file, and print how much that changes what it shows."""
     from dataclasses import replace
 
-    from dyngs.export.redrawn import compare_splats
+    from dyngs.export.images import compare_splats
     from dyngs.io.formats.formats import (
         chosen_variant,
         format_of,

@@ -237,7 +237,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _inspect_videos(arguments: argparse.Namespace) -> int:
-    from dyngs.capture.inspection.video_report import video_report
+    from dyngs.capture.inspection.report import video_report
     from dyngs.io.containment import images_up_to
 
     if arguments.image is not None:

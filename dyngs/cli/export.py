@@ -278,7 +278,7 @@ def _export_splats(
 ) -> list[Path]:
     """Write a sequence if several times of a moving scene are requested, else one file; return the
     paths."""
-    from dyngs.export.redrawn import compare_run
+    from dyngs.export.images import compare_run
     from dyngs.export.splat_files import (
         scene_part,
         write_run_levels,
@@ -353,7 +353,7 @@ def _export_moving(
     arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]
 ) -> list[Path]:
     """Write all times as one file of moving Gaussians."""
-    from dyngs.export.redrawn import compare_run
+    from dyngs.export.images import compare_run
     from dyngs.export.splat_files import (
         SUFFIX,
         UP,
@@ -457,7 +457,7 @@ def _export_network(arguments: argparse.Namespace) -> int:
 
 def _export_bodies(arguments: argparse.Namespace) -> int:
     """Write a moving scene with its bodies as animated nodes."""
-    from dyngs.export.redrawn import compare_run
+    from dyngs.export.images import compare_run
     from dyngs.export.splat_files import write_bodies, writing_of
     from dyngs.io.formats.formats import format_named, read_splats
 
@@ -590,7 +590,7 @@ def _export_page(arguments: argparse.Namespace) -> int:
 def _export_cameras(arguments: argparse.Namespace) -> int:
     """Write the cameras of a run as a transforms.json, refined where training refined them."""
     from dyngs.data.capture import all_views
-    from dyngs.evaluate.refined_cameras import found_corrections
+    from dyngs.evaluate.report import found_corrections
     from dyngs.export.cameras import NAME, write_cameras
     from dyngs.runs.opened import open_run
 

@@ -11,7 +11,7 @@ from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import ProgressBar, print_notes
 from dyngs.core.errors import DyngsError, counted
-from dyngs.io.wrong_place import command_for
+from dyngs.io.outputs import command_for
 
 if TYPE_CHECKING:
     from dyngs.export.choose_path import PathOptions

@@ -11,7 +11,7 @@ from dyngs.cli.arguments import AXES
 from dyngs.cli.output import print_notes
 
 if TYPE_CHECKING:
-    from dyngs.export.redrawn import Redrawn
+    from dyngs.export.images import Redrawn
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
 """Names of ``dyngs.io.formats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not

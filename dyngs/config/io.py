@@ -37,8 +37,8 @@ from dyngs.config.schema import (
 from dyngs.config.yaml_reader import Leaf, read_file, read_override
 from dyngs.core.errors import DyngsError, as_word, printable, reading, require_name
 from dyngs.io.containment import follows_links_of_runs
+from dyngs.io.outputs import command_for
 from dyngs.io.write import write_text
-from dyngs.io.wrong_place import command_for
 
 RESOLVED_NAME = "config.yaml"
 """Name of the resolved configuration inside a run folder."""

@@ -1,7 +1,8 @@
-"""Read a capture of any format: recognise the format, read it, finish its splits and times."""
+"""Sets of people: folders that hold a capture of a person in each of their folders."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
@@ -22,8 +23,9 @@ from dyngs.data.capture import (
     all_views,
     each_view,
 )
+from dyngs.data.geometry import match_size
 from dyngs.data.images.frame_cache import decode_frames
-from dyngs.data.images.images import read_header
+from dyngs.data.images.images import header_if_readable, read_header, target_size
 from dyngs.data.images.lens import wide_pinhole
 from dyngs.data.readers import (
     blender,
@@ -37,10 +39,95 @@ from dyngs.data.readers import (
     zju_mocap,
 )
 from dyngs.data.scene_space import normalise_capture
-from dyngs.data.smaller_images import with_smaller_images
 from dyngs.io.archive import is_archive, unpacked
 from dyngs.io.containment import images_up_to, inside, staying_within
-from dyngs.io.wrong_place import command_for
+from dyngs.io.find import FileFinder, shrunk_folders
+from dyngs.io.outputs import command_for
+
+PEOPLE_FILE = "people.json"
+"""In a set whose people lie in shards, folders of folders: the options that they were made with."""
+
+
+def captures_in(data: DataConfig) -> list[DataConfig]:
+    """Return the paths of the captures in the folders of ``data.root``, or of its shards, by name.
+    No capture is read.
+
+    Raises DyngsError: there are none.
+    """
+    root = data.root
+    shards = _folders(root) if (root / PEOPLE_FILE).is_file() else [root]
+    people = [person for shard in shards for person in _folders(shard)]
+    if not people:
+        raise DyngsError(
+            f"{root}: holds no folders; give one that holds a capture of a person in each of its folders"
+        )
+    return [data.model_copy(update={"root": folder}) for folder in people]
+
+
+def _folders(root: Path) -> list[Path]:
+    return (
+        sorted(f for f in root.iterdir() if f.is_dir() and not f.name.startswith("."))
+        if root.is_dir()
+        else []
+    )
+
+
+def view_size(view: View, options: DataConfig) -> tuple[int, int]:
+    """Return the (width, height) of a view in training."""
+    return target_size(
+        view.width, view.height, options.downscale / view.shrunk, options.longest_side
+    )
+
+
+def with_smaller_images(
+    root: Path, splits: Splits, options: DataConfig
+) -> tuple[Splits, list[str]]:
+    """Return views of the smallest copies that are large enough for training, and a line on what is
+    read.
+
+    Copies are not read where an image has no copy or has a mask or depth map, which have its size.
+    """
+    images = root / "images"
+    copies = shrunk_folders(images)
+    views = [view for view in all_views(splits) if view.image_path.is_relative_to(images)]
+    if not copies or not views:
+        return splits, []
+    factor = min(max(view.width, view.height) / max(view_size(view, options)) for view in views)
+    number = max((number for number in copies if number <= factor), default=min(copies))
+    finder = FileFinder(copies[number])
+    small: dict[str, View] = {}
+    for view in views if number <= factor else ():
+        copy = _shrunk(view, finder.find(os.path.relpath(view.image_path, images)), number)
+        if copy is not None:
+            small[view.name] = copy
+    if len(small) < len(views):
+        names = ", ".join(copies[key].name for key in sorted(copies))
+        conditions = "if each image has its copy, and none a mask or a depth map"
+        return splits, [
+            f"{names}: not read; data.downscale={number} reads {copies[number].name} {conditions}"
+        ]
+    line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
+    return each_view(splits, lambda view: small.get(view.name, view)), [line]
+
+
+def _shrunk(view: View, path: Path, factor: int) -> View | None:
+    """Return the view with a copy of its image, ``factor`` times smaller; None if that cannot
+    be."""
+    if view.mask_path or view.silhouette or view.depth_path or view.motion_mask_path:
+        return None
+    header = header_if_readable(path)
+    described = (view.width, view.height)
+    stored = (0, 0) if header is None else header.size_for(described)
+    if any(
+        abs(factor * small - large) >= factor
+        for small, large in zip(stored, described, strict=True)
+    ):
+        return None
+    intrinsics, size, _ = match_size(view.intrinsics, described, stored, str(path))
+    return replace(
+        view, image_path=path, intrinsics=intrinsics, width=size[0], height=size[1], shrunk=factor
+    )
+
 
 # points with larger coordinates are dropped as mistakes; their squares would not fit into float32
 FARTHEST = 1e18

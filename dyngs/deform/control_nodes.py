@@ -34,7 +34,7 @@ from dyngs.deform.field import (
 )
 from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.nodes import SPAN, cubic_fractions, node_penalties, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.ops.skinning import blend_skinning

@@ -18,7 +18,7 @@ from dyngs.core.initialisation import glorot
 from dyngs.core.state import State, moved_to, part_of, prefixed
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.skinning import add_offsets_, offset_gradients

@@ -18,7 +18,7 @@ from dyngs.deform.free import FreePrimitives
 from dyngs.deform.keys import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
 from dyngs.deform.networks import Hexplane, Mlp
 from dyngs.gaussians import TopologyEdit
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 
 EDGE = 0.05  # Time over which the logit falls by 1 outside of a window, in units of the clip

@@ -21,7 +21,7 @@ from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.fixed_cameras.start import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 
 SHORTEST = 0.25  # Least span, in gaps between times: less would flicker between them
 SHIFT = 0.5  # Spans by which a new Gaussian is earlier or later than the one it descends from

@@ -18,7 +18,7 @@ from dyngs.deform.field import (
     split_heads,
 )
 from dyngs.deform.keys import HexplaneField, MlpField
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
 WEIGHTS = (1e-4, 0.01, 1e-4)

@@ -1,4 +1,4 @@
-"""Measures a finished run on held-out views and writes the report next to it."""
+"""Cameras of a capture as a run has refined them."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, reading
 from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.data.tracks import read_true_tracks
-from dyngs.evaluate.refined_cameras import found_corrections
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import (
     REGION_METRICS,
@@ -39,7 +38,7 @@ from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.io.write import write_text
-from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of
 from dyngs.models.kind import Moves, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
@@ -48,12 +47,33 @@ from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
     LoadedRun,
+    checkpoint_paths,
     has_only_scene_file,
+    latest_checkpoint,
     load_run,
 )
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
-from dyngs.training.corrections.camera_refinement import fitted_to_image
+from dyngs.training.corrections.camera_refinement import (
+    CameraCorrections,
+    CameraRefinement,
+    fitted_to_image,
+)
+
+
+def found_corrections(
+    run_dir: Path, run: LoadedRun, trained_on: Sequence[View]
+) -> CameraCorrections | None:
+    """Return the corrections of a run's cameras; None where it refined none, or has no
+    checkpoint."""
+    if run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
+        return None
+    checkpoint = latest_checkpoint(run_dir)
+    refinement = CameraRefinement(trained_on, run.info.extent, run.config.train.steps)
+    with reading(checkpoint.name, OTHER_CONFIG):
+        refinement.load_state(checkpoint.part("cameras"))
+    return refinement.corrections
+
 
 MOST_BY_BACKGROUND = 1.0
 """Largest difference of PSNR between white and black, dB, that is not warned of."""

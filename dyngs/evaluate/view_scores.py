@@ -30,7 +30,7 @@ from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.colour.network import fitted_affine, recoloured
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour

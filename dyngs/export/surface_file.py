@@ -24,7 +24,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file
-from dyngs.models.surface import Surface
+from dyngs.models.renderable import Surface
 from dyngs.models.views import training_cameras
 from dyngs.ops.patches import MOST_SEGMENTS
 from dyngs.runs.inputs import inputs_of

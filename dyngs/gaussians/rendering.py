@@ -22,10 +22,10 @@ from dyngs.models.renderable import (
     check_views,
     near_plane,
 )
-from dyngs.ops.checks import check_choice, check_count, check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import Blended, BlendOptions, Tally, blend_and_tally, rasterize, tally
+from dyngs.ops.registration import check_choice, check_count, check_finite, finite_rows
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
 """Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour

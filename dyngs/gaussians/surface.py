@@ -13,7 +13,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.surface import Surface
+from dyngs.models.renderable import Surface
 
 BEHIND = 3.0  # Cells behind a surface that still count as seen
 AT_ONCE = 1 << 21  # Points of the grid that are looked at together

@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
+from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.state import State
 from dyngs.data.loader import Image
@@ -158,4 +159,55 @@ class Loss:
 
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
         """Return differentiable scalars, weighted, by name."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """A training image next to its rendering, before the loss.
+
+    Attributes:
+        index: of the training view.
+        rendered: (H, W, 3) that is compared with the image.
+        draw: renders the scene from cameras at a time, with expected depth.
+        trains_on: returns whether a training view is trained on in this step.
+    """
+
+    index: int
+    step: int
+    image: Image
+    rendering: Rendering
+    rendered: Tensor
+    background: Tensor
+    draw: Callable[[Cameras, float | None], Rendering]
+    trains_on: Callable[[int], bool]
+
+
+class Correction:
+    """What is learned of single images next to the scene.
+
+    Attributes:
+        name: of its part in a checkpoint.
+    """
+
+    name: str
+
+    def before_render(self, image: Image) -> Image:
+        """Return the image whose camera the scene is rendered from."""
+        return image
+
+    def after_render(self, view: RenderedView) -> RenderedView:
+        """Return the view with the image and the rendering that the loss compares."""
+        return view
+
+    def after_backward(self, index: int, step: int, image: Image) -> Count:
+        """Update what is learned of an image; return the number of rows with bad gradients."""
+        return 0
+
+    def state(self) -> dict[str, Tensor]:
+        """Return what a checkpoint stores."""
+        raise NotImplementedError
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what ``state`` returned. Raises KeyError, or ValueError for other images."""
         raise NotImplementedError

@@ -1,10 +1,4 @@
-"""Networks that predict scenes from a few images: what each of them is, in training and at work.
-
-A kind of network (``dyngs.models.kind.Predicts``) makes its ``Learner``, and its ``Predictor`` for
-one capture. One trainer (``dyngs.training.prediction``) and one command (``dyngs.api.predict``)
-serve all kinds.
-What is predicted is any ``Renderable``: Gaussians, an avatar, a field.
-"""
+"""Parts that convolutional networks of several kinds share."""
 
 from __future__ import annotations
 
@@ -29,6 +23,40 @@ from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, sent
 from dyngs.ops.loss import l1_ssim_loss
+
+GROUPS = 8
+"""Groups of channels that are normalised together (Wu and He 2018)."""
+
+
+class ResidualBlock(nn.Module):
+    """Residual block of two convolutions (B, ``width``, H, W), normalised before each (He et al.
+    2016)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            *(nn.GroupNorm(GROUPS, width), nn.SiLU(), nn.Conv2d(width, width, 3, padding=1)),
+            *(nn.GroupNorm(GROUPS, width), nn.SiLU(), nn.Conv2d(width, width, 3, padding=1)),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        return features + self.layers(features)
+
+
+def upsampled(features: Tensor) -> Tensor:
+    """Return features (B, C, H, W) at twice the resolution, bilinear."""
+    return nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
+
+
+def begin_weights(network: nn.Module, generator: torch.Generator) -> None:
+    """Draw the weights of all convolutions (He et al. 2015) from ``generator``, on the CPU; biases
+    are 0."""
+    for layer in network.modules():
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+
 
 N = TypeVar("N", bound=nn.Module)
 P = TypeVar("P")

@@ -1,4 +1,4 @@
-"""What can be drawn from anywhere at any time, whatever it is made of."""
+"""The surface of a scene as flat triangles, as other programs read it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,17 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, fields_moved_to
 from dyngs.data.capture import Capture, Split
-from dyngs.ops.checks import check_choice, check_finite, check_number
+from dyngs.ops.registration import check_choice, check_finite, check_number
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles with colours, in the world of the scene."""
+
+    vertices: np.ndarray  # (V, 3)
+    faces: np.ndarray  # (F, 3) int; anticlockwise from outside where there is an outside
+    colours: np.ndarray  # (V, 3) in [0, 1], seen from straight ahead
+
 
 R = TypeVar("R", bound="Renderable")
 T = TypeVar("T")

@@ -12,7 +12,7 @@ from dyngs.core.camera import Cameras
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import scaled_intrinsics
 from dyngs.data.loader import Image
-from dyngs.data.smaller_images import view_size
+from dyngs.data.read import view_size
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
 OPAQUE = 0.99  # Alpha from which a pixel shows no background

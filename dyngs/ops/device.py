@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_choice
 from dyngs.ops.native import core, cuda_core, has_cuda_core
+from dyngs.ops.registration import check_choice
 
 CPU = torch.device("cpu")
 CHOICES = ("auto", "cpu", "cuda")

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, differentiable, empty_like, launch
+from dyngs.ops.registration import Backward, check_tensors, differentiable, empty_like, launch
 
 WIDTHS = 1, 2, 4, 8  # Features of a level that there are kernels for
 

@@ -19,9 +19,17 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_number, check_size, check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, differentiable, empty_like, launch, register
+from dyngs.ops.registration import (
+    Backward,
+    check_number,
+    check_size,
+    check_tensors,
+    differentiable,
+    empty_like,
+    launch,
+    register,
+)
 
 NUM_POINTS = 6  # of a quadratic patch
 SEGMENTS = 6  # Of an edge: 36 flat faces (Wu et al. 2025)

@@ -16,9 +16,15 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import core_for, num_threads
-from dyngs.ops.registration import Backward, differentiable, empty_like, has_kernel, launch
+from dyngs.ops.registration import (
+    Backward,
+    check_tensors,
+    differentiable,
+    empty_like,
+    has_kernel,
+    launch,
+)
 
 KEPT_BYTES = 2**30
 """The backward pass computes activations again where keeping them would take more memory than this,

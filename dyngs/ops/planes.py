@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, empty_like, launch, register
+from dyngs.ops.registration import Gradient, check_tensors, empty_like, launch, register
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, differentiable, launch
+from dyngs.ops.registration import Backward, check_tensors, differentiable, launch
 
 _KEPT = 12  # numbers per Gaussian that the forward pass keeps for the backward pass
 

@@ -9,9 +9,18 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.ops.checks import check_memory, check_near_and_far, check_number, check_size
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, Struct, differentiable, empty_like, launch
+from dyngs.ops.registration import (
+    Backward,
+    Struct,
+    check_memory,
+    check_near_and_far,
+    check_number,
+    check_size,
+    differentiable,
+    empty_like,
+    launch,
+)
 
 
 @dataclass(frozen=True)

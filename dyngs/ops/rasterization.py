@@ -15,12 +15,15 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import REMEDY, check_memory, check_number, check_size
 from dyngs.ops.native import num_threads
 from dyngs.ops.projection import Projection
 from dyngs.ops.registration import (
+    REMEDY,
     Backward,
     Struct,
+    check_memory,
+    check_number,
+    check_size,
     differentiable,
     empty_like,
     launch,

@@ -15,9 +15,15 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, differentiable, empty_like, launch, register
+from dyngs.ops.registration import (
+    Backward,
+    check_tensors,
+    differentiable,
+    empty_like,
+    launch,
+    register,
+)
 
 TRANSMITTANCE_MIN = 1e-4  # A ray ends when less than this is left (Müller et al. 2022)
 

@@ -13,9 +13,15 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, InPlace, differentiable, launch, register
+from dyngs.ops.registration import (
+    Backward,
+    InPlace,
+    check_tensors,
+    differentiable,
+    launch,
+    register,
+)
 
 
 def _skinning(

@@ -17,7 +17,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import camera_center
-from dyngs.data.people_set import captures_in
+from dyngs.data.read import captures_in
 from dyngs.io.fields import read_limited
 from dyngs.io.write import write_text
 

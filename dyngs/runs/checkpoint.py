@@ -19,8 +19,8 @@ import torch
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, as_word, reading
-from dyngs.gaussians.restored import restored_model
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
+from dyngs.gaussians.static_training import restored_model
 from dyngs.io.fields import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text

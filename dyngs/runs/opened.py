@@ -24,7 +24,7 @@ from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
 from dyngs.io.formats.splat_file import Nonfinite
-from dyngs.io.wrong_place import command_for
+from dyngs.io.outputs import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.kind import HasBody, capability
 from dyngs.models.renderable import Posable, Renderable

@@ -25,8 +25,7 @@ from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
+from dyngs.data.read import captures_in, read_capture
 from dyngs.human.predict.gps.rectification import angle, around
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text

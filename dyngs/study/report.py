@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dyngs.core.errors import escaped, printable
-from dyngs.export.html.template import filled, script_safe, source_hash
+from dyngs.export.html.page import filled, script_safe, source_hash
 from dyngs.io.write import atomic_file, write_text
 from dyngs.study.measure import TRUTH, Measurement
 from dyngs.study.sweep import ExchangeRate, Row, pareto_mask

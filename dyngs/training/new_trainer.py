@@ -11,8 +11,7 @@ from dyngs.capture.inspection.problems import before_training
 from dyngs.config import Config, ModelSection, PointsInit, RandomInit
 from dyngs.core.errors import DyngsError, reading, warn
 from dyngs.data.capture import Capture
-from dyngs.data.decoding import usual_threads
-from dyngs.data.loader import ImageLoader
+from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced

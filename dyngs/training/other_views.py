@@ -16,7 +16,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.colour.affine import SATURATED
+from dyngs.gaussians.colour.network import SATURATED
 from dyngs.models.renderable import Rendering
 
 CELLS = 40  # Cells along the longest side of an image

@@ -9,10 +9,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from dyngs.config import Config
+from dyngs.config import Config, TrainConfig
+from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture
-from dyngs.gaussians.schedule import Rates, rates_of
+from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
 from dyngs.gaussians.start import FirstGaussians
+from dyngs.models.kind import ExtendsTo, HasGaussians, capability
+from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
+from dyngs.training.corrections.exposure import WARM_UP
 
 
 @dataclass(frozen=True)
@@ -62,3 +66,67 @@ Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
 def with_steps(config: Config, steps: int) -> Config:
     """Return ``config`` with another ``train.steps``, which all schedules follow."""
     return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
+
+
+def with_length(config: Config, done: int, steps: int) -> Config:
+    """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no
+    limit of time holds.
+
+    Raises:
+        DyngsError: so many steps are done already, the run was pruned, or its motion began too
+            early for that length.
+    """
+    length = Length(done, config.train.steps, steps)
+    if done > length.was:
+        raise DyngsError(
+            f"train.steps={steps}: the run was pruned after step {length.was:,}, so its training cannot be made "
+            "longer; go on with the run before that, and prune again"
+        )
+    if steps <= done:
+        raise DyngsError(
+            f"train.steps={steps}: {counted(done, 'step')} are done already; give more than that"
+        )
+    _require_exposures_stay(config, length)
+    changed: dict[str, object] = {"train": _train(config.train, length)}
+    extends = capability(config.model, ExtendsTo)
+    if extends is not None:
+        changed["model"] = extends.extended(config.model, length)
+    return config.model_copy(update=changed)
+
+
+def _require_exposures_stay(config: Config, length: Length) -> None:
+    begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
+    if config.train.exposure == "always" and begun < length.done <= begins:
+        raise DyngsError(
+            f"train.steps={length.steps}: exposures were learned after {begun:,} steps, and a run of {length.steps:,} "
+            f"begins with that after {begins:,}; train anew with so many steps"
+        )
+
+
+def told(before: Config, after: Config, done: int) -> str:
+    """Return the line that says how a run goes on after ``done`` steps."""
+    was = before.train.steps
+    steps = after.train.steps
+    line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {counted(steps, 'step')}"
+    if capability(after.model, HasGaussians) is None:
+        return line
+    then, now = (
+        means_rate(learning_rates(c), rates_of(c).progress(done), 1.0) for c in (before, after)
+    )
+    stop = scaled(after.strategy.stop, steps)
+    grows = after.strategy.growth_limit > 0 and stop > done + 1
+    line += f": the learning rate of positions is {now / then:.3g} times what it was, "
+    line += f"Gaussians are added up to step {stop:,}" if grows else "no more Gaussians are added"
+    return line + ("" if before.train.minutes is None else "; train.minutes holds no longer")
+
+
+def _train(options: TrainConfig, length: Length) -> TrainConfig:
+    changed: dict[str, object] = {"steps": length.steps, "minutes": None}
+    full_at = max(options.resolution_grows_from, options.resolution_full_at)
+    if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
+        changed["resolution_grows_from"] = length.kept(options.resolution_grows_from * length.was)
+        changed["resolution_full_at"] = length.kept(full_at * length.was)
+    if length.steps > length.was:
+        pace = scaled(options.sh_every, length.was)
+        changed["sh_every"] = max(1, pace * PUBLISHED_STEPS // length.steps)
+    return options.model_copy(update=changed)

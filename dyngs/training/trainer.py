@@ -21,8 +21,7 @@ from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
-from dyngs.models.correction import Correction, RenderedView
-from dyngs.models.model import Look, Loss, Model
+from dyngs.models.model import Correction, Look, Loss, Model, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour

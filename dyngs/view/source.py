@@ -15,10 +15,9 @@ from dyngs.api.predict import network_config, predict, require_network
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.errors import DyngsError
-from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
+from dyngs.data.read import captures_in, read_capture
 from dyngs.io.formats.formats import format_to_read
-from dyngs.io.wrong_place import command_for
+from dyngs.io.outputs import command_for
 from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths

@@ -21,8 +21,7 @@ from dyngs.models.views import background_colour
 from dyngs.runs.opened import Captured, Opened
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.gate import free_port
-from dyngs.view.server import Serving, Viewer, require_viser
+from dyngs.view.server import Serving, Viewer, free_port, require_viser
 from dyngs.view.session import Drawer
 from dyngs.view.source import Source
 from dyngs.view.views import captured_views

@@ -15,8 +15,7 @@ from tiny_captures import write_colmap
 
 from dyngs.cli import main
 from dyngs.config import DataConfig
-from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
+from dyngs.data.read import captures_in, read_capture
 from dyngs.human.avatar import pose_fit
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from dyngs.api.train import train
-from dyngs.compress import floaters as module
-from dyngs.compress.floaters import floaters
+from dyngs.compress import clean as module
+from dyngs.compress.clean import floaters
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras

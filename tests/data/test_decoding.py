@@ -5,7 +5,7 @@ from __future__ import annotations
 from threading import Event
 from threading import enumerate as enumerate_threads
 
-from dyngs.data.decoding import Ahead
+from dyngs.data.loader import Ahead
 
 
 def test_what_is_expected_is_ready_once() -> None:

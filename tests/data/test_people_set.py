@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.config import DataConfig
-from dyngs.data.people_set import PEOPLE_FILE, captures_in
+from dyngs.data.read import PEOPLE_FILE, captures_in
 
 
 def found(root: Path) -> list[str]:

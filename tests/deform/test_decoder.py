@@ -11,7 +11,7 @@ from tiny_fields import HEADS
 
 from dyngs.deform.field import Decoder, head_sizes, split_heads
 from dyngs.deform.keys import FieldSection
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 
 SIZES = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "colors": 3}
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.training import PX_PER_OPACITY, bake_, measure_motion
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from dyngs.export import sog_levels
-from dyngs.export.sog_levels import write_sog_levels
+from dyngs.export import splat_files
+from dyngs.export.splat_files import write_sog_levels
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import levels_of
 from dyngs.io.formats.formats import SOG_INDEX, read_splats
@@ -45,8 +45,8 @@ def leaves(node: dict[str, Any]) -> list[dict[str, Any]]:
 def test_leaves_are_alternatives_of_one_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sog_levels, "PER_LEAF", 4096)
-    monkeypatch.setattr(sog_levels, "PER_FILE", 8192)
+    monkeypatch.setattr(splat_files, "PER_LEAF", 4096)
+    monkeypatch.setattr(splat_files, "PER_FILE", 8192)
     splat = scene()
     counts = write_sog_levels(tmp_path / "town", splat)
     index = json.loads((tmp_path / "town" / SOG_INDEX).read_text(encoding="utf-8"))

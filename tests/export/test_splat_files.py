@@ -35,7 +35,7 @@ from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
 from dyngs.export import splat_files
 from dyngs.export.cameras import NAME, write_cameras
-from dyngs.export.redrawn import compare_run, compare_splats
+from dyngs.export.images import compare_run, compare_splats
 from dyngs.export.splat_files import (
     Part,
     Writing,

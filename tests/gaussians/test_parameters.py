@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.core.state import Role, tensors_of
 from dyngs.gaussians import TopologyEdit
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 
 RATES = {"weight": 1e-2, "bias": 3e-3, "planes": 2e-2}
 SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}

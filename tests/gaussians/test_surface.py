@@ -19,7 +19,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.surface import Mesh, fused, largest_pieces, num_holes, opaque_box, surface_of
 from dyngs.io.formats.similarity import Similarity
-from dyngs.models.surface import Surface
+from dyngs.models.renderable import Surface
 
 COUNT = 3000
 BOX = LOW, HIGH

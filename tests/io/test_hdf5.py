@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.hdf5 import hdf5_length, read_hdf5
+from dyngs.io.numpy_files import hdf5_length, read_hdf5
 
 
 @pytest.fixture

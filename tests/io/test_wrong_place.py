@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.io.wrong_place import command_for
+from dyngs.io.outputs import command_for
 
 
 @pytest.fixture

@@ -20,15 +20,15 @@ import dyngs
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.ops.checks import (
+from dyngs.ops.native import core
+from dyngs.ops.projection import Projection, ProjectionOptions, project
+from dyngs.ops.rasterization import BlendOptions, Tally, bin_tiles, rasterize, tally
+from dyngs.ops.registration import (
     MAX_SIDE,
     check_finite,
     check_size,
     finite_rows,
 )
-from dyngs.ops.native import core
-from dyngs.ops.projection import Projection, ProjectionOptions, project
-from dyngs.ops.rasterization import BlendOptions, Tally, bin_tiles, rasterize, tally
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -13,9 +13,8 @@ from torch import Tensor
 from torch._C import DispatchKey, DispatchKeySet
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features
-from dyngs.ops.registration import Gradient, has_kernel, implement, register
+from dyngs.ops.registration import Gradient, count_nonfinite_op, has_kernel, implement, register
 from dyngs.ops.skinning import blend_skinning
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -13,8 +13,7 @@ from tiny_stereo import PEOPLE, stereo_config, stereo_people
 from dyngs.api.train import train
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
+from dyngs.data.read import captures_in, read_capture
 from dyngs.human.predict.gps.rectification import angle
 from dyngs.study.people import PeopleBench, compare_people, task_of
 

@@ -16,7 +16,7 @@ from dyngs.core.section import ModelSection
 from dyngs.core.state import Role, State, StateTensor, prefixed
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
-from dyngs.gaussians.parameters import AdamState
+from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import ModelKind, RunStart
 from dyngs.models.model import Drawn, Model, Updated

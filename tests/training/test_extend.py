@@ -32,7 +32,7 @@ from dyngs.human.synthetic.capture import write_human_capture
 from dyngs.models.schedule import image_divisor
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.training.extend import told, with_length
+from dyngs.training.plan import told, with_length
 from dyngs.training.trainer import StepReport, Trainer
 
 ALL_KINDS = ("default", "mcmc", "control_nodes", "human")

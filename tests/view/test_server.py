@@ -25,16 +25,20 @@ from view_sessions import balls
 from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import ssim
-from dyngs.view.gate import (
+from dyngs.view.server import (
     COOKIE,
+    Browsing,
     Gate,
+    Serving,
+    Viewer,
+    as_text,
     free_port,
     gate_for,
     guarded,
     is_loopback,
     link_to,
+    quiet,
 )
-from dyngs.view.server import Browsing, Serving, Viewer, as_text, quiet
 from dyngs.view.session import Keyframe, Pace, Recording
 from dyngs.view.source import open_source
 

@@ -25,11 +25,11 @@ from dyngs.models.renderable import (
     DrawOptions,
     Renderable,
     Rendering,
+    Surface,
     TimeStep,
     composited,
     fixed_cameras,
 )
-from dyngs.models.surface import Surface
 from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Space
 

@@ -22,7 +22,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, moved_to, prefixed, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
-from dyngs.gaussians.parameters import AdamState
+from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Look, Loss, Model, Updated

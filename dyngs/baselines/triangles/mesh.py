@@ -6,7 +6,7 @@ import torch
 
 from dyngs.baselines.triangles.patches import evaluated
 from dyngs.baselines.triangles.scene import TriangleScene
-from dyngs.models.surface import Surface
+from dyngs.models.renderable import Surface
 from dyngs.ops.patches import MOST_SEGMENTS, SEGMENTS, lattice
 
 

@@ -24,7 +24,7 @@ from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError, counted
 from dyngs.core.state import State, prefixed
 from dyngs.data.loader import Image
-from dyngs.gaussians.parameters import AdamState
+from dyngs.gaussians.optimizer import AdamState
 from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart

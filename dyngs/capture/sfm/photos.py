@@ -29,8 +29,8 @@ from dyngs.data.images.images import (
 )
 from dyngs.data.images.video import DECODER_VERSION, VIDEO_SUFFIXES
 from dyngs.io.containment import check_size, inside
+from dyngs.io.outputs import PHOTO_SUFFIXES
 from dyngs.io.write import atomic_file, write_image
-from dyngs.io.wrong_place import PHOTO_SUFFIXES
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 """What phones write; read by pillow-heif."""

@@ -17,9 +17,8 @@ from dyngs.core.errors import DyngsError, as_word, counted, reading, show
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
 from dyngs.io.lock import make_once
-from dyngs.io.outputs import note_sources
+from dyngs.io.outputs import command_for, note_sources
 from dyngs.io.write import cache_folder
-from dyngs.io.wrong_place import command_for
 
 FEWEST_PHOTOS = 3
 

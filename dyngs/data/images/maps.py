@@ -15,8 +15,7 @@ from dyngs.data.capture import Silhouette, View
 from dyngs.data.images.images import read_image, read_raw
 from dyngs.data.images.lens import LensMap, undistorted_points
 from dyngs.io.containment import check_size, inside
-from dyngs.io.hdf5 import read_hdf5
-from dyngs.io.numpy_files import read_map
+from dyngs.io.numpy_files import read_hdf5, read_map
 
 MILLIMETRE = 1e-3  # unit of maps in whole numbers, as in nerfstudio
 _FARTHEST = 1e9

@@ -18,7 +18,7 @@ from dyngs.core.errors import DyngsError, counted, reading, reason
 from dyngs.data.images.colour_space import BT2020, UNSPECIFIED, ColourTags, to_srgb
 from dyngs.data.images.images import files_in, rotated_upright
 from dyngs.io.containment import check_size
-from dyngs.io.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
+from dyngs.io.outputs import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 
 if TYPE_CHECKING:
     import av

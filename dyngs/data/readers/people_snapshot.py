@@ -18,7 +18,7 @@ from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.readers.camera_folders import open_camera, sequence_views, video_fps
 from dyngs.io.containment import inside
 from dyngs.io.fields import entry, numbers_of
-from dyngs.io.hdf5 import hdf5_length, read_hdf5
+from dyngs.io.numpy_files import hdf5_length, read_hdf5
 from dyngs.io.pickles import read_pickle
 
 CAMERA = "camera.pkl"

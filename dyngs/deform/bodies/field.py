@@ -17,7 +17,7 @@ from dyngs.core.state import Role, State, StateTensor, fields_moved_to, part_of,
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.harmonics import dimmed, light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate

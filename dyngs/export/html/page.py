@@ -1,10 +1,14 @@
-"""The page of a scene: one file with everything in it, which asks no host for anything, and the script
-that defines ``<dyngs-scene src="PAGE">``, which draws our pages and stands in those of others."""
+"""A page of a template: its places filled in, scripts and styles named by hash, values that cannot
+end a script.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +24,6 @@ from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
-from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.static_scene import StaticScene
@@ -31,6 +34,28 @@ from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
+
+
+def filled(page: str, pieces: Mapping[str, str]) -> str:
+    """Return ``page`` with each ``{{name}}`` replaced by the piece of that name; pieces are not
+    looked into."""
+    first, *rest = page.split("{{")
+    text = [first]
+    for part in rest:
+        name, after = part.split("}}", 1)
+        text += [pieces[name], after]
+    return "".join(text)
+
+
+def source_hash(text: str) -> str:
+    """Return how a Content-Security-Policy names an inline script or style."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def script_safe(value: Any) -> str:
+    """Return JSON that cannot end the script element it stands in."""
+    return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
+
 
 PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # in a folder for a web server
 # pixels of the first view that a place at its target may be off where motion is fitted

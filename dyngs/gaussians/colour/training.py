@@ -19,7 +19,7 @@ from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.rendering import RenderOptions, contributions, render
 from dyngs.ops.adam import Count
 from dyngs.ops.harmonics import evaluate_harmonics

@@ -9,9 +9,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.keys import HumanModel
-from dyngs.human.motion.feet import feet_kept, sole_points
 from dyngs.human.motion.motion import motion_clip
-from dyngs.human.motion.placement import place_like, up_direction
+from dyngs.human.motion.placement import feet_kept, place_like, sole_points, up_direction
 from dyngs.human.motion.retarget import read_motion
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.kind import InMotion

@@ -18,7 +18,7 @@ from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, fields_moved_to
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES, mirrored_joints

@@ -20,7 +20,7 @@ from dyngs.core.tensor_checks import (
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (

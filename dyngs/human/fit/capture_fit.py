@@ -25,7 +25,7 @@ from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar.posing import (
     BodyPose,

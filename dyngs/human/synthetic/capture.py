@@ -24,7 +24,7 @@ from torch import Tensor
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.maps import MILLIMETRE
-from dyngs.data.people_set import PEOPLE_FILE
+from dyngs.data.read import PEOPLE_FILE
 from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.human.body.body import BodyTemplate, apply_shape, posed_vertices

@@ -19,7 +19,7 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import logit
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, far_offset, similarity_of
-from dyngs.ops.checks import finite_rows
+from dyngs.ops.registration import finite_rows
 
 Nonfinite = Literal["error", "skip"]
 

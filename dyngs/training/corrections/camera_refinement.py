@@ -21,10 +21,10 @@ from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.gaussians.parameters import AdamState
+from dyngs.gaussians.optimizer import AdamState
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.correction import Correction
+from dyngs.models.model import Correction
 from dyngs.ops.adam import Count, adam_step_
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.quaternions import rotation_matrices

@@ -27,10 +27,9 @@ from dyngs.core.state import tensors_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import videos
-from dyngs.gaussians.colour.affine import SATURATED, recoloured
-from dyngs.gaussians.parameters import AdamState
-from dyngs.models.correction import Correction, RenderedView
-from dyngs.models.model import Look, Loss
+from dyngs.gaussians.colour.network import SATURATED, recoloured
+from dyngs.gaussians.optimizer import AdamState
+from dyngs.models.model import Correction, Look, Loss, RenderedView
 from dyngs.ops.adam import Count
 from dyngs.training.other_views import log_gains
 

@@ -24,7 +24,7 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.data.loader import ImageLoader
-from dyngs.models.correction import Correction, RenderedView
+from dyngs.models.model import Correction, RenderedView
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 
 # An image is looked at each so many times that it is trained on; in between its mask stays

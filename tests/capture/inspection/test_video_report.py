@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stage_videos import camera, corner, write_videos
 
-from dyngs.capture.inspection.video_report import video_facts, video_report
+from dyngs.capture.inspection.report import video_facts, video_report
 from dyngs.capture.sfm.several_videos import open_video
 from dyngs.cli import main
 from dyngs.export.video import VideoWriter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dyngs.data.images.exr_layers import beauty_pass, layers_of
+from dyngs.data.images.images import beauty_pass, layers_of
 
 
 def channels(layer: str, names: str = "RGBA") -> list[str]:

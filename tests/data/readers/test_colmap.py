@@ -12,8 +12,13 @@ from tiny_captures import opengl_pose, random_pixels, write_colmap, write_image
 from dyngs.api.load import read_capture
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.lens import distort
-from dyngs.data.readers.colmap import is_colmap, model_folders, pinhole_and_lens, read_colmap
-from dyngs.data.readers.colmap_model import ModelCamera
+from dyngs.data.readers.colmap import (
+    ModelCamera,
+    is_colmap,
+    model_folders,
+    pinhole_and_lens,
+    read_colmap,
+)
 
 MODELS = {
     "SIMPLE_PINHOLE": (10, 6, 4),

@@ -13,8 +13,7 @@ from tiny_captures import write_colmap
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.readers.colmap import read_colmap
-from dyngs.data.readers.colmap_model import EXTENSIONS, NUM_PARAMS, num_images, read_model
+from dyngs.data.readers.colmap import EXTENSIONS, NUM_PARAMS, num_images, read_colmap, read_model
 
 POINTS_2D = "1.5 2.5 -1 3 4 17"
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dyngs.data.readers.point_colours import GREY, point_colours
-from dyngs.data.readers.transforms import read_points
+from dyngs.data.readers.transforms import GREY, point_colours, read_points
 
 COLOURS = np.array([[255, 0, 51], [0, 204, 102], [12, 34, 56]], np.uint8)
 PACKED = COLOURS.astype(np.uint32) @ np.array([2**16, 2**8, 1], np.uint32)

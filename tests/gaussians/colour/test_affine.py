@@ -10,7 +10,7 @@ from flat_wall import BLACK, cameras_before_wall, seen_from
 from torch import Tensor
 
 from dyngs.data.loader import Image
-from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.colour.network import fitted_affine, recoloured
 from dyngs.models.renderable import Rendering
 
 WARM = torch.tensor([[1.2, 0.05, 0.0, 0.02], [0.0, 1.0, -0.03, -0.01], [0.02, 0.0, 0.8, 0.03]])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.optimizer import Parameters
 from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES

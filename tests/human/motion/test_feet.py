@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.human.motion.feet import feet_kept, foot_contact, sole_points
 from dyngs.human.motion.motion import MotionClip
+from dyngs.human.motion.placement import feet_kept, foot_contact, sole_points
 
 FPS = 30.0
 BODY = default_template()

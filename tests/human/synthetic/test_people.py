@@ -12,7 +12,7 @@ from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.data.people_set import captures_in
+from dyngs.data.read import captures_in
 from dyngs.data.tracks import read_true_tracks
 from dyngs.human.synthetic.capture import KEYPOINTS_FILE, NUM_KEYPOINTS, PeopleOptions, write_people
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.loader import Image
 from dyngs.deform.keys import DynamicModel
-from dyngs.models.correction import RenderedView
+from dyngs.models.model import RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.static_section import StaticModel
 from dyngs.training.corrections.robust import WARM_UP, RobustMasks

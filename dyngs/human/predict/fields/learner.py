@@ -13,7 +13,7 @@ from dyngs.core.conventions import ReportProgress
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import fields_moved_to
 from dyngs.data.loader import Image
-from dyngs.data.people_set import captures_in
+from dyngs.data.read import captures_in
 from dyngs.data.times import distinct_times
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template, read_body

@@ -18,7 +18,7 @@ from dyngs.core.initialisation import glorot
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.people import PosedBody, Sources
 from dyngs.human.predict.gps.stereo import Encoder
-from dyngs.models.convolution import begin_weights, upsampled
+from dyngs.models.prediction import begin_weights, upsampled
 from dyngs.ops.perceptron import Layer, perceptron
 
 FINE = 8

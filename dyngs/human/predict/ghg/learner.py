@@ -17,8 +17,7 @@ from dyngs.core.errors import DyngsError, reading
 from dyngs.core.state import fields_moved_to
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
+from dyngs.data.read import captures_in, read_capture
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.scene import GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import Rates

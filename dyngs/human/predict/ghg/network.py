@@ -37,7 +37,7 @@ from dyngs.human.body.mesh import interpolate, rasterize, vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.motion.motion import captured_motion
-from dyngs.models.convolution import ResidualBlock, begin_weights, upsampled
+from dyngs.models.prediction import ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import unit_quats
 
 

@@ -16,8 +16,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import fields_moved_to
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
+from dyngs.data.read import captures_in, read_capture
 from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate

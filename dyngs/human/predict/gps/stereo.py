@@ -30,7 +30,7 @@ from torch.nn.functional import (
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.predict.gps.rectification import RectifiedPair
-from dyngs.models.convolution import ResidualBlock, begin_weights, upsampled
+from dyngs.models.prediction import ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
 
 QUARTER = 4

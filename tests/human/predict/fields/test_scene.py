@@ -12,7 +12,7 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
-from dyngs.gaussians.restored import restored_model
+from dyngs.gaussians.static_training import restored_model
 from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
 from dyngs.human.predict.fields.keys import PredictedFieldModel
 from dyngs.human.predict.fields.people import Person, sources_of

@@ -23,8 +23,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.aim import look_at
 from dyngs.data.loader import ImageLoader
-from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
+from dyngs.data.read import captures_in, read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.predict.gps.learner import learner, predictor
