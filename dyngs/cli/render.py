@@ -11,7 +11,6 @@ from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import ProgressBar, print_notes
 from dyngs.core.errors import DyngsError, counted
-from dyngs.io.outputs import command_for
 
 if TYPE_CHECKING:
     from dyngs.export.choose_path import PathOptions
@@ -98,6 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for nothing to render, nowhere to write, or an option that does not
     apply."""
+    from dyngs.io.outputs import command_for
+
     args.require_motion_for_feet(arguments)
     arguments.source = args.run_of_scene_file(arguments.source)
     known = command_for(arguments.source)

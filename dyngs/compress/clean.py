@@ -1,11 +1,4 @@
-"""Floaters: Gaussians close before one camera that explain its image alone, and haze all views from
-next to it.
-
-A Gaussian that belongs to a surface contributes to the images of many cameras. One that hangs
-between a camera and the scene shows mostly there. It is cheap to tell: most of its blending weight,
-over all training views, lies in one of them, and it is much nearer to that camera than the scene
-usually is.
-"""
+"""Removal of floaters, faint and unseen Gaussians."""
 
 from __future__ import annotations
 

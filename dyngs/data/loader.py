@@ -1,4 +1,4 @@
-"""Images of views as they are kept in memory, and work on the next ones in background threads."""
+"""Images of views in memory, decoded ahead in background threads."""
 
 from __future__ import annotations
 

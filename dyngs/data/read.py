@@ -1,4 +1,4 @@
-"""Sets of people: folders that hold a capture of a person in each of their folders."""
+"""Reading of a capture or a set of people: choice of the format, splits, missing images, masks."""
 
 from __future__ import annotations
 

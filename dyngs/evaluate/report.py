@@ -1,4 +1,4 @@
-"""Cameras of a capture as a run has refined them."""
+"""Evaluation of a run on its splits, with cameras as the run has refined them."""
 
 from __future__ import annotations
 

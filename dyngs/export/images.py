@@ -1,6 +1,4 @@
-"""Images and videos of scenes: frames along a camera path, or the views of a split next to their
-ground truth.
-"""
+"""Rendered images, contact sheets, and the images of a capture drawn anew."""
 
 from __future__ import annotations
 

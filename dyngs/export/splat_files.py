@@ -1,11 +1,4 @@
-"""PlayCanvas' streamed ``.sog``: a folder of a still scene in levels of detail, of which viewers
-fetch what they see.
-
-``lod-meta.json`` (version 1) holds a tree of boxes; its leaves name, for each level, a file and a
-range of Gaussians in it. Files are ``.sog`` as folders: ``LEVEL_NUMBER/meta.json`` and images. The
-order of ``dyngs.gaussians.levels`` makes what a leaf shows consecutive at each level. Format:
-PlayCanvas, "The Streamed SOG Format", 2026.
-"""
+"""Scenes as files of Gaussians, one time or a clip, also as streamed .sog in levels of detail."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Named tensors trained by Adam, with their learning rates: fields, corrections of body fits,
-colour networks.
-"""
+"""Named tensors trained by Adam, and the optimiser of Gaussians with its schedules."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Training of a static scene: on every image, with its 3D filter kept up to date, and rid of what
-no image shows.
-"""
+"""Training of static scenes, and scenes restored from a checkpoint."""
 
 from __future__ import annotations
 

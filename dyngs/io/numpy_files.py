@@ -1,6 +1,4 @@
-"""Untrusted NumPy files, checked before memory is allocated: ``.npy`` arrays, arrays of ``.npz``
-archives.
-"""
+"""Reading of .npy, .npz and HDF5 files within limits; none of them can run code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a path is that was given where something else belongs, and the command that takes it."""
+"""Checks of output paths, and advice on paths that were given in the wrong place."""
 
 from __future__ import annotations
 

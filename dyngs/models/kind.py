@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 from dyngs.config.kinds import installed_kind
 from dyngs.core.conventions import ReportProgress
 from dyngs.core.errors import DyngsError
-from dyngs.core.section import ModelSection, SceneModel
+from dyngs.core.section import ModelSection, SceneModel, SceneModel
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -191,7 +191,7 @@ class HasBody(ModelKind):
         """
 
     @abstractmethod
-    def read_person(self, path: Path) -> tuple[ModelSection, Posable, CheckpointInfo]:
+    def read_person(self, path: Path) -> tuple[SceneModel, Posable, CheckpointInfo]:
         """Return the person of an avatar file, with its section and its metadata. Raises
         DyngsError."""
 

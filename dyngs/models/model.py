@@ -1,4 +1,4 @@
-"""What a trainer steps: a model that draws training images and is updated; terms of its loss."""
+"""Models that a trainer steps, their loss terms, and corrections of single images."""
 
 from __future__ import annotations
 

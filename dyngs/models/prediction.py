@@ -1,4 +1,4 @@
-"""Parts that convolutional networks of several kinds share."""
+"""Networks that predict scenes: their training, their use, and parts that several share."""
 
 from __future__ import annotations
 

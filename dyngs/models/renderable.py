@@ -1,4 +1,4 @@
-"""The surface of a scene as flat triangles, as other programs read it."""
+"""Scenes that can be rendered: their interface, renderings, and surfaces as flat triangles."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
-
-``register`` takes an implementation, whose type hints are the schema; ``differentiable`` takes that
-of the gradient, too. An implementation allocates its results and has them filled by ``launch``, which does
-nothing where only shapes are needed (``torch.compile``). The compiled cores for CPU and CUDA have
-the same functions, so that one implementation serves both. ``torch.library.custom_op`` would do the
-same, but imports ``torch._dynamo`` when the first op is made: 2 s.
-"""
+"""Registration of ops with torch, and checks of their tensors."""
 
 from __future__ import annotations
 

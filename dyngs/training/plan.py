@@ -1,7 +1,4 @@
-"""The plan of a run: what was requested, what was resolved, its schedule and its limits.
-
-A plan is made before the loop by stages, each of which returns a new plan and a message.
-"""
+"""The plan of a run before its first step, and plans of runs that go on to more steps."""
 
 from __future__ import annotations
 

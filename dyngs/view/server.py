@@ -1,4 +1,5 @@
-"""Who may open the viewer's page: this machine alone, or whoever has the token of the link."""
+"""The server of the viewer, and who may open its page: this machine alone, or holders of the
+token."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Report on videos without poses: what one wants to know before structure from motion, and the next
-command.
-"""
+"""Reports on captures and on videos without poses, with the next command."""
 
 from __future__ import annotations
 

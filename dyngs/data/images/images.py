@@ -1,4 +1,4 @@
-"""Choice of the beauty pass of an OpenEXR file, by the names of its parts and layers."""
+"""Reading of images: PNG, JPEG, EXR (with its parts and layers), TIFF, HEIC, WebP."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""The files of a COLMAP model, binary or text: cameras, poses of images, points; no observations.
-
-pycolmap is not used: it cuts names at spaces, refuses tracks of absent images, needs the second
-lines of images.txt, and trusts the counts in binary files: a truncated one can hang or abort the
-process.
-"""
+"""COLMAP models, binary or text: cameras, poses of images, points, masks; no observations."""
 
 from __future__ import annotations
 

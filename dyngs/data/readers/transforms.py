@@ -1,4 +1,4 @@
-"""Colours of point clouds, by the names and types that programs give to them in a .ply file."""
+"""Transforms files (Blender, nerfstudio, instant-ngp): frames, views, and coloured point clouds."""
 
 from __future__ import annotations
 

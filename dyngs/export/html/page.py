@@ -1,6 +1,4 @@
-"""A page of a template: its places filled in, scripts and styles named by hash, values that cannot
-end a script.
-"""
+"""Pages that show a scene in a browser: their parts, scripts and styles named by hash."""
 
 from __future__ import annotations
 

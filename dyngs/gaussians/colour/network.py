@@ -1,7 +1,4 @@
-"""Affine colours: what a camera's exposure and white balance make of the colours of a scene.
-
-Local letters: M (3, 4), a matrix next to an offset; colours c are shown as M[:, :3] c + M[:, 3].
-"""
+"""Colour networks, and affine colour changes by exposure and white balance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion clips moved to the size, place, floor and up direction of a captured person."""
+"""Motions moved to the size, place and floor of a person, with feet that stay on the floor."""
 
 from __future__ import annotations
 
