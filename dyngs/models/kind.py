@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 from dyngs.config.kinds import installed_kind
 from dyngs.core.conventions import ReportProgress
 from dyngs.core.errors import DyngsError
-from dyngs.core.section import ModelSection, SceneModel, SceneModel
+from dyngs.core.section import ModelSection, SceneModel
 
 if TYPE_CHECKING:
     from pathlib import Path
