@@ -47,9 +47,7 @@ REMOVED_KEYS: dict[str, object] = {
     "budget.min_fps": None,
     "colour.lr": 0.01,
     "model.cells": None,
-    "model.coarse": 64,
     "model.features": None,
-    "model.fine": 128,
     "model.finest": None,
     "model.levels": None,
     "model.log2_rows": None,
@@ -60,10 +58,8 @@ REMOVED_KEYS: dict[str, object] = {
     "model.lr_position_final": 2e-4,
     "model.near": 0.05,
     "model.num_first": 2000,
-    "model.rays": 1024,
     "model.texture_from": 0.7,
     "model.weight_decay": 1e-6,
-    "model.width": 256,
     "strategy.min_opacity": 0.005,
     "strategy.opacity_reg": 0.01,
     "strategy.scale_reg": 0.01,
@@ -87,6 +83,7 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
         "target_views": 2,
         "widths": [24, 32, 48, 64],
     },
+    "nerf": {"width": 128, "coarse": 32, "fine": 32, "rays": 256},  # sizes=cpu
     "gps": {"widths": [24, 40, 64], "depth_fraction": 0.4},
     "keypoint_nerf": {"features": 32, "width": 64, "patch": 32, "step": 0.015},
     "eg_human_nerf": {
@@ -197,7 +194,9 @@ def without_removed_keys(model: dict[str, object]) -> dict[str, object]:
     """Return the section ``model`` of an earlier version without the keys of
     ``REMOVED_MODEL_KEYS``."""
     removed = REMOVED_MODEL_KEYS.get(str(model.get("kind")), {})
-    return {key: x for key, x in model.items() if key not in removed or x != removed[key]}
+    return {
+        key: x for key, x in model.items() if key not in removed or not _is_same(x, removed[key])
+    }
 
 
 def save_config(config: Config, path: Path) -> None:
@@ -361,10 +360,15 @@ def _is_removed(keys: tuple[str, ...], section: type[BaseModel], written: object
     name = ".".join(keys)
     if keys[-1] in section.model_fields or name not in REMOVED_KEYS:
         return False
-    return (
-        as_written(written) == as_written(REMOVED_KEYS[name])
-        or _number(written) == REMOVED_KEYS[name]
-    )
+    return _is_same(written, REMOVED_KEYS[name])
+
+
+def _is_same(written: object, value: object) -> bool:
+    """Return whether a value of a file, as it is written there, is ``value``."""
+    if isinstance(value, list):
+        items = written if isinstance(written, list) else []
+        return len(items) == len(value) and all(map(_is_same, items, value))
+    return as_written(written) == as_written(value) or _number(written) == value
 
 
 def _number(written: object) -> float | None:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,7 +21,15 @@ from dyngs.config import (
     RunConfig,
     TrainConfig,
 )
-from dyngs.config.io import find_preset, load_config, load_resolved, packaged_preset, save_config
+from dyngs.config.io import (
+    REMOVED_MODEL_KEYS,
+    RESOLVED_NAME,
+    find_preset,
+    load_config,
+    load_resolved,
+    packaged_preset,
+    save_config,
+)
 from dyngs.config.yaml_reader import MAX_BYTES
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
@@ -339,3 +348,16 @@ def test_a_run_of_an_earlier_version_may_have_a_removed_key_that_had_no_effect(
         else:
             with pytest.raises(DyngsError, match=r"unknown key 'model\.loose'"):
                 load_resolved(tmp_path)
+
+
+@pytest.mark.parametrize("kind", REMOVED_MODEL_KEYS)
+def test_runs_of_earlier_versions_with_keys_of_one_kind_are_read(kind: str, tmp_path: Path) -> None:
+    model = {"kind": kind} | REMOVED_MODEL_KEYS[kind]
+    text = yaml.safe_dump({"data": {"root": "capture"}, "model": model})
+    (tmp_path / RESOLVED_NAME).write_text(text)
+    assert load_resolved(tmp_path).model.kind == kind
+    changed = next(key for key in REMOVED_MODEL_KEYS[kind])
+    text = yaml.safe_dump({"data": {"root": "capture"}, "model": model | {changed: 7}})
+    (tmp_path / RESOLVED_NAME).write_text(text)
+    with pytest.raises(DyngsError, match=f"unknown key 'model.{changed}'"):
+        load_resolved(tmp_path)
