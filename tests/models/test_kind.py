@@ -61,10 +61,13 @@ def test_our_own_kinds_are_entry_points_of_the_package() -> None:
 
 def dyngs_command(*words: str, plugin: bool) -> subprocess.CompletedProcess[str]:
     """Run a command in a new process, with or without the package."""
-    folders = [str(ROOT), *([str(FOLDER)] if plugin else [])]
+    tested = Path(dyngs.__file__).resolve().parents[1]  # not the source tree, which has no core
+    folders = [str(tested), *([str(FOLDER)] if plugin else [])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
     command = [sys.executable, "-m", "dyngs", *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, env=environment, cwd=FOLDER.parent, capture_output=True, text=True, check=False
+    )
 
 
 def test_a_run_needs_the_package_of_its_kind(capture: Path, tmp_path: Path) -> None:
