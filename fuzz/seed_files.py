@@ -22,8 +22,7 @@ from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.export.camera_paths import CameraPath, write_path
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.static_training import restored_scene
+from dyngs.gaussians.scene import GaussianScene, restored_scene
 from dyngs.human.avatar.avatar_file import _KIND as AVATAR_KIND
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.compress.measure import GREY_LEVELS, Precision, mean_square_change, storage_plan
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
-from dyngs.gaussians.static_training import restored_model
+from dyngs.models.checkpoint import restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config

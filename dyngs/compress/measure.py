@@ -18,9 +18,8 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import contributions
-from dyngs.gaussians.scene import GaussianScene, render_options
-from dyngs.gaussians.static_training import restored_model, restored_scene
-from dyngs.models.checkpoint import Checkpoint, read_capture_of
+from dyngs.gaussians.scene import GaussianScene, render_options, restored_scene
+from dyngs.models.checkpoint import Checkpoint, read_capture_of, restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.runs.stored_file import (

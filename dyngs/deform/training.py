@@ -237,17 +237,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene, gaussians=gaussians, field=field, moving=moving, filter_std=std
         ), result
 
-    def all_moving(self, scene: DynamicScene, extent: float) -> DynamicScene:
-        if not scene.is_static:
-            return scene
-        count = len(scene)
-        means = scene.gaussians.means.detach()
-        setup = FieldSetup(
-            means.mean(0), torch.full_like(means[0], extent), len(self.times), count, extent
-        )
-        field = new_field(self.options.deform, setup, torch.Generator()).to(means.device)
-        return replace(scene, moving=torch.arange(count, device=means.device), field=field)
-
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
         self._see_all("all_times" in tensors)
         return DynamicScene.restored(self.options, gaussians, tensors)

@@ -93,10 +93,6 @@ class SceneTraining(Generic[S]):
         None: it does not."""
         return None
 
-    def all_moving(self, scene: S, extent: float) -> S:
-        """Return ``scene`` as expensive to draw as it may become: all Gaussians move."""
-        return scene
-
     def follow(self, edit: TopologyEdit) -> None:
         """Let what the training itself keeps per Gaussian follow a change of the set."""
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from dyngs.config import SceneModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
+from dyngs.core.section import ModelSection
 from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.core.tensor_checks import require_moments
 from dyngs.data.scene_space import TYPICAL_EXTENT
@@ -25,7 +26,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork, RestFrame, network_of
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.checkpoint import Checkpoint, restored_model
 from dyngs.models.renderable import Renderable, TimeStep, near_plane
 from dyngs.models.views import background_colour
 
@@ -217,6 +218,11 @@ def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
             f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed"
         )
     return scene
+
+
+def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
+    """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
+    return require_gaussians(restored_model(checkpoint, model), checkpoint.name)
 
 
 def _number(time: float | TimeStep | None) -> float | None:

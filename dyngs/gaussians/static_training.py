@@ -1,4 +1,4 @@
-"""Training of static scenes, and scenes restored from a checkpoint."""
+"""Training of static scenes."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import DefaultStrategy, ModelSection, SceneInit
+from dyngs.config import DefaultStrategy, SceneInit
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError, reading
 from dyngs.core.section import SceneModel
 from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_tensor
@@ -20,12 +19,11 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.gaussians.rendering import contributions
-from dyngs.gaussians.scene import GaussianScene, drawn_as_trained, require_gaussians
+from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
-from dyngs.models.kind import RunStart, kind_of
-from dyngs.models.renderable import Renderable
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import RunStart
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
 
@@ -141,24 +139,3 @@ def restore(model: SceneModel, checkpoint: Checkpoint) -> StaticScene:
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
     return drawn_as_trained(scene, model, checkpoint)
-
-
-def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
-    """Return the scene of a checkpoint of ``model``.
-
-    Raises:
-        DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names
-            the file.
-    """
-    with reading(checkpoint.name, OTHER_CONFIG):
-        try:
-            return kind_of(model).restore(model, checkpoint)
-        except KeyError as missing:
-            raise DyngsError(
-                f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew"
-            ) from None
-
-
-def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
-    """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
-    return require_gaussians(restored_model(checkpoint, model), checkpoint.name)

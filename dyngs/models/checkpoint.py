@@ -1,4 +1,4 @@
-"""The state of a training run that a checkpoint stores."""
+"""Checkpoints as values: the state of a training run, and the scene that it describes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, reading
+from dyngs.core.section import ModelSection
 from dyngs.core.state import part_of
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import change_coordinates
+from dyngs.models.kind import kind_of
+from dyngs.models.renderable import Renderable
 
 OTHER_CONFIG = "was its config changed? Otherwise train anew"
 """Advice where a checkpoint and its run do not fit together."""
@@ -113,3 +116,19 @@ class Checkpoint:
     def part(self, prefix: str) -> dict[str, Tensor]:
         """Return the tensors whose names start with ``prefix.``, without it."""
         return part_of(self.tensors, prefix)
+
+
+def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
+    """Return the scene of a checkpoint of ``model``.
+
+    Raises:
+        DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names
+            the file.
+    """
+    with reading(checkpoint.name, OTHER_CONFIG):
+        try:
+            return kind_of(model).restore(model, checkpoint)
+        except KeyError as missing:
+            raise DyngsError(
+                f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew"
+            ) from None

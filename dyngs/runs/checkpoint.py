@@ -20,11 +20,10 @@ from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, as_word, reading
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.gaussians.static_training import restored_model
 from dyngs.io.fields import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, info_of
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, info_of, restored_model
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.renderable import Renderable
 from dyngs.runs.stored_file import read_scene

@@ -23,7 +23,7 @@ from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError, printable
 from dyngs.core.state import tensors_of
 from dyngs.deform.keys import DynamicModel, FieldSection
-from dyngs.models.checkpoint import read_capture_of, settings_of
+from dyngs.models.checkpoint import read_capture_of, restored_model, settings_of
 from dyngs.models.kind import Moves, capability
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -39,7 +39,7 @@ from dyngs.runs.checkpoint import (
 from dyngs.runs.config_file import write_config
 from dyngs.runs.stored_file import write_scene
 from dyngs.study.runs import finished
-from dyngs.training.new_trainer import assemble, restored_model
+from dyngs.training.new_trainer import assemble
 
 if TYPE_CHECKING:
     from dyngs.study.measure import Subject

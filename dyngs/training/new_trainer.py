@@ -8,19 +8,16 @@ import torch
 
 from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.inspection.problems import before_training
-from dyngs.config import Config, ModelSection, PointsInit, RandomInit
-from dyngs.core.errors import DyngsError, reading, warn
+from dyngs.config import Config, PointsInit, RandomInit
+from dyngs.core.errors import warn
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.gaussians.start import FirstGaussians, surroundings
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.kind import Moves, Predicts, RunStart, capability, kind_of
-from dyngs.models.renderable import Renderable
 from dyngs.models.views import (
     background_colour,
     resolved_background,
@@ -144,27 +141,6 @@ def assemble(
         held_out=held_out,
         device=device_for(config.run.device),
     )
-
-
-def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
-    """Return the scene of a checkpoint of ``model``.
-
-    Raises:
-        DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names
-            the file.
-    """
-    with reading(checkpoint.name, OTHER_CONFIG):
-        try:
-            return kind_of(model).restore(model, checkpoint)
-        except KeyError as missing:
-            raise DyngsError(
-                f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew"
-            ) from None
-
-
-def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
-    """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
-    return require_gaussians(restored_model(checkpoint, model), checkpoint.name)
 
 
 def prepared(config: Config) -> Capture:

@@ -12,7 +12,7 @@ from tiny_fields import busy_config
 from dyngs.compress.search import Cut, FieldSize, apply_cut, cut_config, field_size
 from dyngs.config import Config
 from dyngs.deform.keys import DynamicModel
-from dyngs.gaussians.static_training import restored_scene
+from dyngs.gaussians.scene import restored_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer

@@ -16,8 +16,7 @@ from dyngs.compress.measure import (
 )
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.static_training import restored_scene
+from dyngs.gaussians.scene import GaussianScene, restored_scene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.runs.stored_file import decoded
 

@@ -29,7 +29,7 @@ from dyngs.deform.keys import DynamicModel
 from dyngs.deform.networks import Hexplane
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit
-from dyngs.gaussians.static_training import restored_scene
+from dyngs.gaussians.scene import restored_scene
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 

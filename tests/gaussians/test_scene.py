@@ -18,8 +18,7 @@ from dyngs.config import FixedStrategy
 from dyngs.core.state import Role, part_of, tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.static_training import restored_scene
+from dyngs.gaussians.scene import GaussianScene, restored_scene
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.models.static_section import StaticModel
 from dyngs.training.new_trainer import assemble

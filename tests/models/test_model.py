@@ -17,9 +17,8 @@ from dyngs.config.kinds import kind_names, section_of_kind
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.gaussians.static_training import restored_model
 from dyngs.human.predict.ghg.learner import PersonPredictor, new_network
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
 from dyngs.models.kind import HasGaussians, Predicts, capability, kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable

@@ -20,7 +20,7 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
-from dyngs.gaussians.static_training import restored_scene
+from dyngs.gaussians.scene import restored_scene
 from dyngs.io import tensor_file
 from dyngs.io.tensor_file import write_tensors
 from dyngs.models.static_section import StaticModel

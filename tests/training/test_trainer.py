@@ -119,9 +119,6 @@ class _Lifted(SceneTraining[_LiftedScene]):
     def extend(self, scene: _LiftedScene, seen: tuple[float, float], step: int) -> None:
         raise NotImplementedError
 
-    def all_moving(self, scene: _LiftedScene, extent: float) -> _LiftedScene:
-        return scene
-
     def follow(self, edit: TopologyEdit) -> None: ...
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:

@@ -16,8 +16,7 @@ from dyngs.compress.stage import highest, probe_images, quality_of, scores_of
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.errors import DyngsError, counted
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.static_training import restored_model
-from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.models.checkpoint import CheckpointInfo, restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE

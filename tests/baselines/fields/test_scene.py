@@ -12,7 +12,7 @@ from small_fields import NERF, NGP, config_of
 from dyngs.baselines.fields.keys import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene
-from dyngs.gaussians.static_training import restored_model
+from dyngs.models.checkpoint import restored_model
 from dyngs.models.renderable import DrawOptions
 from dyngs.ops.rays import Space
 from dyngs.training.new_trainer import assemble

@@ -25,7 +25,7 @@ from dyngs.config import (
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.gaussians.static_training import restored_scene
+from dyngs.gaussians.scene import restored_scene
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints

@@ -12,7 +12,6 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
-from dyngs.gaussians.static_training import restored_model
 from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
 from dyngs.human.predict.fields.keys import PredictedFieldModel
 from dyngs.human.predict.fields.people import Person, sources_of
@@ -22,7 +21,7 @@ from dyngs.human.predict.fields.scene import (
     around_in,
     stored_field,
 )
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
 from dyngs.models.renderable import DrawOptions
 
 KINDS = sorted(NETWORKS)
