@@ -1,4 +1,4 @@
-"""The scene that a training goes on from: its Gaussians in the world of the capture."""
+"""Initial Gaussians from an existing scene, in the world of the capture."""
 
 from __future__ import annotations
 

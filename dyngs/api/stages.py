@@ -21,7 +21,7 @@ from dyngs.runs.capture_record import changed_files, named
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
 from dyngs.training.limits import most_gaussians, within_cap
-from dyngs.training.plan import Limits, RunPlan, Stage, told, with_length, with_steps
+from dyngs.training.plan import Limits, RunPlan, Stage, describe_extension, with_length, with_steps
 from dyngs.training.processes import Processes
 
 
@@ -82,8 +82,8 @@ def find_poses(report: ReportProgress) -> Stage:
 
 
 def continue_scene(plan: RunPlan) -> tuple[RunPlan, None]:
-    """Keep what would take the scene apart that the run goes on from: images are whole from the
-    start; with frozen Gaussians none are removed and all keep their harmonics."""
+    """Protect the scene that ``init.scene`` names: training starts at full resolution, and with
+    frozen Gaussians none are removed and all keep their harmonics."""
     config = plan.resolved
     init = config.init
     if not isinstance(init, SceneInit):
@@ -179,6 +179,8 @@ def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
         save_config(longer, folder / RESOLVED_NAME)
         (folder / ASKED_NAME).unlink(missing_ok=True)  # what was requested now is what is there
         config = with_length(with_steps(config, stored.train.steps), done, steps)
-        return replace(plan, requested=longer, resolved=config), told(stored, longer, done)
+        return replace(plan, requested=longer, resolved=config), describe_extension(
+            stored, longer, done
+        )
 
     return stage

@@ -112,10 +112,10 @@ def train(
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose
             ``train.steps`` may be changed: the run then goes on to so many, on their schedules
-                (``dyngs.training.plan``).
+            (``dyngs.training.plan``).
         resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning
             where it was stopped before its first: the result has the same bytes as if the run had
-                never stopped.
+            never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
         progress: shows how far what comes before training is.
@@ -398,7 +398,7 @@ def _is_export_pending(config: Config, folder: Path) -> bool:
 
 
 def _newest(folder: Path) -> Checkpoint | None:
-    """Return the checkpoint to go on from; None for a run that was stopped before its first."""
+    """Return the newest valid checkpoint; None for a run that was stopped before its first."""
     if was_only_begun(folder):
         return None
     checkpoint = latest_checkpoint(folder)

@@ -74,7 +74,7 @@ class Separation:
     Attributes:
         on_edges: fraction of the masks' outlines along which the image changes more than the
             background does: outlines of who is there are edges of the image, outlines of who has
-                left are edges of the background.
+            left are edges of the background.
         area: median fraction of the image that the masks cover.
         staying: fraction of the masks at pixels that they cover in more than ``OFTEN`` of the
             frames: somebody stands there so long that the background may be a part of them.

@@ -1,4 +1,4 @@
-"""What commands print: results on stdout, messages of the package, tables, and a progress bar."""
+"""Output of commands: results on stdout, messages of the package, tables, and a progress bar."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ def prune_stage(loop: Loop) -> Edit | None:
 
 @torch.no_grad()
 def pruning(trainer: GaussianTrainer) -> Edit:
-    """Return the edit that prunes and masks the Gaussians of ``trainer`` as its config says."""
+    """Return the edit that prunes and masks the Gaussians of ``trainer`` by its config."""
     scene = trainer.model.scene.unmasked()
     options = trainer.config.prune
     edit = removal(trainer, scores_of(trainer, options) if options.fraction > 0 else None)

@@ -309,7 +309,7 @@ class _Layers:
             self.origins = {k: v for k, v in self.origins.items() if k[: len(keys)] != keys}
 
     def field_at(self, keys: tuple[str, ...]) -> FieldInfo | None:
-        """Return the field of a section, by the kinds that are there; None: there is none."""
+        """Return the field at ``keys``, in the sections of the chosen kinds; None: no such field."""
         section: type[BaseModel] = Config
         info: FieldInfo | None = None
         for depth, key in enumerate(keys, 1):
@@ -364,7 +364,7 @@ def _is_removed(keys: tuple[str, ...], section: type[BaseModel], written: object
 
 
 def _is_same(written: object, value: object) -> bool:
-    """Return whether a value of a file, as it is written there, is ``value``."""
+    """Return whether the text or value ``written`` in a file means ``value``."""
     if isinstance(value, list):
         items = written if isinstance(written, list) else []
         return len(items) == len(value) and all(map(_is_same, items, value))

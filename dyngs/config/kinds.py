@@ -34,7 +34,7 @@ OWN = {
 
 
 class InstalledKind(Protocol):
-    """What the configuration needs of a kind."""
+    """The part of a kind that the configuration needs."""
 
     @property
     def section(self) -> type[ModelSection]: ...

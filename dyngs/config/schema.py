@@ -209,7 +209,7 @@ def is_kind_of(info: FieldInfo, kind: object) -> bool:
 
 
 def default_kind(info: FieldInfo) -> str | None:
-    """Return the kind of a section that does not say it; None: there is only one."""
+    """Return the default kind of a section with several kinds; None: it has only one."""
     default = info.get_default(call_default_factory=True)
     return getattr(default, "kind", None)
 

@@ -56,7 +56,7 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
 
 
 def extended(model: DynamicModel, length: Length) -> DynamicModel:
-    """Return the section for a run that goes on to another length: what has begun keeps its step.
+    """Return the section for a run of another length; phases that have begun keep their step.
 
     Raises DyngsError: its motion began too early for that length.
     """

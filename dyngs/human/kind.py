@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class HumanKind(HasGaussians, HasBody):
-    """See the module. The body says how it moves, and poses are refined instead of cameras."""
+    """Avatars: moved by the body, with refined poses instead of refined cameras."""
 
     uses = HasGaussians.uses - {"init", "camera.refine", "train.robust", "train.priors"}
 

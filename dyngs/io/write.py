@@ -198,7 +198,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         path: ``.png`` or ``.jpg`` (8 bit), ``.exr`` (float32), or what else OpenImageIO writes.
         pixels: (H, W) or (H, W, C); uint8 and uint16 as they are, or floats, which are clamped to
             [0, 1] for 8-bit formats. A fourth channel is alpha: straight for PNG, premultiplied for
-                EXR, as these formats want it.
+            EXR, as these formats want it.
     """
     import OpenImageIO as oiio
 

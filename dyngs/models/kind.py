@@ -139,7 +139,7 @@ class HasGaussians(ModelKind):
     """Learning rates are higher in shorter runs, see ``optim.rate_factor``."""
 
     def adding(self, section: SceneModel, most: int) -> SceneModel:
-        """Return the section with which at most so many are added whatever the strategy allows."""
+        """Return the section with at most ``most`` Gaussians added beside the strategy."""
         return section
 
 
@@ -156,7 +156,7 @@ class Moves(ModelKind):
 
 
 class ExtendsTo(ModelKind):
-    """Has schedules of its own that must fit the length of the run."""
+    """A kind whose section has schedules that depend on the length of the run."""
 
     @abstractmethod
     def extended(self, section: Any, length: Length) -> ModelSection:

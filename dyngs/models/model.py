@@ -184,7 +184,7 @@ class RenderedView:
 
 
 class Correction:
-    """What is learned of single images next to the scene.
+    """Parameters of single images, learned beside the scene (exposure, cameras, robust masks).
 
     Attributes:
         name: of its part in a checkpoint.

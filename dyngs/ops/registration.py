@@ -87,7 +87,7 @@ def _defined(
 
 
 class Backward(NamedTuple):
-    """What the implementation of a gradient computes from."""
+    """Inputs of the implementation of a gradient."""
 
     inputs: Sequence[Any]  # of the forward pass
     outputs: Sequence[Tensor]  # those of the forward pass that ``differentiable`` keeps

@@ -1,4 +1,4 @@
-"""Memory needed for rendering, measured in a process of its own, which this module also is."""
+"""Memory needed for rendering, measured in a child process that runs this module."""
 
 from __future__ import annotations
 

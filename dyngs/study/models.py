@@ -59,7 +59,7 @@ _CURVE = TypeAdapter(tuple[CurvePoint, ...])
 
 @dataclass(frozen=True)
 class Comparison:
-    """What all models are trained and measured on, and the limit of all, of which two are None."""
+    """The capture, the images and the limit shared by all models; two of the limits are None."""
 
     capture: Path
     out: Path

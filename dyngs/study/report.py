@@ -70,7 +70,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Report:
-    """What a report is made of; ``views``: name, and the name and PSNR of each image of it, whose
+    """Content of a report; ``views``: name, and the name and PSNR of each image of it, whose
     files are in ``images``."""
 
     title: str
@@ -167,8 +167,7 @@ def write_report(stem: Path, report: Report) -> list[Path]:
 
 
 def page_text(report: Report, svg: str) -> str:
-    """Return a page with tables, the plot as SVG or "", and synchronised crops, which asks no host
-    for anything."""
+    """Return a self-contained page with tables, the plot as SVG or "", and synchronised crops."""
     script = _file("page.js") if report.views else ""
     left_out = "".join(
         f"<p>Left out: <b>{escape(name)}</b>: {escape(why)}</p>"

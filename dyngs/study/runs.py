@@ -101,7 +101,7 @@ def write_stored(path: Path, values: Mapping[str, Any] | Sequence[Any]) -> None:
 
 
 def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequence[str]) -> None:
-    """Note what a study is about in its folder ``out``, or compare it with what is noted there.
+    """Store the facts of a study in its folder ``out``, or compare them with those stored there.
 
     Raises:
         DyngsError: one of the ``compared`` facts differs; names those that do.

@@ -147,7 +147,7 @@ def prepared(config: Config) -> Capture:
     """Return the capture of a run with the points that its scene begins with, see
     ``with_first_points``.
 
-    What is suspicious about the capture, and where the points are from, is printed to stderr.
+    Problems of the capture and the source of its points are logged.
     """
     return with_points(require_images(read_capture(config.data)), config)
 

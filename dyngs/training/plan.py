@@ -18,7 +18,7 @@ from dyngs.training.corrections.exposure import WARM_UP
 
 @dataclass(frozen=True)
 class Limits:
-    """What a run may not exceed; None: no limit.
+    """Limits of a run; None: no limit.
 
     Attributes:
         gaussians: at the end.
@@ -100,8 +100,8 @@ def _require_exposures_stay(config: Config, length: Length) -> None:
         )
 
 
-def told(before: Config, after: Config, done: int) -> str:
-    """Return the line that says how a run goes on after ``done`` steps."""
+def describe_extension(before: Config, after: Config, done: int) -> str:
+    """Return a message about the schedules of a run that continues after ``done`` steps."""
     was = before.train.steps
     steps = after.train.steps
     line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {counted(steps, 'step')}"

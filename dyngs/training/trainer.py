@@ -97,7 +97,7 @@ M = TypeVar("M", bound=Model[Any])
 
 
 class Parts(NamedTuple):
-    """What follows the schedules of a run.
+    """Parts of a trainer that depend on the schedules of a run.
 
     The order of the losses decides the last bits of gradients.
     """

@@ -202,7 +202,7 @@ def shows_filled(opened: Opened) -> bool:
 
 
 def _filled(opened: Opened, shot: Shot) -> Rendering:
-    """Return the image with marked what is filled in; the plain one where that is not known."""
+    """Return the image with filled-in parts marked; the plain image where they are not known."""
     person = avatar_of(opened.renderable)
     if person is None or person.seen is None or not shows_filled(opened):
         return _rendering(opened, shot)

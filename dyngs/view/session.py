@@ -1,5 +1,5 @@
-"""What one browser looks at, which image it gets next and how large, and the thread that draws for
-all browsers. Knows no viser."""
+"""Sessions of the viewer: the view of one browser, the size of its next image, and the thread that
+renders for all browsers. Independent of viser."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Cameras of the viewer: the views of a scene's capture, from where a scene is looked at first, and
-poses of a browser's camera."""
+"""Cameras of the viewer: the views of a capture, the first viewpoint, and poses of a browser's
+camera."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from dyngs.human.synthetic.capture import write_human_capture
 from dyngs.models.schedule import image_divisor
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.training.plan import told, with_length
+from dyngs.training.plan import describe_extension, with_length
 from dyngs.training.trainer import StepReport, Trainer
 
 ALL_KINDS = ("default", "mcmc", "control_nodes", "human")
@@ -170,7 +170,7 @@ def test_what_has_begun_keeps_its_step() -> None:
             assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
             if done >= old.opens and steps < 9000:
                 assert (now.opens, now.full) == (old.opens, min(old.full, steps))
-            assert told(config, new, done).count("\n") == 0
+            assert describe_extension(config, new, done).count("\n") == 0
 
 
 def test_exposures_that_are_learned_stay_so() -> None:

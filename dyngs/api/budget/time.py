@@ -87,7 +87,7 @@ def fit_minutes(
 
 
 def _measured(trainer: Trainer[Any], seconds: float) -> Forecast:
-    """Return a forecast by a few steps of ``trainer``, which may take so many ``seconds``."""
+    """Time a few steps of ``trainer``, for at most ``seconds``, and return a forecast."""
     begun = time.perf_counter()
     last = min(FIT.warm_up + FIT.steps, trainer.config.train.steps)
     forecast = _forecast(trainer, begun)

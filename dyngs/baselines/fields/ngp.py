@@ -78,7 +78,7 @@ class NgpSizes:
         return SIZES[model.sizes]
 
     def levels(self, pixels: int, cascades: int) -> HashLevels:
-        """Return the levels of the grid for images whose longest side has so many ``pixels``."""
+        """Return the levels of the hash grid for images with a longest side of ``pixels`` px."""
         finest = self.finest or min(max(64, round(FINEST * pixels * min(cascades, 2))), 4096)
         return HashLevels.geometric(self.num_levels, 16, finest, 1 << self.log2_rows)
 

@@ -176,7 +176,7 @@ class FieldTraining(Model[FieldScene]):
 
 
 class NgpTraining(FieldTraining):
-    """As many rays as fill a step with samples, and cells that are kept up to date."""
+    """Training of Instant-NGP: rays per step by the number of samples, and the occupancy grid."""
 
     _field: NgpField
 

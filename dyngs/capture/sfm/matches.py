@@ -1,4 +1,4 @@
-"""What matches show: whether poses fit them, and whether the camera moved or only rotated."""
+"""Checks of feature matches: whether poses fit them, and whether the camera only rotated."""
 
 from __future__ import annotations
 

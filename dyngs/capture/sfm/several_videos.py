@@ -418,8 +418,8 @@ LESS_ERROR = 0.7
 def _static_images(
     source: Path, videos: Sequence[CameraVideo], report: ReportProgress
 ) -> tuple[dict[str, np.ndarray], str]:
-    """Return a (H, W, 3) uint8 image of each camera without what moves, and a line that says that
-    all cameras stand still."""
+    """Return the median image (H, W, 3) uint8 of each camera, without moving things, and a message
+    that no camera moves."""
     images: dict[str, np.ndarray] = {}
     displaced: dict[str, float] = {}
     for video in videos:

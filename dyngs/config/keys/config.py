@@ -19,7 +19,7 @@ from dyngs.core.section import ModelSection, SceneModel, Section
 
 
 def _model_section(value: object) -> object:
-    """Return the section of the kind that ``value`` names; what is a section stays as it is."""
+    """Return ``value`` as the section of the kind that it names; sections are returned unchanged."""
     if not isinstance(value, dict):
         return value
     given = cast("dict[str, Any]", value)

@@ -30,7 +30,7 @@ class FieldPredictorKind(Predicts):
 
 
 class PredictedFieldKind(ModelKind):
-    """What such a network has predicted: it is drawn, and not trained."""
+    """Fields that these networks predict: rendered, not trained."""
 
     def refusal(self, capture: Capture) -> str:
         return "model.kind=predicted_field is what `dyngs predict` writes, and is not trained"

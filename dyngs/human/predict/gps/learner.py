@@ -123,8 +123,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
 
 
 class GpsLearner(Learner[GpsNetwork]):
-    """At first depth alone is learned, from depth maps, then also the images of views in
-    between."""
+    """Training of GPS-Gaussian: depth first, from depth maps, then images of the views between."""
 
     def __init__(
         self,
