@@ -14,7 +14,7 @@ import torch
 from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import FieldScene, space_of
 from dyngs.baselines.fields.scene import surface_of as surface_of_field
-from dyngs.baselines.triangles import mesh as triangles
+from dyngs.baselines.triangles import scene as triangles
 from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced

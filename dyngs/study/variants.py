@@ -14,7 +14,7 @@ from pydantic import ConfigDict
 from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import num_cores
-from dyngs.baselines.triangles.keys import BgTriangleModel
+from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.compress.stage import pruning
 from dyngs.config import BudgetConfig, Config, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved

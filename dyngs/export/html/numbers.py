@@ -20,8 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyngs.baselines.triangles.patches import CORNERS
-from dyngs.baselines.triangles.scene import TriangleScene
+from dyngs.baselines.triangles.scene import CORNERS, TriangleScene
 from dyngs.core.gaussians import storage_order
 from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
 from dyngs.deform.field import DeformationField, Offsets

@@ -13,9 +13,9 @@ import trimesh
 from small_triangles import config_of
 
 import dyngs
-from dyngs.baselines.triangles.keys import BgTriangleModel
+from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.baselines.triangles.scene import TriangleScene
-from dyngs.baselines.triangles.tallies import most_pixels
+from dyngs.baselines.triangles.training import most_pixels
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -167,7 +167,7 @@ def test_a_capture_that_shows_no_surface_is_refused(
     capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Gaussians of images that show nothing need hundreds of steps until they have faded."""
-    monkeypatch.setattr("dyngs.baselines.triangles.first.fused", lambda *_: None)
+    monkeypatch.setattr("dyngs.baselines.triangles.training.fused", lambda *_: None)
     few = ["model.gaussian_steps=2", "run.dir=run"]
     assert main(["train", f"data.root={capture}", "model.kind=bg_triangle", *few]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
