@@ -74,7 +74,7 @@ from dyngs.training.events import (
 )
 from dyngs.training.limits import require_possible
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
-from dyngs.training.memory import memory_forecasts, require_room
+from dyngs.training.memory import memory_forecasts
 from dyngs.training.new_trainer import build
 from dyngs.training.plan import RunPlan
 from dyngs.training.processes import Processes
@@ -168,7 +168,6 @@ def train(
         images = None
         if resumed is None:
             plan = planned(plan, [run_pilots, find_first_gaussians, set_limits])
-            require_room(plan.resolved)
             if plan.limits.seconds is not None:
                 plan, images = _fit_minutes(plan, watch)
         else:
@@ -376,7 +375,6 @@ def _show_memory(trainer: Trainer[Any], processes: int) -> None:
     """Show how much memory a run will take, and warn where that is likely to be too much."""
     for forecast in memory_forecasts(trainer, processes):
         show(str(forecast))
-        forecast.require_possible()
         warning = forecast.warning()
         if warning is not None:
             warn(warning)
