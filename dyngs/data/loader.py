@@ -32,7 +32,6 @@ from dyngs.data.images.images import (
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.read import view_size
-from dyngs.io.containment import images_up_to
 from dyngs.ops.device import CPU, Upload, gpu_memory, sent
 
 
@@ -249,8 +248,7 @@ class ImageLoader:
 
         Args:
             views: one split of a capture.
-            options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count;
-                None: the defaults.
+            options: ``downscale``, ``longest_side`` and ``cache_mb`` count; None: the defaults.
             with_maps: read depth maps and flow, too.
             decoding_threads: decode what is to be expected in so many threads; none if ``cache_mb``
                 is 0.
@@ -271,8 +269,7 @@ class ImageLoader:
         self._cameras: dict[tuple[int, int, torch.device], Cameras] = {}
         self.corrected: Callable[[int, Cameras], Cameras] | None = None
         self._lock = Lock()
-        with images_up_to(options.max_megapixels):
-            check_files(self._views)
+        check_files(self._views)
 
     def __len__(self) -> int:
         return len(self._views)
@@ -467,8 +464,7 @@ class ImageLoader:
         with self._lock:
             decoded = self._cache.get(index)
         if decoded is None:
-            with images_up_to(self._options.max_megapixels):
-                decoded = self._decode(self._views[index])
+            decoded = self._decode(self._views[index])
         return decoded, None if self._device == CPU else decoded.upload(self._device)
 
     def _keep(self, index: int, decoded: Decoded, there: Decoded) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from dyngs.data.body_frames import with_fitted_body
 from dyngs.data.capture import (
     Capture,
     CaptureFormat,
-    Lens,
     PointCloud,
     Splits,
     View,
@@ -24,9 +22,8 @@ from dyngs.data.capture import (
     each_view,
 )
 from dyngs.data.geometry import match_size
-from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import header_if_readable, read_header, target_size
-from dyngs.data.images.lens import wide_pinhole
+from dyngs.data.images.video import decode_frames
 from dyngs.data.readers import (
     blender,
     camera_folders,
@@ -40,7 +37,7 @@ from dyngs.data.readers import (
 )
 from dyngs.data.scene_space import normalise_capture
 from dyngs.io.archive import is_archive, unpacked
-from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.containment import inside, staying_within
 from dyngs.io.find import FileFinder, shrunk_folders
 from dyngs.io.outputs import command_for
 
@@ -182,7 +179,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     Args:
         source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and options
             such as ``frames``.
-        decode_videos: write the chosen frames of videos as image files, see ``images.frame_cache``;
+        decode_videos: write the chosen frames of videos as image files, see ``images.video``;
             otherwise views may name files that do not exist yet.
 
     Raises:
@@ -198,7 +195,6 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     chosen = _chosen_format(options, found)
     with (
         staying_within(root, options.follow_links),
-        images_up_to(options.max_megapixels),
         reading(
             root,
             "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
@@ -275,7 +271,6 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         capture = _without_missing(capture)
     capture, notes = _with_splits(capture, options)
     splits, copies = with_smaller_images(capture.root, capture.splits, options)
-    splits = _wide(splits) if options.undistort == "wide" else splits
     for view in all_views(splits):
         _check_places(view)
     splits, tracks, absent = _present_priors(splits, capture.tracks_path)
@@ -283,7 +278,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         frames = {
             view.image_path: view.video for view in all_views(splits) if view.video is not None
         }
-        decode_frames(capture.root, frames, options.frame_cache_mb)
+        decode_frames(capture.root, frames)
     lacking = _missing(splits)
     has_alpha, layers = _first_image(splits["train"])
     points, more = _finite_points(capture.points)
@@ -394,19 +389,6 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
     if new_poses is not None:
         splits["pose"] = new_poses
     return replace(capture, splits=splits, span=span, seconds=seconds), [*by_name, *notes]
-
-
-def _wide(splits: Splits) -> Splits:
-    """Return views whose pinholes show all that their lenses saw."""
-    known: dict[Hashable, tuple[Lens, np.ndarray]] = {}
-
-    def wide(view: View) -> View:
-        key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
-        if key not in known:
-            known[key] = wide_pinhole(view.lens, view.intrinsics, view.width, view.height)
-        return replace(view, lens=known[key][0], intrinsics=known[key][1])
-
-    return each_view(splits, wide)
 
 
 def _with_poses_held_out(
