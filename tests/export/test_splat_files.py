@@ -316,7 +316,7 @@ def far_capture(still: Path) -> Capture:
         Lens(),
         Lens("opencv", (0.1, -0.02, 0.001, 0.002)),
         Lens("opencv", (0.1,) * 8),
-        Lens("fisheye", (0.01,) * 4, 1.5),
+        Lens("fisheye", (0.01,) * 4),
     ]
     found = read_capture(still)
     views = []

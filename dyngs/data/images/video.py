@@ -402,4 +402,4 @@ def _stored_info(folder: Path) -> VideoInfo | None:
 
 
 def _num_bytes(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.iterdir())
+    return sum(path.stat().st_size for path in folder.glob("*.png"))
