@@ -90,19 +90,16 @@ def with_smaller_images(
     if not copies or not views:
         return splits, []
     factor = min(max(view.width, view.height) / max(view_size(view, options)) for view in views)
-    number = max((number for number in copies if number <= factor), default=min(copies))
+    number = max((number for number in copies if number <= factor), default=0)
+    if not number:
+        return splits, []
     finder = FileFinder(copies[number])
     small: dict[str, View] = {}
-    for view in views if number <= factor else ():
+    for view in views:
         copy = _shrunk(view, finder.find(os.path.relpath(view.image_path, images)), number)
-        if copy is not None:
-            small[view.name] = copy
-    if len(small) < len(views):
-        names = ", ".join(copies[key].name for key in sorted(copies))
-        conditions = "if each image has its copy, and none a mask or a depth map"
-        return splits, [
-            f"{names}: not read; data.downscale={number} reads {copies[number].name} {conditions}"
-        ]
+        if copy is None:
+            return splits, []
+        small[view.name] = copy
     line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
     return each_view(splits, lambda view: small.get(view.name, view)), [line]
 
@@ -344,11 +341,11 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         # people are drawn in the poses of their frames, which are found by their times
         splits = times.times_of_frames(splits)
     new_poses = splits.pop("pose", None)
-    by_name: list[str] = []
+    notes: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
-        splits, line = times.times_by_name(capture.root, splits, rate)
-        by_name = [line]
+        splits, line = times.times_by_name(splits, rate)
+        notes.append(line)
         capture = replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
@@ -361,51 +358,49 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         capture = replace(capture, warnings=said)
     written = splits
     # People move by frame number: of their captures, times within [0, 1] are left as they are.
-    splits, notes = times.unit_times(capture.root, splits, stretch=capture.body is None)
+    splits, scaled = times.unit_times(capture.root, splits, stretch=capture.body is None)
     if options.frames is not None:
-        splits = times.select_frames(capture.root, splits, options.frames)
-    splits, constant = times.still_if_constant(splits)
-    notes += [*constant, *times.sequence_warnings(splits)]
+        splits, _ = times.split_by_frames(capture.root, splits, options.frames)
+    splits, constant = times.static_if_constant(splits)
+    notes += [*scaled, *constant, *times.frame_count_warnings(splits)]
     if options.pose_frames is not None:
         capture, splits, new_poses = _with_poses_held_out(
             capture, splits, new_poses, options.pose_frames
         )
     span = times.span_in_files(written, splits)
-    seconds = (
-        span[1] - span[0]
-        if capture.in_seconds and span
-        else times.clip_seconds(splits, capture.fps)
-    )
+    seconds = times.clip_seconds(splits, capture.fps)
+    if capture.in_seconds and span:
+        seconds = span[1] - span[0]
     if "test" not in splits:
         views = splits["train"]
         every = options.test_every
         splits["test"] = views[::every] if every else ()
         splits["train"] = tuple(view for i, view in enumerate(views) if not every or i % every)
-        if not splits["train"]:
-            raise DyngsError(
-                f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it"
-            )
+    if not splits["train"]:
+        raise DyngsError(
+            f"{capture.root}: no training views are left; change data.frames, data.pose_frames or data.test_every"
+        )
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
-    return replace(capture, splits=splits, span=span, seconds=seconds), [*by_name, *notes]
+    return replace(capture, splits=splits, span=span, seconds=seconds), notes
 
 
 def _with_poses_held_out(
     capture: Capture, splits: Splits, new_poses: tuple[View, ...] | None, frames: str
 ) -> tuple[Capture, Splits, tuple[View, ...]]:
     """Return the capture and its splits without the times that ``frames`` selects, and the views of
-    split pose."""
-    if capture.body is None:
+    split pose: those of cameras that only have test views, if there are any."""
+    if capture.body is None or new_poses is not None:
         raise DyngsError(
-            f"{capture.root}: data.pose_frames={frames} is for people; here are no body parameters"
+            f"{capture.root}: data.pose_frames={frames} is for people without a clip of new poses of their own"
         )
-    if new_poses is not None:
-        raise DyngsError(
-            f"{capture.root}: has a clip of new poses of its own; remove data.pose_frames={frames}, or the files of it"
-        )
-    splits, held = times.hold_out_frames(capture.root, splits, frames)
-    return capture.replace(body={**capture.body, "pose": capture.body["train"]}), splits, held
+    held, kept = times.split_by_frames(capture.root, splits, frames, "data.pose_frames")
+    views = all_views(held)
+    trained = {view.camera_id for view in splits["train"]}
+    others = {view.camera_id for view in splits.get("test", ())} - trained
+    views = tuple(view for view in views if not others or view.camera_id in others)
+    return capture.replace(body={**capture.body, "pose": capture.body["train"]}), kept, views
 
 
 def _check_places(view: View) -> None:
