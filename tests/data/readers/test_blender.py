@@ -509,7 +509,7 @@ def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
     capture = read_capture(DataConfig(root=root, pose_frames="2::"))
     assert [view.name for view in capture.splits["pose"]] == ["images/test/f2_c2"]
     (root / "body_train.npz").unlink()
-    with pytest.raises(DyngsError, match="is for people; here are no body parameters"):
+    with pytest.raises(DyngsError, match="is for people without a clip"):
         read_capture(DataConfig(root=root, pose_frames="2::"))
 
 
