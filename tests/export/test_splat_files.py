@@ -286,16 +286,16 @@ def test_the_animation_of_bodies_shows_the_scene_at_all_times(
         torch.testing.assert_close(x, wanted, atol=1e-5, rtol=0)
     assert any("bodies: 1" in note for note in written.notes)
     file = GltfFile(written.path)
-    rest, body = file.document.nodes
-    assert (rest.name, body.name) == ("rest", "body 0")
-    animation = file.document.animations[0]
+    rest, body = file.nodes
+    assert (rest["name"], body["name"]) == ("rest", "body 0")
+    animation = file.json["animations"][0]
     samples = {}
-    for channel in animation.channels:
-        assert channel.target.node == 1
-        sampler = animation.samplers[channel.sampler]
-        kind = {"translation": "VEC3", "rotation": "VEC4"}[channel.target.path]
-        seconds = file.numbers(sampler.input, "SCALAR", np.float64)[:, 0]
-        samples[channel.target.path] = file.numbers(sampler.output, kind, np.float64)
+    for channel in animation["channels"]:
+        assert channel["target"]["node"] == 1
+        sampler = animation["samplers"][channel["sampler"]]
+        kind = {"translation": "VEC3", "rotation": "VEC4"}[channel["target"]["path"]]
+        seconds = file.numbers(sampler["input"], "SCALAR", np.float64)[:, 0]
+        samples[channel["target"]["path"]] = file.numbers(sampler["output"], kind, np.float64)
     assert seconds[-1] == pytest.approx(rolling.seconds)
     assert (samples["rotation"][1:] * samples["rotation"][:-1]).sum(1).min() > 0
     turns = Slerp(seconds, Rotation.from_quat(samples["rotation"]))
