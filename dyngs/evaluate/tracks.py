@@ -111,7 +111,7 @@ class _Moment:
     """The Gaussians at one time."""
 
     means: np.ndarray  # (N, 3)
-    rotations: Rotation  # (N,)
+    quats: np.ndarray  # (N, 4) unit, xyzw
     opacities: np.ndarray  # (N,)
 
 
@@ -125,7 +125,7 @@ def _moment(scene: GaussianScene, time: float) -> _Moment:
             gaussians.logit_opacities.sigmoid(),
         )
     )
-    return _Moment(means, Rotation.from_quat(quats[:, [1, 2, 3, 0]]), opacities)
+    return _Moment(means, quats[:, [1, 2, 3, 0]], opacities)
 
 
 def _carried_to(
@@ -174,7 +174,7 @@ def _bind(
     rows = opaque[np.reshape(nearest, (len(points), count))]
     weights = moment.opacities[rows]
     arms = points[:, None] - moment.means[rows]
-    inverse = moment.rotations[rows.ravel()].inv()
+    inverse = Rotation.from_quat(moment.quats[rows.ravel()]).inv()
     arms = inverse.apply(arms.reshape(-1, 3)).reshape(arms.shape)
     return rows, weights / weights.sum(axis=1, keepdims=True), arms
 
@@ -187,7 +187,8 @@ def _carried(
     What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone
     would not do.
     """
-    turned = moment.rotations[rows.ravel()].apply(arms.reshape(-1, 3)).reshape(arms.shape)
+    rotations = Rotation.from_quat(moment.quats[rows.ravel()])
+    turned = rotations.apply(arms.reshape(-1, 3)).reshape(arms.shape)
     return (weights[..., None] * (moment.means[rows] + turned)).sum(axis=1)
 
 
