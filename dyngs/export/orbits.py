@@ -59,8 +59,9 @@ def orbit_path(
         near = np.exp(-0.5 * (apart / max(width / 6, narrowest)) ** 2)
         near /= near.sum(axis=1, keepdims=True)
         azimuths = swing + middle
+        degrees = round(math.degrees(width))
         notes = (
-            f"the capture was filmed from an arc of {math.degrees(width):.0f} degrees: the orbit swings along it and back",
+            f"the capture was filmed from an arc of {degrees} degrees: the orbit swings along it and back",
         )
     if fraction_in_front(poses, center) < 0.5:
         notes = (
