@@ -437,23 +437,6 @@ def write_log(root: Path) -> None:
     (root / "timing.json").write_text('{"seconds_train": {"7": 1.0}}\n')
 
 
-def write_load(root: Path) -> None:
-    """Write a workload of ``dyngs bench``."""
-    pose = np.eye(4)[None]
-    pose[0, 2, 3] = 3
-    k = np.array([[[20.0, 0, 10], [0, 20, 7], [0, 0, 1]]])
-    points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
-    np.savez(
-        root / "a.npz",
-        means3d=points,
-        colors=np.full((9, 3), 9),
-        viewmats=pose,
-        Ks=k,
-        width=20,
-        height=14,
-    )
-
-
 def _gaussians() -> dict[str, torch.Tensor]:
     return {f"gaussians.{name}": x.contiguous() for name, x in row_of_balls().tensors().items()}
 
