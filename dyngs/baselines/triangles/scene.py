@@ -42,7 +42,6 @@ from dyngs.ops.patches import (
     blend_patches,
     lattice,
     lattice_size,
-    lattice_values,
     outline_crossings,
     patch_values,
     project_points,
@@ -84,9 +83,7 @@ class Patches:
 
     def colours_at(self, ids: Tensor, uv: Tensor) -> Tensor:
         """Return (N, 3) colours without harmonics of places (N, 2) on triangles (N,) int32."""
-        if self.texture == 0:
-            return patch_values(self.colours, ids, uv)
-        return lattice_values(self.colours, ids, uv, self.texture)
+        return patch_values(self.colours, ids, uv, self.texture)
 
     def textured(self, segments: int) -> Patches:
         """Return them with the colours at the points of a lattice."""
