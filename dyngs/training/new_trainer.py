@@ -202,7 +202,9 @@ def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefin
     if config.camera.refine != "always":
         return None
     refinement = CameraRefinement(images.views, size, config.train.steps)
-    images.corrected = refinement.corrections.applied
+    views = images.views
+    applied_to = refinement.corrections.applied_to
+    images.corrected = lambda index, cameras: applied_to(views[index], cameras)
     return refinement
 
 
