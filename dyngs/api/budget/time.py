@@ -16,7 +16,7 @@ from typing import Any
 from dyngs.config import Config
 from dyngs.core.errors import counted
 from dyngs.data.loader import ImageLoader
-from dyngs.training.clock import Forecast
+from dyngs.training.clock import Forecast, Stopwatch
 from dyngs.training.loop import Loop
 from dyngs.training.plan import RunPlan, with_steps
 from dyngs.training.trainer import Edit, Trainer
@@ -28,14 +28,14 @@ WARM_UP = 2  # Steps before those that are measured before training
 
 
 def fit_minutes(
-    plan: RunPlan, used: Callable[[], float], build: Callable[[RunPlan], Trainer[Any]]
+    plan: RunPlan, watch: Stopwatch, build: Callable[[RunPlan], Trainer[Any]]
 ) -> tuple[RunPlan, str | None, ImageLoader]:
     """Return the plan with as many steps as fit into its time, a message, and its training images.
 
     Where fewer than ``FEWEST`` steps fit, the images are halved until they do, or are small.
 
     Args:
-        used: returns the seconds of training so far.
+        watch: seconds of training so far.
         build: returns a new trainer of a plan, which measures and is thrown away.
     """
     seconds = plan.limits.seconds or math.inf
@@ -44,7 +44,7 @@ def fit_minutes(
     while True:
         trainer = build(plan)
         forecast = _measured(trainer, 0.05 * seconds)
-        left = AIM * seconds - used()
+        left = AIM * seconds - watch.seconds
         steps = fitting_steps(forecast, plan.resolved, 0, left, asked)
         side = max(map(max, trainer.images.sizes))
         if steps >= min(FEWEST, asked) or side < 2 * SMALLEST_SIDE:
