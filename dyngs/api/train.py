@@ -34,6 +34,7 @@ from dyngs.core.errors import DyngsError, as_word, counted, show, warn
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.lock import writing
+from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
@@ -72,8 +73,9 @@ from dyngs.training.events import (
 from dyngs.training.limits import require_possible
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
 from dyngs.training.memory import memory_forecasts
-from dyngs.training.new_trainer import build
+from dyngs.training.new_trainer import assemble
 from dyngs.training.plan import RunPlan
+from dyngs.training.prediction import network_trainer
 from dyngs.training.processes import Processes
 from dyngs.training.run_log import RunLog
 from dyngs.training.trainer import Trainer
@@ -174,14 +176,19 @@ def _built(
     plan: RunPlan, resumed: Checkpoint | None = None, images: ImageLoader | None = None
 ) -> Any:
     """Return the trainer of a plan, before its first step or where it was ``resumed``."""
-    trainer = build(
-        plan.resolved,
-        plan.capture,
-        restored=resumed is not None,
-        first=plan.first,
-        uncapped=plan.uncapped,
-        images=images,
-    )
+    config = plan.resolved
+    trainer: Any
+    if capability(config.model, Predicts):
+        trainer = network_trainer(config)
+    else:
+        trainer = assemble(
+            config,
+            plan.capture,
+            restored=resumed is not None,
+            first=plan.first,
+            uncapped=plan.uncapped,
+            images=images,
+        )
     if resumed is not None:
         trainer.restore(resumed)
     return trainer

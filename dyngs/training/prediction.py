@@ -14,7 +14,7 @@ from dyngs.config import Config
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
-from dyngs.models.kind import Predicts
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
 from dyngs.training.trainer import Edit, ViewSampler
@@ -90,8 +90,10 @@ class NetworkTrainer:
         self.done = checkpoint.info.step
 
 
-def network_trainer(config: Config, network: Predicts) -> NetworkTrainer:
+def network_trainer(config: Config) -> NetworkTrainer:
     """Return the trainer of a network of any kind before the first step."""
+    network = capability(config.model, Predicts)
+    assert network is not None
     generator = torch.Generator().manual_seed(config.run.seed)
     learner = network.networks()[0](config, generator)
     return NetworkTrainer(
