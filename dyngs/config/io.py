@@ -99,7 +99,6 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
     },
 }
 """The same for keys of the section ``model`` of one kind."""
-MOST_KEYS = 40  # Of a section that are listed in one line
 _FOLLOW_LINKS = ("data", "follow_links")
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
@@ -418,7 +417,10 @@ def _section(
             continue
         inner = {} if given.get(name) is None else given[name]
         if not isinstance(inner, dict):
-            raise DyngsError(f"{layers.origin_of(keys)}{'.'.join(keys)} {_of_section(info)}")
+            where = layers.origin_of(keys)
+            raise DyngsError(
+                f"{where}{'.'.join(keys)} is a section, not a value; give one of its keys"
+            )
         kind = inner.get("kind") or default_kind(info)
         if has_kinds(info) and not is_kind_of(info, kind):
             where = layers.origin_of((*keys, "kind"))
@@ -446,12 +448,6 @@ def _not_allowed(keys: tuple[str, ...], allowed: str, value: object, choices: li
     close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"{'.'.join(keys)} must be {allowed}, not {printable(as_written(value), 60)}{hint}"
-
-
-def _of_section(info: FieldInfo) -> str:
-    keys = dict.fromkeys(key for variant in section_classes(info) for key in variant.model_fields)
-    rest = ", ... (docs/cli.md has all)" if len(keys) > MOST_KEYS else ""
-    return f"is a section, not a value; its keys: {', '.join([*keys][:MOST_KEYS])}{rest}"
 
 
 def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:

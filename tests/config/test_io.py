@@ -182,7 +182,7 @@ DYNAMIC = "model.kind=dynamic"
         ("strategy.noise=1", "strategy.noise belongs to strategy.kind=mcmc, not to default"),
         ("model.deform.width=64", "model.deform belongs to model.kind=dynamic, not to static"),
         ("deform.width=64", "unknown key 'deform'"),
-        ("train=5", "train is a section, not a value; its keys: steps"),
+        ("train=5", "train is a section, not a value"),
         ("train.steps.x=5", "train.steps"),
         ("train.steps", "section.key=value"),
         (
@@ -227,7 +227,7 @@ def test_paths_hold_no_nul() -> None:
         ("- a\n- b\n", "", "must be a mapping"),
         ("run: " + "[" * 5000, "", "nested too deeply"),
         ("run: {seed: [" + "1:1," * 60_000 + "]}\n", ":1", "run.seed must be an integer >= 0"),
-        ("#" * (MAX_BYTES + 1), "", "larger than 256 KiB"),
+        ("#" * (MAX_BYTES + 1), "", "bytes"),
     ],
 )
 def test_wrong_files_are_named_with_the_line(
@@ -242,7 +242,7 @@ def test_wrong_files_are_named_with_the_line(
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_bytes(b"run: {name: \xe9}\n")
-    assert "not a text file in UTF-8" in refusal(tmp_path / "mine.yaml", ROOT)
+    assert "cannot be read" in refusal(tmp_path / "mine.yaml", ROOT)
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "train:\n", "train: {}\n"])
