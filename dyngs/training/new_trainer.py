@@ -27,7 +27,7 @@ from dyngs.models.views import (
 )
 from dyngs.ops.device import device_for
 from dyngs.training.corrections.camera_refinement import CameraRefinement
-from dyngs.training.corrections.exposure import exposures_of
+from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.priors import UsedPriors, used_priors
@@ -109,7 +109,9 @@ def assemble(
         if config.train.robust == "always" and may_mask:
             cameras = training_cameras(views, config.data)
             robust = RobustMasks(images, cameras, steps, images.corrected)
-        exposures = exposures_of(config.train, images)
+        exposures = None
+        if config.train.exposure == "always":
+            exposures = ViewExposures(len(images), steps, images)
         losses = [
             model.colour_loss or ImageLoss(config.train.ssim_weight),
             SilhouetteLoss(config.train.alpha_weight, early, FULL_OPACITY_FROM * steps),
