@@ -3,7 +3,6 @@ step draws into."""
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -155,8 +154,6 @@ def free_memory() -> int | None:
     available = _kilobytes("/proc/meminfo", "MemAvailable")
     if available is not None:
         found.append(available)
-    elif hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        found.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     for limit, used in zip(_LIMITS, _USED, strict=True):
         most = _number(limit)
         now = _number(used)
