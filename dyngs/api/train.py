@@ -154,7 +154,6 @@ def train(
             if resumed.info.step >= total and not _is_export_pending(plan.resolved, folder):
                 show(_about_finished(plan.resolved, folder))
                 return folder
-            resumed.require_settings(plan.resolved)
         watch = Stopwatch()
         images = None
         if resumed is None:

@@ -23,7 +23,7 @@ from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError, printable
 from dyngs.core.state import tensors_of
 from dyngs.deform.keys import DynamicModel, FieldSection
-from dyngs.models.checkpoint import read_capture_of, restored_model, settings_of
+from dyngs.models.checkpoint import read_capture_of, restored_model
 from dyngs.models.kind import Moves, capability
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -489,6 +489,6 @@ def _write(
     tensors = checkpoint.tensors
     if not whole:
         tensors = tensors_of(restored_model(checkpoint, config.model).state())
-    checkpoint = replace(checkpoint, tensors=tensors, settings=settings_of(config))
+    checkpoint = replace(checkpoint, tensors=tensors)
     save_checkpoint(folder, checkpoint, seconds_at(source, checkpoint.info.step))
     write_config(config, folder)

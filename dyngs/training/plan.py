@@ -98,8 +98,11 @@ def _require_exposures_stay(config: Config, length: Length) -> None:
 def describe_extension(before: Config, after: Config, done: int) -> str:
     """Return a message about the schedules of a run that continues after ``done`` steps."""
     steps = after.train.steps
-    line = f"goes on from step {done:,} to {steps:,} instead of {before.train.steps:,}, on the schedules of {counted(steps, 'step')}"
-    return line + ("" if before.train.minutes is None else "; train.minutes holds no longer")
+    no_limit = "" if before.train.minutes is None else "; train.minutes holds no longer"
+    return (
+        f"goes on from step {done:,} to {steps:,} instead of {before.train.steps:,}, on the schedules of "
+        f"{counted(steps, 'step')}{no_limit}"
+    )
 
 
 def _train(options: TrainConfig, length: Length) -> TrainConfig:
