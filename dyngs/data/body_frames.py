@@ -223,6 +223,11 @@ def with_fitted_body(capture: Capture, folder: Path) -> Capture:
     return capture.replace(splits=splits, body=body)
 
 
+def frame_number(view: View) -> int:
+    """Return the frame number of a view; -1 without one."""
+    return -1 if view.frame is None else view.frame
+
+
 def numbered(splits: Splits) -> Splits:
     """Return the views with frame numbers; if any has none, all get them by the order of their
     times."""

@@ -139,8 +139,6 @@ def person_of(data: DataConfig, template: BodyTemplate) -> Person:
 _NO_SHAPES = {
     "shape_dirs": None,
     "joint_shape_dirs": None,
-    "expression_dirs": None,
-    "joint_expression_dirs": None,
 }
 
 

@@ -87,8 +87,6 @@ def captured_person(
     shape = {
         "shape_dirs": None,
         "joint_shape_dirs": None,
-        "expression_dirs": None,
-        "joint_expression_dirs": None,
     }
     return CapturedPerson(
         name=capture.root.name,
