@@ -38,7 +38,6 @@ _UNFIT = {
     "up": f"{_WHOLE} html tracks",
     "from_up": f"{_WHOLE} tracks",
     "sh_degree": f"{_WHOLE} html surface tracks bodies {MOVING}",
-    "compress": "mesh bodies",
     "joints": "bodies",
     "folder": "bodies",
 }
@@ -48,8 +47,6 @@ _ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of 
 _ONLY |= {"folder": ("html sog", "html or sog"), "max_gaussians_drawn": ("html", "html --folder")}
 _ONLY |= {
     "max_change": ("dyngs", "dyngs"),
-    "spz_version": ("spz", "spz"),
-    "compress": ("glb", "glb"),
 }
 """Options, the formats that they go with, and how these are asked for."""
 
@@ -257,8 +254,7 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
-    from dyngs.evaluate.view_scores import clamped_times
-    from dyngs.export.camera_paths import parse_times
+    from dyngs.export.camera_paths import clamped_times, parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
@@ -286,7 +282,7 @@ def _export_splats(
         write_run_splats,
         writing_of,
     )
-    from dyngs.io.formats.formats import chosen_variant, format_named, known_format, read_splats
+    from dyngs.io.formats.formats import format_named, known_format, read_splats
 
     own = format_named(kind)
     part = _part(arguments)
@@ -299,7 +295,6 @@ def _export_splats(
             )
         )
     how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
-    how = replace(how, own=chosen_variant(own, arguments.spz_version, arguments.compress))
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)

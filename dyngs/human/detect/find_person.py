@@ -29,7 +29,7 @@ from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
 from dyngs.human.fit.capture_fit import cheapest_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 from dyngs.io.lock import make_once
-from dyngs.io.outputs import note_sources, require_new_folder
+from dyngs.io.outputs import note_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 SWAP = 0.04
@@ -272,5 +272,5 @@ def with_found_person(
         say(write_found_person(data, folder, detector, report, say).summary)
 
     make_once(folder, find, say, f"person:  found before, in {folder}")
-    note_sources(folder, data.root)
+    note_source(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})

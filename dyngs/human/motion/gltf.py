@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.errors import reading
 from dyngs.human.motion.motion import SkeletonMotion, require_frame_count, sample_times
 from dyngs.io.fields import require_at_most
-from dyngs.io.gltf import MOST_JOINTS, Animation, GltfFile
+from dyngs.io.gltf import MOST_JOINTS, GltfFile
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
+_AT_REST = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}
 _VRM_THUMBS = {
     f"{side}Thumb{new}": f"{side}Thumb{old}"
     for side in ("left", "right")
@@ -46,21 +48,21 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
     """
     with reading(path):
         file = GltfFile(path)
-        document = file.document
-        vrm = document.extensions.VRMC_vrm_animation
+        vrm = _vrm_animation(file)
         bind = None
         if vrm is not None:
-            bones = vrm.humanoid.humanBones
-            joints = [bone.node for bone in bones.values()]
-        elif document.skins:
-            skin = max(document.skins, key=lambda skin: len(skin.joints))
-            joints = list(skin.joints)
-            bind = skin.inverseBindMatrices
+            bones = vrm["humanoid"]["humanBones"]
+            joints = [bone["node"] for bone in bones.values()]
+            names = [_VRM_THUMBS.get(name, name) for name in bones]
         else:
-            joints = _animated_nodes(file, clip)
-        names = [document.nodes[node].name for node in joints]
-        if vrm is not None:
-            names = [_VRM_THUMBS.get(name, name) for name in vrm.humanoid.humanBones]
+            if file.json.get("skins"):
+                skin = max(file.json["skins"], key=lambda skin: len(skin["joints"]))
+                joints = skin["joints"]
+                bind = skin.get("inverseBindMatrices")
+            else:
+                joints = _animated_nodes(file, clip)
+            names = [file.nodes[node].get("name", "") for node in joints]
+        require_at_most(path, len(joints), MOST_JOINTS, "joints")
         chain = _with_ancestors(file, joints)
         curves = _curves(file, _chosen(file, chain, clip), chain)
         start = min(times[0] for times, _, _ in curves.values())
@@ -86,24 +88,23 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
 
 def _animated_nodes(file: GltfFile, clip: str | None) -> list[int]:
     """Return the nodes that the animation moves, and all below them."""
-    nodes = file.document.nodes
-    channels = _chosen(file, range(len(nodes)), clip).channels
-    waiting = [c.target.node for c in channels if c.target.path in _KINDS]
+    channels = _chosen(file, range(len(file.nodes)), clip)["channels"]
+    targets = [channel["target"] for channel in channels]
+    waiting = [target.get("node") for target in targets if target["path"] in _KINDS]
     found: set[int] = set()
     while waiting:
         node = waiting.pop()
         if node is not None and node not in found:
             found.add(node)
-            waiting += nodes[node].children
-    require_at_most(file.path, len(found), MOST_JOINTS, "joints")
+            waiting += file.nodes[node].get("children", [])
     return sorted(found)
 
 
 def _with_ancestors(file: GltfFile, joints: Sequence[int]) -> dict[int, int | None]:
     """Return the parent of each joint and of all their ancestors, parents first; None for roots."""
     parents: dict[int, int] = {}
-    for i, owner in enumerate(file.document.nodes):
-        parents.update(dict.fromkeys(owner.children, i))
+    for i, owner in enumerate(file.nodes):
+        parents.update(dict.fromkeys(owner.get("children", []), i))
     chain: dict[int, int | None] = {}
     for joint in joints:
         above: dict[int, int | None] = {}
@@ -117,17 +118,22 @@ def _with_ancestors(file: GltfFile, joints: Sequence[int]) -> dict[int, int | No
     return chain
 
 
-def _chosen(file: GltfFile, nodes: Container[int | None], clip: str | None) -> Animation:
+def _vrm_animation(file: GltfFile) -> dict[str, Any] | None:
+    return file.json.get("extensions", {}).get("VRMC_vrm_animation")
+
+
+def _chosen(file: GltfFile, nodes: Container[int | None], clip: str | None) -> dict[str, Any]:
     """Return the animation of that name, or the only one that moves one of the nodes."""
     moving = [
-        x for x in file.document.animations if any(c.target.node in nodes for c in x.channels)
+        x
+        for x in file.json.get("animations", [])
+        if any(channel["target"].get("node") in nodes for channel in x["channels"])
     ]
     if not moving:
         raise file.error("no animation moves its joints; export it with the animation")
-    named = [x for x in moving if clip in (None, x.name)]
-    is_vrm = file.document.extensions.VRMC_vrm_animation is not None
-    if not named or (len(named) > 1 and clip is None and not is_vrm):
-        names = ", ".join(repr(x.name[:30]) for x in moving[:20])
+    named = [x for x in moving if clip in (None, x.get("name", ""))]
+    if not named or (len(named) > 1 and clip is None and _vrm_animation(file) is None):
+        names = ", ".join(f"{x.get('name', '')!r:.32}" for x in moving[:20])
         problem = (
             "several animations; choose a clip of" if named else f"no animation {clip!r}; it has"
         )
@@ -135,23 +141,24 @@ def _chosen(file: GltfFile, nodes: Container[int | None], clip: str | None) -> A
     return named[0]
 
 
-def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) -> _Curves:
+def _curves(file: GltfFile, animation: dict[str, Any], chain: dict[int, int | None]) -> _Curves:
     """Return the curves of an animation that move nodes of the chain, by node and property."""
     curves: _Curves = {}
-    for channel in animation.channels:
-        node = channel.target.node
-        kind = channel.target.path
-        if node is None or node not in chain or kind not in _KINDS:
+    for channel in animation["channels"]:
+        node = channel["target"].get("node")
+        kind = channel["target"]["path"]
+        if node not in chain or kind not in _KINDS:
             continue
-        sampler = animation.samplers[channel.sampler]
-        times = _finite(file, sampler.input, "SCALAR")[:, 0]
-        values = _finite(file, sampler.output, _KINDS[kind])
-        rows = 3 if sampler.interpolation == "CUBICSPLINE" else 1
+        sampler = animation["samplers"][channel["sampler"]]
+        interpolation = sampler.get("interpolation", "LINEAR")
+        rows = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}[interpolation]
+        times = _finite(file, sampler["input"], "SCALAR")[:, 0]
+        values = _finite(file, sampler["output"], _KINDS[kind])
         if len(values) != rows * len(times) or (np.diff(times) < 0).any():
             raise file.error(f"the keys of a {kind} of node {node} are broken; export it again")
-        curves[node, kind] = (times, values, sampler.interpolation)
+        curves[node, kind] = (times, values, interpolation)
     if not curves:
-        raise file.error(f"the animation {animation.name[:30]!r} moves no joint; choose another")
+        raise file.error("its animation moves no joint; choose another clip")
     return curves
 
 
@@ -188,16 +195,16 @@ def _local(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the transform (F, 4, 4) of a node relative to its parent, T R S or its matrix, and its
     rotation (F, 3, 3)."""
-    node = file.document.nodes[index]
+    node = file.nodes[index]
     matrix = np.tile(np.eye(4), (len(times), 1, 1))
-    if node.matrix is not None:
-        matrix[:] = np.reshape(node.matrix, (4, 4)).T
+    if "matrix" in node:
+        matrix[:] = np.reshape(node["matrix"], (4, 4)).T
         return matrix, _nearest_rotations(file, matrix[:, :3, :3])
     values = {
         kind: _sampled(curves[index, kind], times)
         if (index, kind) in curves
-        else np.tile(getattr(node, kind), (len(times), 1))
-        for kind in _KINDS
+        else np.tile(np.array(node.get(kind, still), np.float64), (len(times), 1))
+        for kind, still in _AT_REST.items()
     }
     if (values["scale"].prod(axis=1) < 0).any():
         raise file.error(f"node {index} is mirrored; export it without negative scale")

@@ -23,7 +23,7 @@ from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.io.fields import VARIABLE, allowed
+from dyngs.io.containment import LIMITS_VARIABLE, allowed
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
@@ -79,7 +79,7 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
     if not frames * count <= most:
         raise DyngsError(
             f"{path}: {frames:.0f} frames of {count} joints are too many; at most {most:,} poses of joints are read; "
-            f"cut it into shorter pieces, or set the environment variable {VARIABLE}=N to allow N times as many"
+            f"cut it into shorter pieces, or set {LIMITS_VARIABLE}=N to allow N times as many"
         )
 
 

@@ -213,62 +213,42 @@ def _node(glb: Glb, **changes: object) -> None:
 
 BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
     "no animation": (lambda g: g.json.pop("animations"), "no animation moves its joints"),
-    "no skin, no animation": (
-        lambda g: (g.json.pop("skins"), g.json.pop("animations")),
-        "no animation moves",
-    ),
-    "old": (lambda g: g.json["asset"].update(version="1.0"), "asset.version"),
-    "no asset": (lambda g: g.json.pop("asset"), "asset: Field required"),
-    "text": (lambda g: _node(g, translation="here"), "nodes.0.translation: "),
-    "short": (lambda g: _node(g, rotation=[0, 0, 1]), "nodes.0.rotation: "),
-    "huge": (lambda g: _node(g, scale=[1, 1, 1e30]), "nodes.0.scale.2: "),
+    "old": (lambda g: g.json["asset"].update(version="1.0"), "version is not 2"),
+    "no asset": (lambda g: g.json.pop("asset"), "cannot be read"),
+    "text": (lambda g: _node(g, scale="here"), "cannot be read"),
     "beyond bounds": (
         lambda g: [n.update(scale=[1e9] * 3, translation=[1e9] * 3) for n in g.json["nodes"]],
         "bounds",
     ),
-    "NaN": (lambda g: _node(g, scale=[1, 1, float("nan")]), "nodes.0.scale.2: "),
+    "NaN": (lambda g: _node(g, scale=[1, 1, float("nan")]), "bounds"),
     "no child": (lambda g: (_node(g, children=[7]), g.json.pop("skins")), "cannot be read"),
     "cycle": (lambda g: g.json["nodes"][1].update(children=[0]), "its own ancestor"),
     "no joint": (lambda g: g.json["skins"][0].update(joints=[0, 1, 9]), "cannot be read"),
-    "no joints": (lambda g: g.json["skins"][0].update(joints=[]), "skins.0.joints"),
     "flat": (lambda g: setattr(g, "data", b"\0" * 64 + g.data[64:]), "flat or mirrored"),
     "mirror": (lambda g: _node(g, scale=[-1, 1, 1]), "node 0 is mirrored"),
     "zero": (
         lambda g: g.json["nodes"].append({"rotation": [0] * 4, "children": [0]}),
         "cannot be read",
     ),
-    "no accessor": (lambda g: _sampler(g, output=99), "accessor 99 is missing"),
+    "no accessor": (lambda g: _sampler(g, output=99), "accessor 99 is broken"),
     "kind": (lambda g: _sampler(g, output=1), "accessor 1 must hold VEC4, not 'SCALAR'"),
-    "component": (
-        lambda g: g.json["accessors"][1].update(componentType=7),
-        "accessor 1 must hold SCALAR",
-    ),
     "sparse": (lambda g: g.json["accessors"][1].update(sparse={}), "accessor 1 is sparse"),
-    "no data": (
-        lambda g: g.json["accessors"][1].pop("bufferView"),
-        "accessor 1 is sparse or has no data",
-    ),
-    "no view": (lambda g: g.json["accessors"][1].update(bufferView=77), "missing buffer view"),
-    "no buffer": (lambda g: g.json["bufferViews"][1].update(buffer=3), "buffer 3 is missing"),
     "outside": (
         lambda g: g.json["bufferViews"][1].update(byteOffset=10**15),
-        "lies outside its buffer",
+        "accessor 1 is broken",
     ),
     "past the end": (
-        lambda g: g.json["accessors"][1].update(count=10**15),
-        "lies outside its buffer",
+        lambda g: g.json["accessors"][1].update(count=1000),
+        "accessor 1 is broken",
     ),
-    "offset": (lambda g: g.json["accessors"][1].update(byteOffset=4), "lies outside its buffer"),
-    "negative": (lambda g: g.json["accessors"][1].update(byteOffset=-4), "accessors.1.byteOffset"),
+    "offset": (lambda g: g.json["accessors"][1].update(byteOffset=4), "accessor 1 is broken"),
+    "negative": (lambda g: g.json["accessors"][1].update(byteOffset=-4), "accessor 1 is broken"),
     "meshopt": (
         lambda g: g.json["bufferViews"][1].update(extensions={"EXT_meshopt_compression": {}}),
-        "accessor 1 is compressed",
+        "is compressed",
     ),
-    "interpolation": (lambda g: _sampler(g, interpolation="NONE"), "interpolation: "),
-    "too few": (
-        lambda g: _sampler(g, interpolation="CUBICSPLINE"),
-        "keys of a rotation of node 0 are broken",
-    ),
+    "interpolation": (lambda g: _sampler(g, interpolation="NONE"), "cannot be read"),
+    "too few": (lambda g: _sampler(g, interpolation="CUBICSPLINE"), "keys of a .* are broken"),
     "no sampler": (
         lambda g: g.json["animations"][0]["channels"][0].update(sampler=9),
         "cannot be read",
@@ -278,7 +258,6 @@ BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
         "keys of a .* are broken",
     ),
     "endless": (lambda g: _sampler(g, input=g.add(np.array([0, 1e8]), "SCALAR")), "too many"),
-    "long": (lambda g: _sampler(g, input=g.add(np.array([0, 90000.0]), "SCALAR")), "too many"),
     "infinite": (
         lambda g: _sampler(g, input=g.add(np.array([0, np.inf]), "SCALAR")),
         "NaN or huge",
@@ -340,10 +319,9 @@ HOSTILE: dict[str, tuple[Callable[[Glb], object], str]] = {
         lambda g: _sampler(g, input=g.add(np.array([0, 10_080.0]), "SCALAR")),
         "too many",
     ),
-    "nodes": (lambda g: g.json.update(nodes=[{}] * 70_000), "nodes: "),
-    "joints": (lambda g: g.json["skins"][0].update(joints=[0] * 5000), "skins.0.joints: "),
+    "joints": (lambda g: g.json["skins"][0].update(joints=[0] * 5000), "5,000 joints"),
     "one sampler": (_shared_sampler, "asks for .* numbers"),
-    "a count": (lambda g: g.json["accessors"][1].update(count=2**62), "lies outside its buffer"),
+    "a count": (lambda g: g.json["accessors"][1].update(count=2**62), "asks for"),
 }
 
 
