@@ -16,15 +16,7 @@ from dyngs.core.errors import DyngsError, reading
 from dyngs.human.motion.motion import SkeletonMotion, require_frame_count, require_frame_rate
 from dyngs.io.fields import read_limited, require_at_most
 
-_PART = re.compile(
-    r"""(?:ROOT|JOINT)[ \t]+(?P<name>[^\n{]{1,200})\s*\{
-    | (?P<end>END\s+SITE\s*\{)
-    | (?P<close>\})
-    | OFFSET(?P<offset>(?:[ \t]+\S+){3})
-    | CHANNELS[ \t]+(?P<count>\d{1,3})(?P<channels>(?:[ \t]+[XYZ](?:position|rotation))*)""",
-    re.IGNORECASE | re.VERBOSE,
-)
-"""A part of HIERARCHY; others are not read."""
+_CHANNELS = {f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz"}
 
 
 def read_bvh(path: Path) -> SkeletonMotion:
@@ -49,24 +41,30 @@ def read_bvh(path: Path) -> SkeletonMotion:
         parents: list[int] = []
         offsets: list[list[float]] = []
         channels: list[list[str]] = []
-        blocks = [-1]  # joints with open braces, below those of all; -1 also for end sites
-        for part in _PART.finditer(text, 0, header.start()):
-            if part["name"]:
-                require_at_most(path, len(names) + 1, 4096, "joints")
-                names.append(part["name"].strip())
+        opened = -1  # joint that the next brace opens; -1 for an end site
+        blocks = [-1]  # joints with open braces
+        hierarchy = text[: header.start()].replace("{", "\n{\n").replace("}", "\n}\n")
+        for line in hierarchy.splitlines():
+            word, *rest = line.split() or [""]
+            word = word.upper()
+            if word in ("ROOT", "JOINT"):
+                opened = len(names)
+                require_at_most(path, opened + 1, 4096, "joints")
+                names.append(" ".join(rest)[:200])
                 parents.append(blocks[-1])
                 offsets.append([np.nan] * 3)  # until it is read
                 channels.append([])
-                blocks.append(len(names) - 1)
-            elif part["end"]:
-                blocks.append(-1)
-            elif part["close"]:
+            elif word == "END":
+                opened = -1
+            elif word == "{":
+                blocks.append(opened)
+            elif word == "}":
                 blocks.pop()
-            elif part["offset"] and blocks[-1] >= 0:
-                offsets[blocks[-1]] = [float(word) for word in part["offset"].split()]
-            elif part["count"] and blocks[-1] >= 0:
-                channels[blocks[-1]] = part["channels"].lower().split()
-                if len(channels[blocks[-1]]) != int(part["count"]):
+            elif word == "OFFSET" and blocks[-1] >= 0:
+                offsets[blocks[-1]] = [float(x) for x in rest]
+            elif word == "CHANNELS" and blocks[-1] >= 0:
+                channels[blocks[-1]] = [x.lower() for x in rest[1:]]
+                if rest[0] != str(len(rest) - 1) or not set(channels[blocks[-1]]) <= _CHANNELS:
                     raise DyngsError(
                         f"{path}: the CHANNELS of '{names[blocks[-1]]}' must be a count and so many of Xposition ... "
                         "Zrotation"

@@ -172,8 +172,6 @@ def test_missing_files(root: Path) -> None:
             {1: {**fit(), "pose": np.zeros((4, 72))}},
             "'poses' must hold as many numbers for each of 9",
         ),
-        ({1: {**fit(), "pose": np.full((9, 72), np.nan)}}, "'poses' of frame 0 holds NaN"),
-        ({1: {**fit(), "pose": np.zeros((9, 70))}}, "'poses' has 70 numbers per frame"),
     ],
 )
 def test_bad_fits(root: Path, person: object, line: str) -> None:
@@ -189,7 +187,6 @@ def test_bad_fits(root: Path, person: object, line: str) -> None:
     [
         (None, "the key '04.jpg' is missing"),
         (np.zeros((4, 4)), r"04\.jpg must hold 4x3 finite numbers"),
-        (np.full((4, 3), np.inf), r"04\.jpg must hold 4x3 finite numbers"),
         (np.zeros((4, 3)), r"04\.jpg: the alignment is no similarity"),
         (-np.eye(4)[:, :3], r"04\.jpg: the alignment is no similarity"),
         (np.eye(4)[:, :3] * [1, 2, 3], r"04\.jpg: the pose is not a rotation"),

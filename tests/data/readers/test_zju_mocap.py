@@ -260,7 +260,6 @@ def test_missing_files(tmp_path: Path) -> None:
     ("change", "line"),
     [
         (lambda a: a["cams"]["K"].pop(), "cannot be read"),
-        (lambda a: a["cams"].pop("R"), "cannot be read"),
         (lambda a: a["cams"].update(R=np.array({}, dtype=object)), "cannot be read"),
         (
             lambda a: a["ims"][0]["ims"].__setitem__(0, "9" * 3000 + ".jpg"),
@@ -287,7 +286,6 @@ def test_missing_files(tmp_path: Path) -> None:
             "camera 3: 'T' must hold 3 finite numbers",
         ),
         (lambda a: a["ims"][1]["ims"].pop(), "cannot be read"),
-        (lambda a: a["ims"][1].update(ims=[1, 2, 3, 4]), "cannot be read"),
         (lambda a: a.update(ims=[]), "lists no images"),
     ],
 )
@@ -337,7 +335,6 @@ def test_bad_pickles_of_one_camera(tmp_path: Path) -> None:
             r"mesh_infos\.pkl: no body parameters for 1 frames that have images \(1\)",
         ),
         (cameras, {}, r"mesh_infos\.pkl: cannot be read|holds no frame"),
-        (cameras, [meshes], r"mesh_infos\.pkl: cannot be read"),
         (
             {"../x_1": cameras["frame_000000"]},
             meshes,

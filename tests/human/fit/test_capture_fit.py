@@ -100,7 +100,7 @@ def test_a_body_file_finds_its_own_shape(
     betas = torch.zeros(10)
     betas[:2] = torch.tensor([2.0, -1.5])
     options = HumanOptions(
-        size=96, num_frames=3, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1
+        size=96, num_frames=2, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1
     )
     root = write_capture_of(
         *write_smpl_like(tmp_path, "smplx"), tmp_path / "person", options, betas, monkeypatch

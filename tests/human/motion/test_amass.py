@@ -286,16 +286,11 @@ NAN = np.full((FRAMES, 3), np.nan)
             "'poses' must hold .* 22 or 24 or 52 or 55 joints .*, has 4 x 96; .*quaternions",
         ),
         ({"poses": np.zeros((4, 24, 6))}, "'poses' must hold .*, has 4 x 24 x 6; .*6D"),
-        ({"poses": np.zeros((4, 3, 24))}, "'poses' must hold .*, has 4 x 3 x 24"),
-        ({"poses": np.zeros((2, 4, 72))}, "'poses' must hold .*, has 2 x 4 x 72"),
         (
             {"poses": np.full((4, 72), 30.0)},
             "a joint is rotated by 52 rad, more than two turns; convert degrees",
         ),
-        ({"poses": np.zeros((0, 165)), "trans": np.zeros((0, 3))}, "cannot be read"),
         ({"poses": np.full((4, 165), "a")}, "'poses' must hold numbers, not <U1"),
-        ({"poses": np.full((4, 165), 1e30)}, "'poses' holds NaN or huge"),
-        ({"poses": np.zeros((4, 165), complex)}, "'poses' must hold numbers"),
         (
             {"poses": np.array([{}], object)},
             "'poses': cannot be read .*it holds Python objects",
@@ -311,7 +306,6 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"mocap_framerate": b"fast"}, "could not convert"),
         ({"scale": -1.0}, "'scale' must be positive"),
         ({"scale": np.ones(3)}, "cannot be read"),
-        ({"mocap_framerate": 1e-310}, "1e-310 frames per second is not the rate of a motion"),
         (
             {"poses": np.zeros((90_910, 72), np.uint8)},
             "90910 frames of 55 joints are too many; at most 5,000,000 poses",
