@@ -252,8 +252,6 @@ def _written(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
             moved_file(splat, how, up) if _has_frame(edits) else turned_file(splat, how.turn, up)
         )
         _tell_frame(edits, up, own.up, tell)
-        if edits.geo is not None and any(edits.geo.offset):
-            edited = replace(edited, comments=(*edited.comments, edits.geo.comment))
     written = write_splats(out, edited)
     return EditedFile(written.path, compare_splats(splat, written), written.notes)
 

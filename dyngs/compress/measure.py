@@ -309,20 +309,11 @@ def storage_plan(
     )
 
 
-@dataclass(frozen=True)
-class CoarseFile:
-    """A file in memory."""
-
-    data: bytes  # its bytes
-    factor: float  # on the usual steps
-    quality: float  # of the scene that is read from it
-
-
 def coarsest_file(
     config: Config, checkpoint: Checkpoint, quality: Callable[[GaussianScene], float], least: float
-) -> CoarseFile | None:
-    """Return the file with the coarsest steps tried at which ``quality`` is at least ``least``;
-    None: it never is.
+) -> tuple[bytes, float] | None:
+    """Return the bytes of a file with the coarsest steps tried at which ``quality`` is at least
+    ``least``, and that quality; None: it never is.
 
     All steps are those that ``storage_plan`` measures, times one factor. The bytes are read again
     before they count. ``quality``: of a scene, the higher the better.
@@ -341,7 +332,7 @@ def coarsest_file(
         data = encoded(checkpoint.info, scene, steps, plan.coarseness)
         found = quality(restored_scene(decoded(data), config.model))
         if found >= least:
-            best = CoarseFile(data, factor, found)
+            best = data, found
             low = middle + 1
         else:
             high = middle

@@ -24,7 +24,6 @@ from dyngs.io.formats.similarity import (
 )
 from dyngs.io.formats.sog import SOG_META, read_sog, write_sog
 from dyngs.io.formats.splat_file import (
-    GEO_OFFSET,
     Nonfinite,
     SplatFile,
     drawable,
@@ -231,10 +230,8 @@ def turned_file(
 def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
     """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what
     then points up."""
-    edited = replace(
-        splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited)
-    )
-    return edited if how == UNMOVED else _without_offset(edited)
+    gaussians = how.gaussians(splat.gaussians)
+    return replace(splat, gaussians=gaussians, up=up, edited=how.after(splat.edited))
 
 
 def undone_file(splat: SplatFile) -> SplatFile:
@@ -245,12 +242,4 @@ def undone_file(splat: SplatFile) -> SplatFile:
     if up is not None:
         before = back.rotation @ axis_of(up)
         up = next((name for name, axis in AXES.items() if before @ axis > 1 - 1e-6), None)
-    return _without_offset(
-        replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
-    )
-
-
-def _without_offset(splat: SplatFile) -> SplatFile:
-    return replace(
-        splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET))
-    )
+    return replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
