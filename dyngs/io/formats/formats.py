@@ -132,7 +132,7 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     """Read a file of Gaussians; its suffix names the format.
 
     ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the
-    file. Opacities of exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError:
+    file. Opacities of exactly 0 or 1 and sizes of 0 become finite. Raises DyngsError:
     an unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated
     before the header has been compared with the size of the file.
     """

@@ -45,9 +45,8 @@ _MOST_PIXELS = 1 << 27
 _MODE = 252  # alpha of a rotation: this plus the index of its largest entry
 _HALF_ROOT = float(np.sqrt(0.5))
 
-_Members = Callable[[str, int, str], bytes]
-"""Returns the bytes of a file of the given name, whose size is at most so many of what the last
-argument says."""
+_Members = Callable[[str, int], bytes]
+"""Returns the bytes of a file of the given name, at most so many."""
 
 
 def read_sog(path: Path) -> SplatFile:
@@ -151,16 +150,16 @@ def _encoded(image: np.ndarray) -> bytes:
 
 
 def _in_archive(path: Path, archive: zipfile.ZipFile) -> _Members:
-    def member(name: str, most: int, what: str) -> bytes:
+    def member(name: str, most: int) -> bytes:
         info = archive.getinfo(name)
-        require_at_most(path, info.file_size, most, what)
+        require_at_most(path, info.file_size, most, "bytes")
         return archive.read(info)
 
     return member
 
 
 def _in_folder(path: Path) -> _Members:
-    def member(name: str, most: int, what: str) -> bytes:
+    def member(name: str, most: int) -> bytes:
         file = path.parent / name
         if PureWindowsPath(name).name != name or file.resolve().parent != path.parent.resolve():
             raise DyngsError(f"{path}: {name!r:.60} lies outside of its folder; put the file there")
@@ -170,7 +169,7 @@ def _in_folder(path: Path) -> _Members:
 
 
 def _read(path: Path, member: _Members) -> SplatFile:
-    meta = json.loads(member(SOG_META, _MOST_META_BYTES, f"bytes of {SOG_META}"))
+    meta = json.loads(member(SOG_META, _MOST_META_BYTES))
     if meta.get("version", 1) != 2:
         raise ValueError(f"it is a .sog of version {meta.get('version', 1)!r:.20}, only 2 is known")
     n = meta["count"]
@@ -226,7 +225,7 @@ def _read(path: Path, member: _Members) -> SplatFile:
 def _image(path: Path, member: _Members, name: str) -> np.ndarray:
     from PIL import Image
 
-    data = member(name, 8 * _MOST_PIXELS, "bytes of an image")
+    data = member(name, 8 * _MOST_PIXELS)
     with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
         require_at_most(path, image.width * image.height, _MOST_PIXELS, "pixels of an image")
         return np.asarray(image.convert("RGBA"))

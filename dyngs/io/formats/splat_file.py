@@ -101,31 +101,18 @@ def offset_notes(splat: SplatFile, remark: str) -> tuple[str, ...]:
 
 
 def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
-    """Return the contents with values that can be drawn, and a note about each kind of change; see
-    ``read_splats``.
+    """Return the contents with values that can be drawn; see ``read_splats``.
 
     Raises DyngsError: no Gaussians, or none that can be drawn, or ``nonfinite`` is "error" and some
     cannot.
     """
-    notes = list(splat.notes)
+    notes = splat.notes
     gaussians = splat.gaussians
     total = len(gaussians)
     logits = gaussians.logit_opacities
+    logits = torch.where(logits.isinf(), logits.clamp(-MOST_LOGIT, MOST_LOGIT), logits)
     scales = gaussians.log_scales
-    opaque = int((logits == torch.inf).sum())
-    clear = int((logits == -torch.inf).sum())
-    if opaque or clear:
-        kinds = [f"{opaque:,} exactly opaque"] * bool(opaque)
-        kinds += [f"{clear:,} exactly transparent"] * bool(clear)
-        notes.append(
-            f"{' and '.join(kinds)} Gaussians (infinite logits) are brought within 1e-07 of that"
-        )
-        logits = torch.where(logits.isinf(), logits.clamp(-MOST_LOGIT, MOST_LOGIT), logits)
-    flat = scales == -torch.inf
-    if bool(flat.any()):
-        count = int(flat.any(1).sum())
-        notes.append(f"{count:,} Gaussians with a size of 0 along an axis get 1e-13 instead")
-        scales = torch.where(flat, torch.full_like(scales, LEAST_LOG_SCALE), scales)
+    scales = torch.where(scales == -torch.inf, LEAST_LOG_SCALE, scales)
     gaussians = gaussians.replace(logit_opacities=logits, log_scales=scales)
     good = finite_rows(list(gaussians.tensors().values())) & ~(scales > MOST_LOG_SCALE).any(1)
     count = int((~good).sum())
@@ -134,10 +121,10 @@ def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
         if nonfinite == "error":
             raise DyngsError(f"{path}: {bad} have non-finite values (NaN or Inf)")
         gaussians = gaussians.select(good)
-        notes.append(f"{bad} are left out: they have non-finite values (NaN or Inf)")
+        notes += (f"{bad} are left out: they have non-finite values (NaN or Inf)",)
     if len(gaussians) == 0:
         raise DyngsError(f"{path}: holds no Gaussians" + (" with finite values" if total else ""))
-    return replace(splat, gaussians=gaussians, notes=tuple(notes))
+    return replace(splat, gaussians=gaussians, notes=notes)
 
 
 def require_writable(path: Path, gaussians: Gaussians) -> None:
