@@ -325,13 +325,6 @@ def read_a_log(root: Path) -> object:
         return seconds
 
 
-def read_a_load(root: Path) -> object:
-    """Read the workload of a benchmark."""
-    from dyngs.cli.kernel_bench import garden_workload
-
-    return garden_workload(only(root))
-
-
 def only(root: Path) -> Path:
     """Return the file of the folder that is named ``a``."""
     return next((path for path in sorted(root.iterdir()) if path.stem == "a"), root / "a")
@@ -451,6 +444,5 @@ READERS: dict[str, Reader] = {
     "points": Reader({"point": files.write_measurement}, read_a_point),
     "options": Reader({"words": files.write_words}, read_option_values, names_file=False),
     "logs": Reader({"log": files.write_log}, read_a_log, writes=True),
-    "bench": Reader({"load": files.write_load}, read_a_load),
 }
 """Readers by their names on the command line."""

@@ -51,7 +51,6 @@ SHORTER = {
 """Appended where a command is run."""
 NOT_RUN = {
     "demo": "trains 3,000 steps; tests/test_demo.py runs it with fewer",
-    "bench": "takes half a minute; tests/bench runs it on less",
     "data sfm": "needs photos with something to match; tests/capture/test_sfm.py has some",
     "view": "serves a page until it is stopped; tests/view opens it in a browser",
     "predict": "needs a trained network; tests/cli/test_predict.py has one",
@@ -102,7 +101,7 @@ class Command:
 
     @property
     def verb(self) -> str:
-        return " ".join(self.words[: 2 if self.words[0] in ("data", "bench") else 1])
+        return " ".join(self.words[: 2 if self.words[0] == "data" else 1])
 
 
 def blocks(page: Path, languages: tuple[str, ...]) -> Iterator[str]:

@@ -254,8 +254,7 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
-    from dyngs.evaluate.view_scores import clamped_times
-    from dyngs.export.camera_paths import parse_times
+    from dyngs.export.camera_paths import clamped_times, parse_times
 
     if arguments.times is None and arguments.time is None:
         return None

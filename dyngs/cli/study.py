@@ -1,4 +1,4 @@
-"""``dyngs compare``: several models on one capture, or networks on people. ``dyngs tradeoff``: the
+"""``dyngs compare``: several models on one capture. ``dyngs tradeoff``: the
 PSNR cost, speed and size of each setting of a run."""
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ examples:
   dyngs compare scans/bench --models static,mip,static_mcmc --minutes 2       -> compare/bench
   dyngs compare scans/dance --models static,dynamic,mine.yaml --steps 7000 data.longest_side=400
   dyngs compare scans/bench --models static,mip --max-mb 2 --out study
-  dyngs compare HELD_OUT_PEOPLE --models gps,runs/net --predict 2,3,4    networks that predict people from 2, 3, 4 views
 
 Each model is a preset or a YAML file. An interrupted command continues when it is given again. Details: docs/cli.md.
 """
@@ -56,7 +55,7 @@ def add_parser(commands: args.Commands) -> None:
     about = "capture with cameras, in any format"
     parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help=about)
     args.add_overrides(parser, "key=value", "overrides for all models")
-    names = "presets and YAML files, or networks that predict people, separated by commas"
+    names = "presets and YAML files, separated by commas"
     parser.add_argument("--models", type=_names, required=True, metavar="A,B,...", help=names)
     limit = parser.add_mutually_exclusive_group()
     about = "train each for so many minutes"
@@ -65,10 +64,6 @@ def add_parser(commands: args.Commands) -> None:
     limit.add_argument("--steps", type=kind, metavar="N", help="or so many steps")
     about = "or to a file of at most so many 1e6 bytes"
     limit.add_argument("--max-mb", type=_positive, metavar="MB", help=about)
-    predict = "predict each person of a folder of captures from so many views, and compare with views between them"
-    parser.add_argument("--predict", type=_counts, metavar="N,N,...", help=predict)
-    spread = "with --predict: from views evenly around the person, not 30 degrees apart"
-    parser.add_argument("--spread", action="store_true", help=spread)
     kind = args.whole("a number of views", 1, 20)
     about = "views on the page (default 4)"
     parser.add_argument("--views", type=kind, default=4, metavar="N", help=about)
@@ -132,10 +127,6 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _counts(text: str) -> list[int]:
-    return [args.whole("a number of views", 1, 100)(part) for part in text.split(",")]
-
-
 def _positive(text: str) -> float:
     try:
         value = float(text)
@@ -153,10 +144,6 @@ def run_compare(arguments: argparse.Namespace) -> int:
     commands."""
     capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
     out = (arguments.out or Path("compare", capture.name)).absolute()
-    if arguments.predict is not None:
-        return _predict(arguments, out)
-    if arguments.spread:
-        raise DyngsError("--spread goes with --predict")
     if arguments.minutes is None and arguments.steps is None and arguments.max_mb is None:
         raise DyngsError(
             "say what all models get the same of: --minutes M, --steps N or --max-mb MB"
@@ -229,36 +216,6 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
     print(f"written: {paths[0]} and {', '.join(path.suffix for path in paths[1:])}")
     if not can_plot():
         print_notes((MISSING,))
-
-
-def _predict(arguments: argparse.Namespace, out: Path) -> int:
-    """Compare networks that predict people; with --minutes an avatar that is trained on the same
-    images, too."""
-    from dyngs.ops.native import kernel_threads
-    from dyngs.study.people import STEM, PeopleBench, compare_people
-
-    for option in ("steps", "max_mb", "ray"):
-        if getattr(arguments, option) is not None:
-            raise DyngsError(f"--{option.replace('_', '-')} does not go with --predict")
-    other = [word for word in arguments.overrides if not word.startswith("data.")]
-    if other:
-        raise DyngsError(
-            f"{other[0]}: networks are compared as they were trained; only data.* can be given"
-        )
-    bench = PeopleBench(
-        people=arguments.capture,
-        networks=[Path(name) for name in arguments.models],
-        counts=arguments.predict,
-        spread=arguments.spread,
-        avatar_minutes=arguments.minutes,
-        data=[word.removeprefix("data.") for word in arguments.overrides],
-    )
-    # its times are CPU seconds, of which waiting threads take some
-    with kernel_threads(arguments.threads or 1):
-        table = compare_people(bench, out)
-    print_tables(numbers_table(table.title, table.head, table.cells))
-    print(f"written: {out / STEM}.md, .csv and pictures of truth, prediction and error")
-    return 0
 
 
 def run_tradeoff(arguments: argparse.Namespace) -> int:

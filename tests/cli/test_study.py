@@ -16,11 +16,9 @@ import pytest
 from moving_scene import write_moving_run
 from PIL import Image
 from refused import error_line
-from tiny_stereo import stereo_config, stereo_people
 from toy_plugin import installed
 
 from dyngs.api.budget import time as budget_time
-from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
@@ -265,22 +263,6 @@ def test_to_the_same_size(capture: Path, tmp_path: Path) -> None:
     assert stored["mb"] == pytest.approx(1e-6 * file.stat().st_size)
     assert 0 < stored["mb"] <= 0.05
     assert stored["seconds"] > 0
-
-
-def test_networks_are_compared_on_people(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = stereo_people(tmp_path / "set")
-    network = train(stereo_config(folder, tmp_path / "net"))
-    given = ["compare", str(folder), "--models", str(network), "--predict", "2"]
-    assert main([*given, "data.longest_side=32", "--out", str(tmp_path / "out")]) == 0
-    assert "2 views" in capsys.readouterr().out
-    assert (tmp_path / "out" / "comparison.csv").is_file()
-    assert "only data.* can be given" in error_line(capsys, *[*given, "model.eps2d=1"])
-    assert "--steps does not go with --predict" in error_line(capsys, *[*given, "--steps", "3"])
-    assert "--spread goes with --predict" in error_line(
-        capsys, *[*given[:4], "--spread", "--steps", "3"]
-    )
 
 
 def test_variants_and_a_chosen_run(

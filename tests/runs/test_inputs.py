@@ -32,7 +32,7 @@ WRITERS = {
     "atomic_file",
     "write_text",
     "write_image",
-    "VideoWriter",
+    "video_writer",
     "write_tensors",
     "save_config",
 }

@@ -68,9 +68,7 @@ def with_poses(
         say(
             f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
         )
-        options = SfmOptions(
-            masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels
-        )
+        options = SfmOptions(masks=masks, follow_links=data.follow_links)
         if videos:
             say(poses_of_videos(source, folder, options, report))
         else:

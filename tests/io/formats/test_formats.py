@@ -20,7 +20,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import splat_options
-from dyngs.io.fields import VARIABLE
+from dyngs.io.containment import LIMITS_VARIABLE
 from dyngs.io.formats.formats import (
     FORMATS,
     Format,
@@ -131,7 +131,7 @@ def test_counts_beyond_the_file_cost_nothing(
     import gzip
     import struct
 
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(LIMITS_VARIABLE, raising=False)
     head = struct.pack("<4sIIBBBB", b"NGSP", 3, 4_000_000_000, 3, 12, 0, 0)
     (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(1000)))
     with pytest.raises(DyngsError, match="asks for 4,000,000,000 Gaussians"):
