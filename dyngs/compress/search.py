@@ -16,6 +16,7 @@ before.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -285,22 +286,20 @@ class Search:
     def _bisected(self, levels: Sequence[PruneChoice], allowed: float) -> Candidate | None:
         """Return the last of ``levels`` that loses at most ``allowed``, as if all before it did."""
         found = None
-        low = 0
-        high = len(levels)
-        while low < high:
-            middle = (low + high) // 2
-            tried = self._tried(levels[middle])
+
+        def is_too_much(choice: PruneChoice) -> bool:
+            nonlocal found
+            tried = self._tried(choice)
             keeps = tried.worst <= allowed
             self.tell(
                 f"trial {self.trials}: without {tried.choice}: {counted(tried.num_gaussians, 'Gaussian')}, "
                 f"{-tried.loss:+.2f} dB, {-tried.trained_loss:+.2f} on views trained on, "
                 f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
             )
-            if keeps:
-                found = tried
-                low = middle + 1
-            else:
-                high = middle
+            found = tried if keeps else found
+            return not keeps
+
+        bisect_left(levels, True, key=is_too_much)
         return found
 
     def _tried(self, choice: PruneChoice) -> Candidate:

@@ -16,7 +16,7 @@ from dyngs.io.lock import LOCK_NAME, writing
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import remove_leftovers
 from dyngs.models.kind import Predicts, capability
-from dyngs.runs.capture_record import RECORD_NAME, changed_files
+from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
 
@@ -140,7 +140,7 @@ def note_root(folder: Path, data: DataConfig) -> None:
         if stored is not None and stored.data.root != data.root:
             is_network = capability(stored.model, Predicts) is not None
             capture = None if is_network else read_capture(data)
-            changed_files(folder, data, capture)
+            require_same_capture(folder, data, capture)
             save_config(
                 stored.model_copy(
                     update={"data": stored.data.model_copy(update={"root": data.root})}

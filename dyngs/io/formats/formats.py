@@ -22,7 +22,7 @@ from dyngs.io.formats.similarity import (
     axis_of,
     turn_between,
 )
-from dyngs.io.formats.sog import SOG_META, read_sog, write_sog
+from dyngs.io.formats.sog import read_sog, write_sog
 from dyngs.io.formats.splat_file import (
     Nonfinite,
     SplatFile,
@@ -95,24 +95,11 @@ def known_format(path: Path) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if
-    it is none.
-
-    A run is none, whatever lies in its folder.
-    """
-    if (path / "config.yaml").is_file():
-        return None
-    if sog_meta(path) is not None:
-        return format_named("sog")
+    """Return the format that a file is read as, also a checkpoint; None if it is none, or a
+    folder."""
     if path.is_dir():
         return None
     return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
-
-
-def sog_meta(path: Path) -> Path | None:
-    """Return the ``meta.json`` that is, or lies in, ``path``; None: it is something else."""
-    inner = path if path.name == SOG_META else path / SOG_META
-    return inner if inner.is_file() else None
 
 
 def format_named(name: str) -> Format:
@@ -141,7 +128,6 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     if not path.exists():
         raise DyngsError(f"{path}: no such file")
     require_regular(path)
-    path = sog_meta(path) or path
     with reading(path):
         splat = own.read(path)
         if splat.up is None:
