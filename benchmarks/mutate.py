@@ -111,7 +111,7 @@ MUTATIONS = (
     ("export/html/numbers.py", "np.roll(quats, 1, axis=1)", "np.roll(quats, 2, axis=1)", "export/test_page_numbers.py export/test_pages.py"),
     ("runs/checkpoint.py", "[:-KEEP_CHECKPOINTS]", "[KEEP_CHECKPOINTS:]", "runs/test_checkpoint.py"),
     ("runs/checkpoint.py", "if int(s) < step}", "if int(s) != step}", "runs/test_checkpoint.py"),
-    ("io/lock.py", "fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "io/test_lock.py"),
+    ("io/outputs.py", "fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "io/test_lock.py"),
     ("runs/folder.py", "if not same or checkpoint_paths(folder)", "if not same", "runs/test_folder.py"),
     ("runs/folder.py", "RunConfig(seed=config.run.seed)", "RunConfig()", "runs/test_folder.py"),
     ("io/containment.py", "amount > most and amount > allowed(most)", "amount > most", "io/test_limits.py"),

@@ -10,7 +10,7 @@ import pytest
 
 from dyngs.cli import main
 from dyngs.cli.demo_run import DemoOptions, DemoResult, claimed_folder, demo_config, run_demo
-from dyngs.io.lock import LOCK_NAME
+from dyngs.io.outputs import LOCK_NAME
 
 TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 

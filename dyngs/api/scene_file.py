@@ -10,10 +10,7 @@ from dyngs.config.io import load_resolved
 from dyngs.models.checkpoint import restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import folder_of_export
-from dyngs.runs.frame import read_frame, write_frame
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import folder_of_export, inputs_of, read_frame, write_config, write_frame
 from dyngs.runs.stored_file import FIELD, drawable, encoded, write_scene
 
 

@@ -17,7 +17,7 @@ from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.splat_files import write_run_splats
-from dyngs.io.lock import LOCK_NAME, InUseError, writing
+from dyngs.io.outputs import LOCK_NAME, InUseError, writing
 from dyngs.runs.opened import open_run
 from dyngs.training.events import Listener
 

@@ -429,7 +429,7 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
 
 def _export_avatar(arguments: argparse.Namespace) -> int:
     from dyngs.human.avatar.avatar_file import write_avatar
-    from dyngs.runs.inputs import inputs_of
+    from dyngs.runs.folder import inputs_of
     from dyngs.runs.opened import open_run
 
     path = arguments.out or arguments.run_dir / "avatar.safetensors"

@@ -148,8 +148,8 @@ def run_compare(arguments: argparse.Namespace) -> int:
         raise DyngsError(
             "say what all models get the same of: --minutes M, --steps N or --max-mb MB"
         )
-    from dyngs.io.lock import writing
-    from dyngs.runs.inputs import inputs_of
+    from dyngs.io.outputs import writing
+    from dyngs.runs.folder import inputs_of
     from dyngs.study import report as files
     from dyngs.study.models import Comparison, compare, planned, require_same_comparison
     from dyngs.study.sweep import table_rows
@@ -223,7 +223,7 @@ def run_tradeoff(arguments: argparse.Namespace) -> int:
     commands."""
     from contextlib import nullcontext
 
-    from dyngs.io.lock import writing
+    from dyngs.io.outputs import writing
 
     target = Path(arguments.target)
     out: Path | None = arguments.out or (target / "tradeoff" if target.is_dir() else None)

@@ -14,7 +14,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, printable, show
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.study.measure import Bench, Measurement, Subject
 from dyngs.study.runs import done_in_turn, require_same_study
 from dyngs.study.variants import (

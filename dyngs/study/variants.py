@@ -36,7 +36,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.config_file import write_config
+from dyngs.runs.folder import write_config
 from dyngs.runs.stored_file import write_scene
 from dyngs.study.runs import finished
 from dyngs.training.new_trainer import assemble
