@@ -35,7 +35,7 @@ from dyngs.evaluate.view_scores import (
     seconds_in_turn,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
+from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, PoseComparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of
@@ -104,12 +104,16 @@ def scores_from_own_poses(
 
 
 def _person_scores(
-    avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
+    avatar: HumanScene,
+    drawing: Drawing,
+    images: ImageLoader,
+    lpips: Lpips,
+    comparison: PoseComparison,
 ) -> PoseScores:
-    fitted = fitted_to_images(avatar, images, drawing.background, comparison)
+    fitted, updates = fitted_to_images(avatar, images, drawing.background, comparison)
     each = (images[i] for i in range(len(images)))
-    views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
-    return PoseScores(**means_of(views), updates=fmean(fitted.updates), per_view=tuple(views))
+    views, _ = score_views(fitted, each, drawing.options, drawing.background, lpips)
+    return PoseScores(**means_of(views), updates=fmean(updates), per_view=tuple(views))
 
 
 def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
