@@ -285,7 +285,7 @@ class PoseRefit:
             map(self._is_fitted, range(len(scene.clip)))
         )
 
-    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, str] | None:
+    def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, str] | None:
         """Return the scene as it is after ``step``, and a line if that was decided; None: nothing
         is to do."""
         since = [step - start for start in self._starts if start <= step]

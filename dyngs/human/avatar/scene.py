@@ -22,7 +22,6 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
-from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (
     LEFT_OUT,
     Anchors,
@@ -308,18 +307,20 @@ class HumanScene(GaussianScene, Posable):
 
 
 def first_scene(
-    gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
+    gaussians: Gaussians,
+    anchors: Anchors,
+    skeleton: Skeleton,
+    clip: MotionClip,
+    shapes: PoseBlendShapes | None = None,
 ) -> HumanScene:
-    """Return the scene of the first Gaussians: nothing is learned yet; light only with their
-    ``normals`` (N, 3)."""
-    clip = subject.motion.clip
+    """Return the scene of the first Gaussians, on their ``anchors``: nothing is learned yet."""
     return HumanScene(
         gaussians=gaussians,
-        anchors=subject.anchors,
-        skeleton=subject.skeleton,
+        anchors=anchors,
+        skeleton=skeleton,
         clip=clip,
-        learned=new_corrections(clip, subject.skeleton, subject.anchors, normals),
-        shapes=subject.shapes,
+        learned=new_corrections(clip, skeleton, anchors),
+        shapes=shapes,
     )
 
 

@@ -39,7 +39,7 @@ from dyngs.human.predict.fields.network import (
     blended,
     mean_and_variance,
 )
-from dyngs.human.predict.fields.people import OUTWARDS, Boundaries, PosedBody
+from dyngs.human.predict.people import OUTWARDS, Boundaries, PosedBody
 from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Rays
 

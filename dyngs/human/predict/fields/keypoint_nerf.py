@@ -34,7 +34,7 @@ from dyngs.human.predict.fields.network import (
     blended,
     mean_and_variance,
 )
-from dyngs.human.predict.fields.people import KEY_POINTS, PosedBody, Sources
+from dyngs.human.predict.people import KEY_POINTS, PosedBody, Sources
 from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
 from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
 

@@ -20,7 +20,9 @@ from dyngs.human.body.body_reader import default_template, read_body
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.human.predict.fields.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.fields.network import FieldNetwork
-from dyngs.human.predict.fields.people import (
+from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
+from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments
+from dyngs.human.predict.people import (
     Person,
     metric,
     person_of,
@@ -29,8 +31,6 @@ from dyngs.human.predict.fields.people import (
     spread,
     window,
 )
-from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
-from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     Example,

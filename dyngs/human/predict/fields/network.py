@@ -16,9 +16,8 @@ from torch.nn.functional import grid_sample
 from dyngs.core.camera import Cameras
 from dyngs.core.initialisation import glorot
 from dyngs.data.loader import Image
-from dyngs.human.predict.fields.people import PosedBody, Sources
-from dyngs.human.predict.gps.stereo import Encoder
-from dyngs.models.prediction import begin_weights, upsampled
+from dyngs.human.predict.people import PosedBody, Sources
+from dyngs.models.prediction import Encoder, begin_weights, upsampled
 from dyngs.ops.perceptron import Layer, perceptron
 
 FINE = 8

@@ -21,7 +21,7 @@ from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.keys import PredictedFieldModel
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
-from dyngs.human.predict.fields.people import MULTIPLE, PosedBody, Sources, metric
+from dyngs.human.predict.people import MULTIPLE, PosedBody, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated

@@ -30,7 +30,7 @@ from torch.nn.functional import (
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.predict.gps.rectification import RectifiedPair
-from dyngs.models.prediction import ResidualBlock, begin_weights, upsampled
+from dyngs.models.prediction import Encoder, ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
 
 QUARTER = 4
@@ -46,26 +46,6 @@ _SHARPNESS = 2.0
 _NEVER = -1e4  # Logits of upsampling: by squared distance, and of what cannot be
 SIDES = (1.0, -1.0)
 """A larger offset lies further left in the right view, further right in the left one."""
-
-
-class Encoder(nn.Module):
-    """Features (B, C, ...) of images at 1/2, 1/4 and 1/8 of their resolution."""
-
-    def __init__(self, channels: int, widths: Sequence[int]) -> None:
-        super().__init__()
-        self.down = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(before, width, 5 if i == 0 else 3, 2, 2 if i == 0 else 1),
-                ResidualBlock(width),
-            )
-            for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
-        )
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        levels = [images]
-        for layer in self.down:
-            levels.append(layer(levels[-1]))
-        return levels[1:]
 
 
 class StereoNetwork(nn.Module):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.human.predict.fields.people import (
+from dyngs.human.predict.people import (
     INWARDS,
     OUTWARDS,
     Boundaries,

@@ -14,7 +14,7 @@ from dyngs.human.predict.fields.eg_human_nerf import (
     opacities,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.fields.people import Boundaries, Person, metric, sources_of, window
+from dyngs.human.predict.people import Boundaries, Person, metric, sources_of, window
 
 
 def network_with() -> EgHumanNerf:

@@ -8,7 +8,7 @@ from dyngs.human.predict.fields.network import (
     SourceFeatures,
     blended,
 )
-from dyngs.human.predict.fields.people import Sources
+from dyngs.human.predict.people import Sources
 
 FOCAL, WIDTH, HEIGHT = 20.0, 32, 24
 

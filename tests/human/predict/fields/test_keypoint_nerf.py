@@ -14,7 +14,7 @@ from dyngs.human.predict.fields.keypoint_nerf import (
     spatial_code,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.fields.people import Person, PosedBody, Sources, metric, sources_of, window
+from dyngs.human.predict.people import Person, PosedBody, Sources, metric, sources_of, window
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,14 @@ import torch
 
 from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.observations import project_points
-from dyngs.human.predict.fields.people import (
+from dyngs.human.predict.gps.rectification import moments
+from dyngs.human.predict.people import (
     Person,
     metric,
     require_shown,
     sources_of,
     spread,
 )
-from dyngs.human.predict.gps.rectification import moments
 
 
 def test_key_points_lie_in_the_person(person: Person) -> None:

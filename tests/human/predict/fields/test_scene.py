@@ -14,13 +14,13 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
 from dyngs.human.predict.fields.keys import PredictedFieldModel
-from dyngs.human.predict.fields.people import Person, sources_of
 from dyngs.human.predict.fields.scene import (
     NETWORKS,
     PredictedField,
     around_in,
     stored_field,
 )
+from dyngs.human.predict.people import Person, sources_of
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
 from dyngs.models.renderable import DrawOptions
 

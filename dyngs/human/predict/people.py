@@ -1,5 +1,5 @@
-"""Captured people with their bodies and images, as networks that predict fields see them: in metres
-of the body.
+"""Captured people with their bodies and images, as networks see them: those that predict fields in
+metres of the body.
 
 Local letters: V images of H x W pixels, J key points, M vertices, T triangles.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.capture import View
+from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.human.avatar.posing import BodyPose, frame_pose
@@ -76,7 +76,7 @@ class Person:
     """One capture of a person."""
 
     name: str
-    template: BodyTemplate  # in the person's shape
+    body: BodyTemplate  # the template in the person's shape, without a shape space
     motion: CapturedMotion
     images: ImageLoader
     _bodies: dict[int | None, tuple[PosedBody, float]] = field(default_factory=dict)
@@ -86,62 +86,60 @@ class Person:
         return self.images.views
 
     def pose_in(self, view: View) -> BodyPose:
-        return frame_pose(
-            self.motion.clip, self.motion.rows[-1 if view.frame is None else view.frame]
-        )
+        row = self.motion.rows[-1 if view.frame is None else view.frame]
+        return frame_pose(self.motion.clip, row)
 
-    def body_in(self, view: View) -> tuple[PosedBody, float]:
-        """Return the body in the pose of ``view``, and how many world units are a metre; kept."""
-        if view.frame not in self._bodies:
-            self._bodies[view.frame] = self._posed(view)
-        return self._bodies[view.frame]
-
-    def _posed(self, view: View) -> tuple[PosedBody, float]:
-        pose = self.pose_in(view)
-        body = self.template
-        vertices = body.vertices
+    def posed(self, vertices: Tensor, pose: BodyPose) -> tuple[Tensor, Tensor]:
+        """Return ``vertices`` (M, 3) at rest, and the joints (J, 3), in a pose before scale and
+        translation."""
+        body = self.body
         if body.pose_dirs is not None:
             features = (pose.rotations[1:] - torch.eye(3, device=vertices.device)).flatten()
             vertices = vertices + (features @ body.pose_dirs).unflatten(0, (-1, 3))
         moves = joint_transforms(body.joints, body.parents, pose.rotations)
-        shift = pose.trans / pose.scale
-        joints = apply_transforms(moves, body.joints)[:KEY_POINTS] + shift
-        posed = apply_transforms(blend_transforms(body.weights, moves), vertices) + shift
-        return PosedBody(joints, posed, body.faces), float(pose.scale)
+        posed = apply_transforms(blend_transforms(body.weights, moves), vertices)
+        return posed, apply_transforms(moves, body.joints)
+
+    def body_in(self, view: View) -> tuple[PosedBody, float]:
+        """Return the body in the pose of ``view``, and how many world units are a metre; kept."""
+        if view.frame not in self._bodies:
+            pose = self.pose_in(view)
+            vertices, joints = self.posed(self.body.vertices, pose)
+            shift = pose.trans / pose.scale
+            body = PosedBody(joints[:KEY_POINTS] + shift, vertices + shift, self.body.faces)
+            self._bodies[view.frame] = body, float(pose.scale)
+        return self._bodies[view.frame]
 
 
-def person_of(data: DataConfig, template: BodyTemplate) -> Person:
-    """Return the person of a capture.
+def person_in(capture: Capture, template: BodyTemplate, images: ImageLoader) -> Person:
+    """Return the person of a capture with its ``images``.
 
     Raises DyngsError: no body parameters, no silhouettes, or a view without parameters.
     """
-    capture = read_capture(data)
-    if capture.body is None:
+    if capture.body is None or not capture.has_alpha:
+        missing = "silhouettes" if capture.body is not None else "body parameters"
         raise DyngsError(
-            f"{data.root}: has no body parameters, which say where the key points are; `dyngs data fit` finds them"
-        )
-    if not capture.has_alpha:
-        raise DyngsError(
-            f"{data.root}: the images have no silhouettes; give them alpha, see docs/human.md"
+            f"{capture.root}: has no {missing}, which a prediction needs; see docs/human.md"
         )
     given = capture.body["train"]
-    views = capture.splits["train"]
     vertices, joints = rest_shape(template, given)
-    motion = captured_motion(capture.root, given, views, joints)
-    return Person(
-        name=capture.root.name,
-        template=replace(template, vertices=vertices, joints=joints, **_NO_SHAPES),
-        motion=motion,
-        images=ImageLoader(views, data, with_maps=True),
+    body = replace(
+        template,
+        vertices=vertices,
+        joints=joints,
+        shape_dirs=None,
+        joint_shape_dirs=None,
+        expression_dirs=None,
+        joint_expression_dirs=None,
     )
+    motion = captured_motion(capture.root, given, capture.splits["train"], joints)
+    return Person(capture.root.name, body, motion, images)
 
 
-_NO_SHAPES = {
-    "shape_dirs": None,
-    "joint_shape_dirs": None,
-    "expression_dirs": None,
-    "joint_expression_dirs": None,
-}
+def person_of(data: DataConfig, template: BodyTemplate) -> Person:
+    """Return the person of a capture with depth maps; see ``person_in``."""
+    capture = read_capture(data)
+    return person_in(capture, template, ImageLoader(capture.splits["train"], data, with_maps=True))
 
 
 def metric(cameras: Cameras, scale: float) -> Cameras:
