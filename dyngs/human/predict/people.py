@@ -214,11 +214,6 @@ def window(image: Image, left: int, top: int, side: int) -> Image:
     return cut_out(image, top, left, height, width)
 
 
-def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
-    """Return ``count`` of the views of a ring, evenly around it from the one at ``first`` on."""
-    return [ring[(first + round(i * len(ring) / count)) % len(ring)] for i in range(count)]
-
-
 OUTWARDS, INWARDS = 0.06, 0.04  # How far the copies are from the mesh, m
 _NEAREST = 0.05  # Least depth of what is drawn, m
 

@@ -21,14 +21,13 @@ from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.human.predict.fields.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.fields.network import FieldNetwork
 from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
-from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments
+from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments, spread, well_spread
 from dyngs.human.predict.people import (
     Person,
     metric,
     person_of,
     require_shown,
     sources_of,
-    spread,
     window,
 )
 from dyngs.models.checkpoint import Checkpoint
@@ -59,11 +58,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
         self._person = person
 
     def chosen(self, count: int) -> list[int]:
-        """See ``Predictor``: evenly around the person, at the first of the moments that most views
-        show."""
-        rings = moments(self.views)
-        ring = max(rings.values(), key=len)
-        return sorted(set(spread(ring, min(count, len(ring)))))
+        return well_spread(self.views, count)
 
     def predict(self, views: Sequence[int]) -> PredictedField:
         shown = [self.views[i] for i in views]

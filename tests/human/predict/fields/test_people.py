@@ -10,13 +10,12 @@ import torch
 
 from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.observations import project_points
-from dyngs.human.predict.gps.rectification import moments
+from dyngs.human.predict.gps.rectification import moments, spread
 from dyngs.human.predict.people import (
     Person,
     metric,
     require_shown,
     sources_of,
-    spread,
 )
 
 
