@@ -218,10 +218,10 @@ def kept_open(
     return opened
 
 
-def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
-    """Let ``network`` take the weights of a checkpoint. Raises DyngsError: of another network, or
-    damaged."""
-    weights = checkpoint.part("model.network")
+def load_weights(network: nn.Module, checkpoint: Checkpoint, part: str = "model.network") -> None:
+    """Let ``network`` take the weights in a part of a checkpoint. Raises DyngsError: of another
+    network, or damaged."""
+    weights = checkpoint.part(part)
     own = network.state_dict()
     if {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
         raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from dyngs.data.read import read_capture
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import rest_shape
-from dyngs.human.body.mesh import Fragments, rasterize, vertex_normals
+from dyngs.human.body.mesh import rasterize, vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.human.predict.gps.rectification import cropped, cut_out
@@ -33,7 +32,6 @@ KEY_POINTS = 22
 """Joints that are key points: those of the body, which SMPL, SMPL-H and SMPL-X have in common."""
 MULTIPLE = 8  # Sides of images are padded to multiples of so many pixels
 MARGIN = 8  # px of background around a person
-MISFIT = 0.25  # Of the size of a silhouette, how far its box may be from that of the body
 
 
 @dataclass(frozen=True)
@@ -171,46 +169,17 @@ def sources_of(images: Sequence[Image], scale: float) -> Sources:
     return Sources(rgba, poses, intrinsics)
 
 
-def require_shown(name: str, image: Image, body: PosedBody, scale: float) -> None:
-    """Raise DyngsError, for the capture ``name``, unless an image shows a person where the body is
-    (world units in m).
-
-    The box of its silhouette must be that of the body, to ``MISFIT`` of its longer side: clothes
-    and hair stand out less, and cameras that are wrong rarely do.
-    """
-    assert image.alpha is not None
-    rows, columns = ((image.alpha > 0.5).any(side).nonzero()[:, 0] for side in (1, 0))
-    if not len(rows):
-        raise DyngsError(
-            f"{name}: {image.name} shows no silhouette of a person; give its mask, or other views"
-        )
-    camera = metric(image.cameras.to(dtype=torch.float32), scale)
-    local = body.vertices @ camera.cam_from_world[0, :3, :3].T + camera.cam_from_world[0, :3, 3]
-    if bool((local[:, 2] <= 0).any()):
-        raise DyngsError(
-            f"{name}: the body lies behind the camera of {image.name}; its calibration or the body is wrong"
-        )
-    pixels = (local @ camera.intrinsics[0].T)[:, :2] / local[:, 2:]
-    size = pixels.new_tensor([camera.width, camera.height])
-    shown = torch.stack([torch.stack([x[0], x[-1] + 1]) for x in (columns, rows)], 1).to(pixels)
-    apart = (shown - torch.stack([pixels.amin(0), pixels.amax(0)]).clamp_min(0).minimum(size)).abs()
-    if float(apart.max()) > MISFIT * float((shown[1] - shown[0]).max()):
-        raise DyngsError(
-            f"{name}: {image.name} shows the person {float(apart.max()):.0f} px from where the body is by its camera; "
-            "the calibration or the body is wrong"
-        )
-
-
 def window(image: Image, left: int, top: int, side: int) -> Image:
     """Return the square of ``side`` px of an image, with its camera and depth, that begins at a
     column and row.
 
     It is moved into the image, and is smaller only where the image is.
     """
-    width = min(side, image.cameras.width)
-    height = min(side, image.cameras.height)
-    left = min(max(left, 0), image.cameras.width - width)
-    top = min(max(top, 0), image.cameras.height - height)
+    camera = image.cameras
+    width = min(side, camera.width)
+    height = min(side, camera.height)
+    left = min(max(left, 0), camera.width - width)
+    top = min(max(top, 0), camera.height - height)
     return cut_out(image, top, left, height, width)
 
 
@@ -218,67 +187,45 @@ OUTWARDS, INWARDS = 0.06, 0.04  # How far the copies are from the mesh, m
 _NEAREST = 0.05  # Least depth of what is drawn, m
 
 
-@dataclass(frozen=True)
-class Interval:
-    """Where the rays of H x W pixels may meet a person, as depths in m; infinite where they do
-    not."""
-
-    begin: Tensor  # (H, W) where they come in
-    end: Tensor  # (H, W) where they are surely inside, or come out
-    body: Tensor  # (H, W) where they meet the body itself
-
-
 class Boundaries:
-    """The meshes of a body."""
+    """The meshes of a body, and of a dilated and an eroded copy."""
 
     def __init__(self, body: PosedBody) -> None:
-        self._body = body
-
-    @cached_property
-    def _meshes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Triangles (T, 3), and vertices (M, 3) of the body, of the dilated and of the eroded
-        copy."""
-        vertices, faces = (x.cpu().numpy() for x in (self._body.vertices, self._body.faces))
-        vertices = vertices.astype(np.float64)
-        normals = vertex_normals(vertices, faces)
-        return faces, vertices, vertices + OUTWARDS * normals, vertices - INWARDS * normals
-
-    @cached_property
-    def _tree(self) -> tuple[KDTree, np.ndarray]:
-        """Return the vertices of the body (M, 3) to be searched, and their normals (M, 3)."""
-        faces, vertices, _, _ = self._meshes
-        return KDTree(vertices), vertex_normals(vertices, faces)
+        self._faces = body.faces.cpu().numpy()
+        self._body = body.vertices.cpu().numpy().astype(np.float64)
+        self._normals = vertex_normals(self._body, self._faces)
+        self._tree = KDTree(self._body)
 
     def height(self, points: Tensor) -> Tensor:
         """Return how far points (N, 3) are from the nearest vertex of the body, m; negative
         inside."""
-        tree, normals = self._tree
         places = points.detach().cpu().double().numpy()
-        found, rows = tree.query(places)
-        distance = np.asarray(found)
-        nearest = np.asarray(rows)
-        inside = ((places - tree.data[nearest]) * normals[nearest]).sum(1) < 0
+        distance, nearest = (np.asarray(x) for x in self._tree.query(places))
+        inside = ((places - self._body[nearest]) * self._normals[nearest]).sum(1) < 0
         return torch.from_numpy(np.where(inside, -distance, distance)).to(points)
 
     def depth(self, camera: Cameras) -> Tensor:
         """Return depths (H, W) of the body, m, infinite beside it."""
-        faces, body, _, _ = self._meshes
-        return depths(body, faces, camera)
+        return depths(self._body, self._faces, camera)
 
-    def interval(self, camera: Cameras) -> Interval:
-        """Return where the rays of one camera may meet the person."""
-        faces, body, outer, inner = self._meshes
-        begin = depths(outer, faces, camera)
-        out = depths(outer, faces, camera, last=True)
+    def interval(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where the rays of one camera may meet the person, as depths (H, W) in m; infinite
+        where they do not.
+
+        Where they come in; where they are surely inside, or come out; where they meet the body.
+        """
+        outer = self._body + OUTWARDS * self._normals
+        inner = self._body - INWARDS * self._normals
+        begin = depths(outer, self._faces, camera)
+        out = depths(outer, self._faces, camera, last=True)
         # what is thinner than the copy is eroded is turned inside out: its back faces lie before
         # its front, and where there are cavities (mouth, eyes) and between fingers even front faces
         # do; nobody is inside before the body
-        surely = depths(inner, faces, camera, front_faces=True)
-        met = depths(body, faces, camera)
-        end = torch.where(
-            met.isfinite(), torch.minimum(torch.maximum(surely, met + INWARDS / 2), out), out
-        )
-        return Interval(begin, torch.maximum(end, begin), met)
+        surely = depths(inner, self._faces, camera, front_faces=True)
+        met = self.depth(camera)
+        inside = torch.minimum(torch.maximum(surely, met + INWARDS / 2), out)
+        end = torch.where(met.isfinite(), inside, out)
+        return begin, torch.maximum(end, begin), met
 
 
 def depths(
@@ -300,21 +247,14 @@ def depths(
     inverse = 1 / np.maximum(local[:, 2], _NEAREST)
     pixels = (local @ k.T)[:, :2] * inverse[:, None] - 0.5
     most = 1.01 / _NEAREST
-    corners = np.concatenate([pixels, (most - inverse if last else inverse)[:, None]], axis=1)[
-        faces
-    ]
-    (x0, x1, x2), (y0, y1, y2) = corners[..., 0].T, corners[..., 1].T
+    corners = np.concatenate([pixels, (most - inverse if last else inverse)[:, None]], axis=1)
+    corners = corners[faces]
     hidden = (local[faces, 2] <= _NEAREST).any(axis=1)
     if front_faces:
+        (x0, x1, x2), (y0, y1, y2) = corners[..., 0].T, corners[..., 1].T
         hidden |= (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0) >= 0  # rows go down
-    near_image = (
-        (corners[..., 0].max(1) >= 0)
-        & (corners[..., 0].min(1) <= camera.width - 1)
-        & (corners[..., 1].max(1) >= 0)
-        & (corners[..., 1].min(1) <= camera.height - 1)
-    )
-    corners = corners[near_image & ~hidden]
-    found: Fragments = rasterize(corners, camera.width, camera.height)
+    corners = corners[~hidden]
+    found = rasterize(corners, camera.width, camera.height)
     # linear in the image
     nearness = 1 / (found.barycentric / corners[found.faces, :, 2]).sum(axis=1)
     image = np.full(camera.height * camera.width, np.inf)
