@@ -19,7 +19,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.frame import read_frame, write_frame
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.stored_file import FIELD, decoded, drawable, encoded, write_scene
+from dyngs.runs.stored_file import decoded, drawable, encoded, write_scene
 
 MISSED = 1.05
 """A file whose images change by so many times what is allowed is not written; less is rounding of
@@ -40,7 +40,6 @@ def write_scene_file(
     run_dir: Path,
     out: Path,
     max_change: float | None = None,
-    field_step: float = 1.0,
     data_root: Path | None = None,
 ) -> SceneFile:
     """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that
@@ -48,7 +47,7 @@ def write_scene_file(
 
     ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean
     square over all values of some training images, grey levels of 255; None: what lowers their PSNR
-    by ``LOSS_DB``. ``field_step``: how many times as coarsely the field is rounded. Raises
+    by ``LOSS_DB``. Raises
     DyngsError: no such run, ``out`` holds another one, or the images would change by more than
     ``max_change``; nothing is written then.
     """
@@ -59,12 +58,8 @@ def write_scene_file(
         scene = restored_model(checkpoint, config.model)
         plan = storage_plan(config, checkpoint, scene, max_change)
         precision = plan.precision
-        steps = {
-            name: step * (field_step if name.startswith(FIELD) else 1)
-            for name, step in precision.steps.items()
-        }
-        data = encoded(checkpoint.info, scene, steps, plan.coarseness)
-        if plan.images is not None and precision.allowed is not None and field_step == 1:
+        data = encoded(checkpoint.info, scene, precision.steps, plan.coarseness)
+        if plan.images is not None and precision.allowed is not None:
             stored = restored_model(decoded(data), config.model)
             precision = _checked(run_dir, precision, plan.images(scene), plan.images(stored))
         write_scene(folder / SCENE_FILE, data)
