@@ -206,19 +206,14 @@ def markdown_text(text: str) -> str:
 
 
 def svg_of(figure: Figure) -> str:
-    """Return a figure as an SVG element, whose points have their labels as tooltips; equal figures
-    give equal text."""
+    """Return a figure as an SVG element; equal figures give equal text."""
     import matplotlib
 
     file = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "dyngs", "svg.fonttype": "none"}):
         figure.savefig(file, format="svg", metadata={"Date": None})
     text = file.getvalue()
-    text = text[text.index("<svg") :]
-    tips = {line.get_gid() for axes in figure.axes for line in axes.lines if line.get_gid()}
-    for tip in map(str, tips):
-        text = text.replace(f'<g id="{tip}">', f"<g><title>{escape(tip)}</title>")
-    return text
+    return text[text.index("<svg") :]
 
 
 def _logarithmic(axes: Axes, label: str, title: str) -> None:
@@ -252,17 +247,11 @@ def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
     """Return two panels, PSNR against speed and against size, and a legend; ``settings``: of each
     row.
 
-    A thin line joins the run with the values of one setting in their order; the thick grey line is
-    the Pareto front of the two axes. Values that are not positive are left out of the logarithmic
-    axes. The run itself comes first.
+    A thin line joins the run, which comes first, with the values of one setting in their order; the
+    thick grey line is the Pareto front of the two axes.
     """
-    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    names = sorted(dict.fromkeys(settings), key=lambda name: name == SEVERAL)
-    shades = colormaps["tab20"].resampled(20)
-    colours: dict[str, Any] = {name: shades(i % 20) for i, name in enumerate(names)}
-    colours |= {"": "#222222", SEVERAL: "#888888"}
     figure = Figure(figsize=(10.4, 4.6), layout="constrained")
     speed, size = figure.subplots(1, 2)
     for axes, key, sign, title, label in (
@@ -270,31 +259,17 @@ def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
         (size, "mb", -1, "PSNR and size", "MB on disk (less is better)"),
     ):
         _logarithmic(axes, label, title)
-        axes.margins(0.06)
-        shown = [(row, name) for row, name in zip(rows, settings, strict=True) if row[key] > 0]
-        best = pareto_mask([(row["psnr"], sign * row[key]) for row, _ in shown])
-        front = sorted(
-            (row[key], row["psnr"]) for (row, _), on in zip(shown, best, strict=True) if on
-        )
-        axes.plot([x for x, _ in front], [y for _, y in front], color="#d4d4d4", linewidth=5)
-        for setting in names:
-            if setting not in ("", SEVERAL):
-                joined = [row for row, name in shown if name in ("", setting)]
-                places = [row[key] for row in joined], [row["psnr"] for row in joined]
-                axes.plot(*places, color=colours[setting], linewidth=0.75)
-        for row, name in reversed(shown):  # draws the run itself on top
-            axes.plot(
-                row[key],
-                row["psnr"],
-                "o",
-                color=colours[name],
-                markeredgecolor="white",
-                ms=7 if name else 9,
-                gid=f"{row['name']}: {row['psnr']:.2f} dB, {row['fps']:.1f} fps, {row['mb']:.2f} MB",
-            )
-    handles = [
-        speed.plot([], [], "o", color=colours[name], label=name or "the run itself")[0]
-        for name in names
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+        best = pareto_mask([(row["psnr"], sign * row[key]) for row in rows])
+        front = sorted((row[key], row["psnr"]) for row, on in zip(rows, best, strict=True) if on)
+        axes.plot(*zip(*front, strict=True), color="#d4d4d4", linewidth=5)
+        for name in reversed(dict.fromkeys(settings)):  # draws the run itself on top
+            alone = name in ("", SEVERAL)
+            shown = [
+                row
+                for row, own in zip(rows, settings, strict=True)
+                if own == name or (own == "" and not alone)
+            ]
+            places = [row[key] for row in shown], [row["psnr"] for row in shown]
+            axes.plot(*places, "o" if alone else "o-", lw=0.75, label=name or "the run itself")
+    figure.legend(*speed.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return figure
