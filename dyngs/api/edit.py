@@ -19,7 +19,7 @@ from dyngs.core.errors import DyngsError, counted, show
 from dyngs.export.edit.crop import Region, held_by
 from dyngs.export.edit.frame import Frame, GeoFrame, gps_frame
 from dyngs.export.edit.merge import merged
-from dyngs.export.images import Redrawn, compare_run, compare_splats
+from dyngs.export.images import compare_run, compare_splats
 from dyngs.export.splat_files import (
     SUFFIX,
     UP,
@@ -101,7 +101,7 @@ class EditedFile:
     """
 
     path: Path
-    redrawn: Redrawn | None = None
+    redrawn: float | None = None
     notes: tuple[str, ...] = ()
 
 

@@ -106,7 +106,7 @@ def _add_sfm(verbs: args.Commands) -> None:
     start = "when a video of several begins; once for each"
     parser.add_argument("--start", action="append", default=[], metavar="NAME=SECONDS", help=start)
     args.add_threads(parser)
-    args.add_overrides(parser, "data.key=value", "data.follow_links, data.max_megapixels")
+    args.add_overrides(parser, "data.key=value", "data.follow_links")
 
 
 def _add_fit(verbs: args.Commands) -> None:
@@ -238,14 +238,12 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 def _inspect_videos(arguments: argparse.Namespace) -> int:
     from dyngs.capture.inspection.report import video_report
-    from dyngs.io.containment import images_up_to
 
     if arguments.image is not None:
         raise DyngsError(
             f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first"
         )
-    with images_up_to(args.data_section(arguments.overrides).max_megapixels):
-        print_lines(video_report(arguments.path))
+    print_lines(video_report(arguments.path))
     return 0
 
 
@@ -272,7 +270,6 @@ def run_sfm(arguments: argparse.Namespace) -> int:
         starts=_starts(arguments.start),
         num_threads=arguments.threads,
         follow_links=limits.follow_links,
-        max_megapixels=limits.max_megapixels,
     )
     with ProgressBar() as report:
         if several:

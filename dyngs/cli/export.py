@@ -29,10 +29,8 @@ _OTHER_SUFFIXES = {
     ".json": "cameras",
 }
 _SPLATS = "time times motion static dynamic up from_up"
-_TAKES = dict.fromkeys(("ply", "compressed-ply", "splat", "usd"), f"{_SPLATS} sh_degree") | {
-    "spz": f"{_SPLATS} sh_degree spz_version",
+_TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree") | {
     "sog": f"{_SPLATS} sh_degree folder",
-    "glb": f"{_SPLATS} sh_degree compress",
     MOVING: _SPLATS,
     "tracks": "time times motion dynamic",
     "dyngs": "max_change",
@@ -252,8 +250,7 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
-    from dyngs.evaluate.view_scores import clamped_times
-    from dyngs.export.camera_paths import parse_times
+    from dyngs.export.camera_paths import clamped_times, parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
@@ -281,7 +278,7 @@ def _export_splats(
         write_run_splats,
         writing_of,
     )
-    from dyngs.io.formats.formats import chosen_variant, format_named, known_format, read_splats
+    from dyngs.io.formats.formats import format_named, known_format, read_splats
 
     own = format_named(kind)
     part = _part(arguments)
@@ -293,7 +290,6 @@ def _export_splats(
         )
         print_notes((line,))
     how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
-    how = replace(how, own=chosen_variant(own, arguments.spz_version, arguments.compress))
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)

@@ -27,7 +27,6 @@ from dyngs.runs.stored_file import (
     LIMIT,
     MAX_COARSENESS,
     TRIANGLES,
-    checked_coarseness,
     coding_of,
     completed,
     decoded,
@@ -144,11 +143,7 @@ def rounded(
     ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``names``:
     of the tensors that are rounded.
     """
-    coarseness = (
-        checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"]))
-        if COARSENESS in exact
-        else None
-    )
+    coarseness = exact[COARSENESS].numpy() if COARSENESS in exact else None
     found = dict(exact)
     for name in exact if names is None else names:
         coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
@@ -321,7 +316,6 @@ class CoarseFile:
     data: bytes  # its bytes
     factor: float  # on the usual steps
     quality: float  # of the scene that is read from it
-    refused: float | None  # quality at the next coarser steps; None where none were tried
 
 
 def coarsest_file(
@@ -335,33 +329,23 @@ def coarsest_file(
     """
     scene = restored_scene(checkpoint, config.model)
     plan = storage_plan(config, checkpoint, scene, None)
-    exact = drawable(scene) | ({} if plan.coarseness is None else {COARSENESS: plan.coarseness})
-
-    def drawn(tensors: dict) -> GaussianScene:
-        return restored_scene(Checkpoint(checkpoint.info, tensors), config.model)
-
-    def steps(factor: float) -> dict[str, float]:
-        return {
-            name: step and step_below(factor * step) for name, step in plan.precision.steps.items()
-        }
-
+    best = None
     low = 0
     high = len(FACTORS)
-    refused = None
     while low < high:
         middle = (low + high) // 2
-        found = quality(drawn(completed(rounded(exact, steps(FACTORS[middle])))))
+        factor = FACTORS[middle]
+        steps = {
+            name: step and step_below(factor * step) for name, step in plan.precision.steps.items()
+        }
+        data = encoded(checkpoint.info, scene, steps, plan.coarseness)
+        found = quality(restored_scene(decoded(data), config.model))
         if found >= least:
+            best = CoarseFile(data, factor, found)
             low = middle + 1
         else:
-            refused, high = found, middle
-    for index in range(low - 1, -1, -1):
-        data = encoded(checkpoint.info, scene, steps(FACTORS[index]), plan.coarseness)
-        found = quality(drawn(decoded(data).tensors))
-        if found >= least:
-            return CoarseFile(data, FACTORS[index], found, refused)
-        refused = found
-    return None
+            high = middle
+    return best
 
 
 def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> list[Shot]:

@@ -25,7 +25,6 @@ from dyngs.gaussians.levels import MERGED, Levels, levels_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
-    Format,
     Written,
     fitted,
     format_named,
@@ -160,7 +159,6 @@ class Writing:
     # degree of the harmonics in the file; None: as they are, up to what the format holds
     sh_degree: int | None = None
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
-    own: Format | None = None  # a variant of the format that the suffix names; None: the usual one
 
 
 AS_THEY_ARE = Writing()
@@ -335,9 +333,7 @@ def splats_at(
 
 
 def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: Writing) -> Written:
-    return write_splats(
-        path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree, own=how.own
-    )
+    return write_splats(path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree)
 
 
 MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in memory

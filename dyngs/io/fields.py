@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, TextIO, TypeGuard
@@ -13,39 +12,10 @@ from typing import Any, TextIO, TypeGuard
 import numpy as np
 
 from dyngs.core.errors import DyngsError, reading, require_regular
-from dyngs.io.containment import inside
+from dyngs.io.containment import inside, require_at_most
 
-VARIABLE = "DYNGS_LIMITS"
-"""Environment variable that multiplies all limits: 4 allows four times as much of everything."""
 MOST_TEXT_BYTES = 1 << 26
 """Largest JSON or text file: 64 MiB hold the cameras of 100,000 images."""
-
-
-def allowed(most: int) -> int:
-    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not
-    set."""
-    text = os.environ.get(VARIABLE, "1")
-    try:
-        factor = float(text)
-    except ValueError:
-        factor = 0.0
-    if not 1 <= factor <= 1e6:
-        raise DyngsError(
-            f"{VARIABLE}={text:.20} must be a number from 1 to 1e6: how many times the usual limits hold"
-        )
-    return int(most * factor)
-
-
-def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
-    """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that
-    ``DYNGS_LIMITS`` may raise."""
-    if amount > most and amount > allowed(most):
-        shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
-        factor = math.ceil(amount / most) if amount < 10**18 else "N"
-        raise DyngsError(
-            f"{where}: asks for {shown} {what}, of which {allowed(most):,} are read at most; if you trust the file, "
-            f"set the environment variable {VARIABLE}={factor}"
-        )
 
 
 def read_limited(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:

@@ -191,7 +191,7 @@ def write_text(path: Path, text: str, *, durable: bool = False) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_image(path: Path, pixels: np.ndarray) -> None:
+def write_image(path: Path, pixels: np.ndarray, png_level: int = 6) -> None:
     """Write an image, atomically; the suffix names the format.
 
     Args:
@@ -199,6 +199,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         pixels: (H, W) or (H, W, C); uint8 and uint16 as they are, or floats, which are clamped to
             [0, 1] for 8-bit formats. A fourth channel is alpha: straight for PNG, premultiplied for
             EXR, as these formats want it.
+        png_level: compression of PNG, 0 to 9.
     """
     import OpenImageIO as oiio
 
@@ -216,6 +217,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("png:compressionLevel", png_level)
     with atomic_file(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:

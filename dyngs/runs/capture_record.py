@@ -115,7 +115,8 @@ def _numbers(view: View, capture: Capture) -> list[float]:
     centre = capture.world_scale * camera_center(view.cam_from_world) + capture.world_offset
     rotation = view.cam_from_world[:3, :3]
     size = (view.width, view.height, -1.0 if view.time is None else view.time)
-    lens = (*view.lens.params, view.lens.focal_ratio)
+    # Earlier versions had another number there, which was 1.
+    lens = (*view.lens.params, 1.0)
     return np.concatenate(
         [size, centre, rotation.ravel(), view.intrinsics[:2].ravel(), lens]
     ).tolist()

@@ -87,7 +87,7 @@ def test_a_hole_in_a_white_object_shows_on_black_alone(background: float) -> Non
     without = background_scores(
         image(alpha[..., None].expand(-1, -1, 3), cameras), nothing, torch.zeros(3)
     )
-    assert without == {"psnr_white": None, "psnr_black": None}
+    assert without == {}
 
 
 def test_scores_are_those_of_the_images() -> None:
@@ -170,8 +170,6 @@ def test_exposure_does_not_count() -> None:
     image, rendering = image_and_rendering()
     brighter = replace(image, rgb_premultiplied=1.4 * image.rgb_premultiplied + 0.02)
     found = right_half_scores(brighter, rendering, BLACK)
-    assert found["psnr_right"] is not None
-    assert found["psnr_right_fitted"] is not None
     assert found["psnr_right"] < 20
     assert found["psnr_right_fitted"] > 50
 
@@ -181,7 +179,6 @@ def test_errors_in_the_right_half_count_though_the_left_half_is_perfect() -> Non
     wrong = image.rgb_premultiplied.clone()
     wrong[:, 40:] = 1.4 * wrong[:, 40:]
     found = right_half_scores(replace(image, rgb_premultiplied=wrong), rendering, BLACK)
-    assert found["psnr_right_fitted"] is not None
     assert found["psnr_right_fitted"] < 25
 
 
@@ -189,8 +186,7 @@ def test_a_half_without_pixels_has_no_score() -> None:
     image, rendering = image_and_rendering()
     mask = torch.ones(60, 80)
     mask[:, :40] = 0
-    found = right_half_scores(replace(image, mask=mask), rendering, BLACK)
-    assert (found["psnr_right"], found["psnr_right_fitted"]) == (None, None)
+    assert right_half_scores(replace(image, mask=mask), rendering, BLACK) == {}
 
 
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20, 6], [0, 0, 1]]]), 20, 12)

@@ -17,10 +17,9 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, as_word, counted, printable, reading
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import camera_center, inverse_rigid
-from dyngs.data.images.lens import is_pinhole, kept_fraction
 from dyngs.data.images.video import opened_video, orientation_of, read_frames, videos_in
 from dyngs.data.times import distinct_times
-from dyngs.io.containment import images_up_to, inside, leaving_links
+from dyngs.io.containment import inside, leaving_links
 from dyngs.io.outputs import Inputs
 from dyngs.io.write import write_image
 
@@ -127,9 +126,6 @@ def _next(path: Path, moves: bool) -> list[str]:
 
 # factor between the most and the least light up to which images count as equally exposed
 SAME_LIGHT = 1.05
-MUCH_LOST = 90  # per cent of an image below which a wider pinhole is worth a word
-# different lenses that are looked at; more are not needed to tell how much is lost
-MOST_LENSES = 20
 
 
 def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
@@ -156,7 +152,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("cameras", str(len({view.camera_id for view in views}))),
         ("focal length", f"{_range(focal_px)} px"),
         ("field of view", f"{_range(fov_deg)} degrees across"),
-        ("lens", tallied(lenses) + _kept(views)),
+        ("lens", tallied(lenses)),
         *_exposures(views),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
         ("masks", masks_of(capture)[0] or "none"),
@@ -180,28 +176,6 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         )
         facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
     return tuple(facts)
-
-
-def _kept(views: Sequence[View]) -> str:
-    """Return how much of the images is left after their lens distortion is removed; empty where
-    there is none."""
-    lenses = {
-        (view.lens, view.intrinsics.tobytes(), view.width, view.height): view for view in views
-    }
-    distorted = [view for view in lenses.values() if not is_pinhole(view.lens)][:MOST_LENSES]
-    if not distorted:
-        return ""
-    fractions = [
-        100 * kept_fraction(view.lens, view.intrinsics, view.width, view.height)
-        for view in distorted
-    ]
-    shorter = [1 / view.lens.focal_ratio for view in distorted]
-    how = "with the same focal length"
-    more = " (data.undistort=wide keeps more)" if min(fractions) < MUCH_LOST else ""
-    if min(shorter) < 1:
-        how = f"to a pinhole with {_range(shorter)} of the focal length"
-        more = ""
-    return f"; undistorted {how}, which keeps {_range(fractions)} % of each image{more}"
 
 
 def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
@@ -301,10 +275,7 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     ]
     try:
         capture = read_capture(options, decode_videos=deep)
-        with (
-            images_up_to(options.max_megapixels),
-            reading(options.root, "`dyngs --debug` shows where"),
-        ):
+        with reading(options.root, "`dyngs --debug` shows where"):
             report = report_on(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *listed(links)))

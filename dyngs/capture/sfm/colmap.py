@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 from dyngs.capture.sfm.photos import Photo
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
-from dyngs.io.containment import MAX_MEGAPIXELS
 from dyngs.io.write import write_text
 
 if TYPE_CHECKING:
@@ -42,7 +41,6 @@ class SfmOptions:
         num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is
             always the same.
         follow_links: photos and videos may be links that lead out of their folder.
-        max_megapixels: larger images and videos are refused.
     """
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -51,7 +49,6 @@ class SfmOptions:
     starts: Mapping[str, float] | None = None
     num_threads: int = 0
     follow_links: bool = False
-    max_megapixels: float = MAX_MEGAPIXELS
 
 
 @dataclass(frozen=True)

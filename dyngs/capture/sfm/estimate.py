@@ -45,7 +45,7 @@ from dyngs.data.images.video import (
 )
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import write_seconds
-from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.containment import inside, staying_within
 from dyngs.io.fields import first_few
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
@@ -132,7 +132,6 @@ def estimate_poses(
     with (
         new_folder(out) as capture,
         staying_within(source, options.follow_links or source.is_file()),
-        images_up_to(options.max_megapixels),
     ):
         return _posed_in(capture, source, out, options, report)
 

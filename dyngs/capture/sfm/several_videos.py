@@ -43,7 +43,7 @@ from dyngs.data.images.video import (
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import evenly_spaced, write_seconds
-from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.containment import inside, staying_within
 from dyngs.io.fields import first_few, is_number, read_json_object
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
@@ -105,7 +105,6 @@ def poses_of_videos(
     with (
         new_folder(out) as work,
         staying_within(source, options.follow_links),
-        images_up_to(options.max_megapixels),
     ):
         lines = _write_capture(work, source, options, report)
     return "\n".join((*lines, f"written: {out}"))

@@ -235,8 +235,7 @@ def header_if_readable(path: Path) -> ImageHeader | None:
     """Read the header of a capture's image; None where it is missing or damaged, which the loader
     reports.
 
-    Raises DyngsError: the image lies outside the capture, or is larger than
-    ``data.max_megapixels``.
+    Raises DyngsError: the image lies outside the capture, or is too large.
     """
     inside(path)
     try:

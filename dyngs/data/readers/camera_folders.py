@@ -20,9 +20,8 @@ from dyngs.data.geometry import (
     opengl_from_cam,
     rescale_warning,
 )
-from dyngs.data.images.frame_cache import VideoFrames, planned_frames
 from dyngs.data.images.images import SUFFIXES, files_in
-from dyngs.data.images.video import VideoInfo, colour_notes, videos_in
+from dyngs.data.images.video import VideoFrames, VideoInfo, colour_notes, planned_frames, videos_in
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
 from dyngs.io.fields import first_few, is_number, matrix_of, read_json_object
 from dyngs.io.numpy_files import read_npy

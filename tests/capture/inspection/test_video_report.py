@@ -11,14 +11,14 @@ from stage_videos import camera, corner, write_videos
 from dyngs.capture.inspection.report import video_facts, video_report
 from dyngs.capture.sfm.several_videos import open_video
 from dyngs.cli import main
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 
 
 def _turning(path: Path, blurred: int = -1) -> Path:
-    with VideoWriter(path, fps=10) as video:
+    with video_writer(path, fps=10) as add:
         for i in range(8):
             rgb = corner(camera(30.0 + 2 * i), 0.0)
-            video.add(np.full_like(rgb, 128) if i == blurred else rgb)
+            add(np.full_like(rgb, 128) if i == blurred else rgb)
     return path
 
 

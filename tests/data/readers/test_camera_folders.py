@@ -342,14 +342,6 @@ def test_videos_and_frames(tmp_path: Path) -> None:
     assert everything.warnings == ()
 
 
-def test_the_disk_limit(tmp_path: Path) -> None:
-    write_poses_bounds(tmp_path, 2)
-    for i in range(2):
-        write_video(tmp_path / f"cam0{i}.mp4", 6)
-    with pytest.raises(DyngsError, match=r"data\.frame_cache_mb is 0\.0001"):
-        read(tmp_path, frame_cache_mb=1e-4)
-
-
 def test_a_truncated_video(tmp_path: Path) -> None:
     """An error names it, unless the chosen frames lie before the break."""
     write_poses_bounds(tmp_path, 2)

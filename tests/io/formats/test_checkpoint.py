@@ -138,5 +138,5 @@ def test_other_checkpoints_are_refused(tmp_path: Path) -> None:
         torch.save({"splats": state}, path)
         with pytest.raises(DyngsError, match=problem):
             read_splats(path)
-    with pytest.raises(DyngsError, match="names no format"):
+    with pytest.raises(DyngsError, match="no suffix of a file"):
         format_of(path)

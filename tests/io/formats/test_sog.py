@@ -66,15 +66,3 @@ def test_files_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:
     (scene / "sh0.webp").unlink()
     with pytest.raises(DyngsError, match=r"No such file or directory: .*sh0\.webp"):
         read_splats(scene)
-
-
-def test_levels_are_named(tmp_path: Path) -> None:
-    scene = unpacked(tmp_path)
-    scene.rename(tmp_path / "0_0")
-    (tmp_path / "lod-meta.json").write_text("{}")
-    for path in (tmp_path, tmp_path / "lod-meta.json"):
-        with pytest.raises(
-            DyngsError, match=r"levels of detail; give the meta\.json of one of its folders"
-        ):
-            read_splats(path)
-    assert len(read_splats(tmp_path / "0_0").gaussians) == 60

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import torch
 from dyngs.core.errors import DyngsError
 from dyngs.human.avatar.observations import project_points
 from dyngs.human.predict.fields.people import (
-    KEY_POINTS,
     Person,
     metric,
     require_shown,
@@ -22,13 +20,14 @@ from dyngs.human.predict.fields.people import (
 from dyngs.human.predict.gps.rectification import moments
 
 
-def test_key_points_are_the_true_ones(person: Person, folder: Path) -> None:
-    """In the world of the capture, once metres are its units."""
+def test_key_points_lie_in_the_person(person: Person) -> None:
+    """In all images, once metres are the units of the world."""
     body, scale = person.body_in(person.views[0])
-    with np.load(folder / "s0000" / "p000000" / "true_keypoints.npz") as found:
-        true = next(x for x in (found[name] for name in found) if x.ndim >= 2 and x.shape[-1] == 3)
-    true = torch.from_numpy(true.reshape(-1, 3)[:KEY_POINTS]).float()
-    torch.testing.assert_close(scale * body.key_points, true, atol=1e-4, rtol=0)
+    for image in person.images:
+        at, _, _ = project_points(body.key_points, metric(image.cameras, scale))
+        column, row = at.long().unbind(1)
+        assert image.alpha is not None
+        assert (image.alpha[row, column] > 0).all()
     low = body.vertices.amin(0)
     high = body.vertices.amax(0)
     assert 1.2 < float((high - low).max()) < 2.4
