@@ -14,7 +14,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.frame import read_frame, write_frame
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.stored_file import FIELD, drawable, encoded, write_scene
+from dyngs.runs.stored_file import drawable, encoded, write_scene
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,6 @@ def write_scene_file(
     run_dir: Path,
     out: Path,
     max_change: float | None = None,
-    field_step: float = 1.0,
     data_root: Path | None = None,
 ) -> SceneFile:
     """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that
@@ -39,8 +38,7 @@ def write_scene_file(
 
     ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean
     square over all values of some training images, grey levels of 255; None: what lowers their PSNR
-    by ``LOSS_DB``. ``field_step``: how many times as coarsely the field is rounded. Raises
-    DyngsError: no such run, or ``out`` holds another one; nothing is written then.
+    by ``LOSS_DB``. Raises DyngsError: no such run, or ``out`` holds another one; nothing is written then.
     """
     config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)
@@ -48,11 +46,7 @@ def write_scene_file(
         checkpoint = latest_checkpoint(run_dir)
         scene = restored_model(checkpoint, config.model)
         precision, coarseness = storage_plan(config, checkpoint, scene, max_change)
-        steps = {
-            name: step * (field_step if name.startswith(FIELD) else 1)
-            for name, step in precision.steps.items()
-        }
-        data = encoded(checkpoint.info, scene, steps, coarseness)
+        data = encoded(checkpoint.info, scene, precision.steps, coarseness)
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
             write_config(config, folder)
