@@ -11,7 +11,7 @@ from dyngs.models.checkpoint import restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.folder import folder_of_export, inputs_of, read_frame, write_config, write_frame
-from dyngs.runs.stored_file import FIELD, drawable, encoded, write_scene
+from dyngs.runs.stored_file import drawable, encoded, write_scene
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,6 @@ def write_scene_file(
     run_dir: Path,
     out: Path,
     max_change: float | None = None,
-    field_step: float = 1.0,
     data_root: Path | None = None,
 ) -> SceneFile:
     """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that
@@ -36,8 +35,8 @@ def write_scene_file(
 
     ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean
     square over all values of some training images, grey levels of 255; None: what lowers their PSNR
-    by ``LOSS_DB``. ``field_step``: how many times as coarsely the field is rounded. Raises
-    DyngsError: no such run, or ``out`` holds another one; nothing is written then.
+    by ``LOSS_DB``. Raises DyngsError: no such run, or ``out`` holds another one; nothing is written
+    then.
     """
     config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)
@@ -45,11 +44,7 @@ def write_scene_file(
         checkpoint = latest_checkpoint(run_dir)
         scene = restored_model(checkpoint, config.model)
         precision, coarseness = storage_plan(config, checkpoint, scene, max_change)
-        steps = {
-            name: step * (field_step if name.startswith(FIELD) else 1)
-            for name, step in precision.steps.items()
-        }
-        data = encoded(checkpoint.info, scene, steps, coarseness)
+        data = encoded(checkpoint.info, scene, precision.steps, coarseness)
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
             write_config(config, folder)
