@@ -354,13 +354,15 @@ def match_pairs(task: SfmTask, pairs: Sequence[tuple[int, int]]) -> None:
 def _enter_focal_lengths(task: SfmTask) -> None:
     import pycolmap
 
-    tags = dict(zip(task.names, (photo.header.tags for photo in task.photos), strict=True))
+    focals = {
+        name: photo.header.focal_px for name, photo in zip(task.names, task.photos, strict=True)
+    }
     with pycolmap.Database.open(task.database) as opened:
         first: dict[int, str] = {}
         for image in sorted(opened.read_all_images(), key=lambda image: image.name):
             first.setdefault(image.camera_id, image.name)
         for camera in opened.read_all_cameras():
-            focal = tags[first[camera.camera_id]].focal_px
+            focal = focals[first[camera.camera_id]]
             camera.has_prior_focal_length = focal is not None
             if focal is not None:
                 params = camera.params.copy()

@@ -352,7 +352,7 @@ def read_colmap(root: Path) -> Capture:
         if changed:
             rescaled.append(where)
         view = View(view_name(path, images), path, pose, intrinsics, *size, lens, image.camera)
-        exposure = None if header is None else header.tags.exposure
+        exposure = None if header is None else header.exposure
         name = Path(os.path.relpath(path, images)).as_posix()
         views.append(
             replace(view, mask_path=mask_of(name, masks), time=seconds.get(name), exposure=exposure)

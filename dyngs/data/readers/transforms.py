@@ -244,7 +244,7 @@ def _view(
         motion_mask_path=masks[0] or masks[1],
         motion_mask_labels=masks[0] is None and masks[1] is not None,
         flow_path=_named_file(files, frame, "flow_file_path"),
-        exposure=header.tags.exposure if header else None,
+        exposure=header.exposure if header else None,
     )
     return view, error, rescaled
 

@@ -129,7 +129,7 @@ def test_time_id_and_no_times(root: Path) -> None:
     edit_json(root / "metadata.json", lambda c: [m.pop("time_id") for m in c.values()])
     assert {view.time for view in read(root).splits["train"]} == {None}
     edit_json(root / "metadata.json", lambda c: c["000001"].update(warp_id=3))
-    with pytest.raises(DyngsError, match="time of .* must be a finite number"):
+    with pytest.raises(DyngsError, match=r"time of .* must be a finite number"):
         read(root)
 
 
