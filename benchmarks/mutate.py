@@ -88,7 +88,7 @@ MUTATIONS = (
     ("gaussians/schedule.py", "(1 - progress) * math.log(options.lr_means)", "progress * math.log(options.lr_means)", "gaussians/test_schedule.py"),
     ("training/corrections/exposure.py", "white = truth >= SATURATED", "white = truth >= 9", "training/corrections/test_exposure.py"),
     ("evaluate/view_scores.py", "kept = 1 - grown", "kept = (shown)[None, None].float()", "evaluate/test_regions.py"),
-    ("evaluate/view_scores.py", "~moves & inside", "~moves", "evaluate/test_regions.py"),
+    ("evaluate/view_scores.py", "else x & foreground", "else x", "evaluate/test_regions.py"),
     ("evaluate/view_scores.py", "(after - now) / (after - before)", "(now - before) / (after - before)", "evaluate/test_temporal.py"),
     ("evaluate/view_scores.py", "psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask)", "psnr(rendering.rgb[0][:, :middle], truth[:, :middle], mask)", "evaluate/test_view_scores.py"),
     ("evaluate/view_scores.py", "rendering.transmittance[0][..., None] * background", "0 * background", "evaluate/test_view_scores.py"),

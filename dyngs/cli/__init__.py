@@ -24,7 +24,6 @@ from typing import Any, NoReturn, TextIO
 
 from dyngs import __version__
 from dyngs.cli import (
-    bench,
     config,
     convert,
     data,
@@ -70,7 +69,6 @@ _COMMANDS: dict[str, Callable[[Any], None]] = {
     "tradeoff": study.add_tradeoff_parser,
     "compare": study.add_parser,
     "data": data.add_parser,
-    "bench": bench.add_parser,
     "config": config.add_parser,
     "docs": docs.add_parser,
     "doctor": doctor.add_parser,

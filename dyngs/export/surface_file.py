@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import FieldScene, space_of
 from dyngs.baselines.fields.scene import surface_of as surface_of_field
 from dyngs.baselines.triangles import mesh as triangles

@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
@@ -73,78 +72,45 @@ def _suffix(path: Path) -> str:
 
 
 SOURCES_NAME = "sources.json"
-"""In a capture made of photos or videos: where these lie."""
+"""In a capture made of photos or a video: where these lie."""
 _RUN_MARK = "config.yaml"
 """In a run folder, which is no part of the capture that it lies in."""
 _OF_RUNS = ("checkpoints", "scene.dyngs")
-_MAX_SOURCES_BYTES = 2**20
-_Identity = tuple[int | str, int | str]
 
 
 class Inputs:
     """Files and folders that are read; a folder stands for all that lies in it.
 
-    Args:
-        paths: of what is read; what is None or does not exist counts for nothing.
-        elsewhere: yields more files where they are costly to find; only called for outputs that
-            exist.
+    A link in a folder stands for the file or folder that it leads to, a capture that dyngs made
+    also for its photos or video. What is None counts for
+    nothing.
     """
 
-    def __init__(
-        self, paths: Iterable[Path | None], elsewhere: Callable[[], Iterable[Path]] = tuple
-    ) -> None:
-        self.paths = tuple(path for path in paths if path is not None)
-        self.elsewhere = elsewhere
+    def __init__(self, paths: Iterable[Path | None]) -> None:
+        self.paths = {path.resolve() for path in paths if path is not None}
+        for folder in [path for path in self.paths if path.is_dir()]:
+            self.paths |= {path.resolve() for path in folder.iterdir() if path.is_symlink()}
+            self.paths |= _sources(folder)
 
     def require_output(self, out: Path) -> None:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
-        Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in
-        a folder that is read; it is a folder that holds a link to an input; a link leads it out of
-        its run folder; or it is a device, a pipe or the like. A run folder in a capture, an empty
-        folder, and a folder around a capture may be written to.
+        Raises DyngsError: ``out`` is an input, or leads to one; it exists in a folder that is read;
+        a link leads it out of its run folder; or it is a device, a pipe or the like. A run folder
+        in a capture, an empty folder, and a folder around a capture may be written to. A link that
+        is a file is replaced itself.
         """
         require_within_run(out)
         require_replaceable(out)
-        if not os.path.lexists(out):
+        if not os.path.lexists(out) or (out.is_dir() and not any(out.iterdir())):
             return
-        for folder in self._folders:
-            _require_outside(out, folder)
-        own = _identity(out)
-        if own is not None and own in self._files:
-            source = self._files[own]
-            as_what = "" if os.path.abspath(out) == os.path.abspath(source) else f", as {source}"
-            raise DyngsError(f"{out}: is the file that is read{as_what}; give another output")
-        if out.is_dir():
-            self._require_no_links(out)
-
-    def _require_no_links(self, out: Path) -> None:
-        for name in sorted(os.listdir(out)):
-            path = out / name
-            source = self._files.get(_identity(path) or ("", ""))
-            if source is not None and os.path.abspath(source) != os.path.abspath(path):
-                raise DyngsError(
-                    f"{out}: holds {name}, a link to {source}, which is read; give another folder"
-                )
-
-    @cached_property
-    def _folders(self) -> tuple[Path, ...]:
-        return tuple(path for path in (*self.paths, *_sources(self.paths)) if path.is_dir())
-
-    @cached_property
-    def _files(self) -> dict[_Identity, Path]:
-        """All files that are read, also below folders and through links, by what tells them from
-        others."""
-        single = (
-            path
-            for path in (*self.paths, *_sources(self.paths), *self.elsewhere())
-            if not path.is_dir()
-        )
-        paths = (
-            *single,
-            *(path for folder in self._folders for path in _files_below(folder, set())),
-        )
-        return {identity: path for path in paths if (identity := _identity(path)) is not None}
+        for place in (out.resolve(), out.parent.resolve() / out.name):
+            for folder in (place, *place.parents):
+                if folder in self.paths:
+                    where = "" if folder == place else f" in {folder}"
+                    raise DyngsError(f"{out}: exists{where}, which is read; give another output")
+                if (folder / _RUN_MARK).is_file():
+                    break
 
 
 def require_within_run(out: Path) -> None:
@@ -188,81 +154,15 @@ def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) 
         remove_quietly(started)
 
 
-def note_sources(capture: Path, *sources: Path) -> None:
-    """Write into a made capture where its photos or videos lie, next to those noted before; no
-    output replaces them."""
-    known = _read_sources(capture)
-    names = list(dict.fromkeys([*known, *(os.path.abspath(source) for source in sources)]))
-    if names != known:
-        write_text(capture / SOURCES_NAME, json.dumps({"sources": names}, indent=1) + "\n")
+def note_source(capture: Path, source: Path) -> None:
+    """Write into a made capture where its photos or video lie; no output replaces them."""
+    names = {"sources": [os.path.abspath(source)]}
+    write_text(capture / SOURCES_NAME, json.dumps(names, indent=1) + "\n")
 
 
-def _require_outside(out: Path, folder: Path) -> None:
-    """Check that an existing ``out`` is not ``folder`` and does not lie in it; it may hold it."""
-    own = _identity(out)
-    root = _identity(folder)
-    if own == root:
-        raise DyngsError(f"{out}: is the folder that is read; give another output")
-    if out.is_dir() and not any(out.iterdir()):
-        return
-    for way in _ways(out):
-        above = [_identity(path) for path in (way, *way.parents)]
-        below = (way, *way.parents)[: above.index(root)] if root in above else ()
-        if below and not any((path / _RUN_MARK).is_file() for path in below):
-            raise DyngsError(
-                f"{out}: exists and lies in {folder}, which is read; give another output, or remove it first if it is "
-                "no part of that"
-            )
-
-
-def _sources(paths: Iterable[Path]) -> list[Path]:
-    return [Path(name) for path in paths for name in _read_sources(path)]
-
-
-def _read_sources(capture: Path) -> list[str]:
+def _sources(capture: Path) -> set[Path]:
     try:
-        names = json.loads(read_limited(capture / SOURCES_NAME, _MAX_SOURCES_BYTES))["sources"]
-        return [name for name in names if isinstance(name, str) and "\0" not in name]
-    except (DyngsError, OSError, ValueError, KeyError, TypeError, RecursionError):
-        # costs no more than this protection
-        return []
-
-
-def _files_below(folder: Path, seen: set[_Identity]) -> Iterator[Path]:
-    """Yield all files below a folder, also through links to folders, each folder once; those of
-    runs are left out."""
-    identity = _identity(folder)
-    if identity is None or identity in seen:
-        return
-    seen.add(identity)
-    try:
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except OSError:  # what cannot be listed is not read either
-        return
-    for entry in entries:
-        if entry.is_dir():
-            if not (Path(entry.path) / _RUN_MARK).is_file():
-                yield from _files_below(Path(entry.path), seen)
-        else:
-            yield Path(entry.path)
-
-
-def _ways(path: Path) -> tuple[Path, Path]:
-    """Return where a path lies, and where a link of that name leads to; with no links above
-    either."""
-    real = Path(os.path.realpath(path))
-    return (
-        real if path.name in ("", "..") else Path(os.path.realpath(path.parent), path.name)
-    ), real
-
-
-def _identity(path: Path) -> _Identity | None:
-    """Return what two names of one file have in common; None where there is no file."""
-    try:
-        status = os.stat(path)
-    except (OSError, ValueError):
-        return None
-    if status.st_ino:
-        return status.st_dev, status.st_ino
-    # a file system without such numbers; they mostly ignore case
-    return "", os.path.realpath(path).casefold()
+        names = json.loads(read_limited(capture / SOURCES_NAME))["sources"]
+        return {Path(name) for name in names}
+    except Exception:  # a missing or damaged file costs no more than this protection
+        return set()

@@ -32,7 +32,7 @@ from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import cam_from_opengl, pinhole_matrix
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, hemisphere_cameras, write_still_capture
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 from dyngs.io.write import write_image
 
 
@@ -308,10 +308,10 @@ def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
 
 
 def _turning(path: Path, blurred: int = -1) -> Path:
-    with VideoWriter(path, fps=10) as video:
+    with video_writer(path, fps=10) as add:
         for i in range(8):
             rgb = corner(camera(30.0 + 2 * i), 0.0)
-            video.add(np.full_like(rgb, 128) if i == blurred else rgb)
+            add(np.full_like(rgb, 128) if i == blurred else rgb)
     return path
 
 

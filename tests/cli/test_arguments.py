@@ -36,8 +36,8 @@ WORDS = {
     "render": {"times", "view", "overrides"},
     "export": {"times", "overrides"},
     "edit": {"up", "origin", "scale", "crop", "max_loss", "overrides"},
-    "tradeoff": {"overrides", "vary", "require", "minimize", "maximize"},
-    "compare": {"overrides"},
+    "tradeoff": {"vary", "require", "minimize", "maximize"},
+    "compare": {"overrides", "models"},
     "config": {"overrides"},
     "docs": {"topic"},
 }
@@ -186,7 +186,6 @@ def test_overrides_are_read_and_written_as_well(
     before = contents(tmp_path)
     for out in (capture, capture / "images", capture / "images" / "1.jpg"):
         require_refused(["train", "static", f"data.root={capture}", f"run.dir={out}"], capsys)
-        require_refused(["tradeoff", "static", f"data.root={capture}", "--out", str(out)], capsys)
     (tmp_path / "own.yaml").write_text("{}")
     require_refused(
         ["train", str(tmp_path / "own.yaml"), f"run.dir={tmp_path / 'own.yaml'}"], capsys

@@ -19,7 +19,7 @@ from dyngs.capture.sfm.estimate import SfmModel, SfmResult, better, estimate_pos
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 from dyngs.io.write import write_image
 
 FAST = SfmOptions(num_threads=1)
@@ -52,11 +52,11 @@ def _rotation_errors_deg(result: SfmResult, truth: dict[str, np.ndarray]) -> np.
 
 def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     poses, images = _still_arc(8)
-    with VideoWriter(tmp_path / "arc.mp4", fps=10, quality=8) as video:
+    with video_writer(tmp_path / "arc.mp4", fps=10, quality=8) as add:
         for rgb in images:
             blurred = (np.roll(rgb, 1, axis=0) // 2 + rgb // 2).astype(np.uint8)
-            video.add(blurred)
-            video.add(rgb)
+            add(blurred)
+            add(rgb)
     out = tmp_path / "capture"
     options = SfmOptions(num_threads=1, num_frames=8)
     told: dict[str, tuple[int, int]] = {}

@@ -27,7 +27,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
 from dyngs.data.images.video import VideoInfo
 from dyngs.data.times import static_cameras
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 
 AZIMUTHS = {"left": 32.0, "middle": 41.0, "phone": 49.0, "right": 58.0}
 STARTS = {"left": 0.03, "middle": 0.0, "phone": 0.37, "right": 0.16}
@@ -83,9 +83,9 @@ def test_the_capture_has_seconds_in_one_clock_and_a_camera_for_testing(capture_r
 
 def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
     write_videos(tmp_path / "rig", {"a": 40.0}, {"a": 0.0}, 10.0, 8)
-    with VideoWriter(tmp_path / "rig" / "walking.mp4", fps=10) as video:
+    with video_writer(tmp_path / "rig" / "walking.mp4", fps=10) as add:
         for i in range(8):
-            video.add(corner(camera(30.0 + 2 * i), 0.0))
+            add(corner(camera(30.0 + 2 * i), 0.0))
     with pytest.raises(DyngsError, match=r"cameras must stand still, but these move: walking"):
         poses_of_videos(tmp_path / "rig", tmp_path / "out", SfmOptions(num_threads=1))
     assert not (tmp_path / "out").exists()

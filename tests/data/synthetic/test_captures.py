@@ -15,6 +15,7 @@ from dyngs.data.synthetic.captures import (
     POINTS_PER_THING,
     DynamicOptions,
     SceneName,
+    SyntheticShot,
     orbit_cameras,
     render_things,
     scene_at,
@@ -23,7 +24,7 @@ from dyngs.data.synthetic.captures import (
 )
 
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
-TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_val=2, num_cameras=3, samples=1)
+TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_cameras=3, samples=1)
 
 
 def _files(root: Path) -> dict[str, bytes]:
@@ -69,7 +70,7 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     poses = [orbit_cameras(1, 4.0, elevation, azimuth)[0] for elevation, azimuth in CAMERAS]
     times = np.linspace(0, 1, 5)
     shots = [
-        (f"v{i}", float(time), pose)
+        SyntheticShot(f"v{i}", pose, float(time))
         for i, (time, pose) in enumerate(zip(times, poses, strict=True))
     ]
     tracks = true_tracks(lambda time: scene_at(name, time), shots)
@@ -78,7 +79,7 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     assert tracks.views.tolist() == ["v0", "v1", "v2", "v3", "v4"]
     np.testing.assert_array_equal(tracks.times, times)
     np.testing.assert_array_equal(tracks.moments, range(5))
-    for k, (_, time, pose) in enumerate(shots):
+    for k, (time, pose) in enumerate(zip(times, poses, strict=True)):
         seen = tracks.visible[k]
         assert seen.mean() > 0.1
         assert seen.mean() < 0.9, "others are on the far side or hidden"
